@@ -882,7 +882,7 @@ class OpenRobot:
         if watches:
             self._check_open()
             made = make_folders(self.folder)
-        self._shell.say(f"$ {step.command}")
+        self._shell.say(f"+ {step.command}")
         status, output, messages = self._shell.run(step.words, bool(step.into))
         if watches and status:
             remove_folders(made)
@@ -1280,7 +1280,7 @@ class OpenRobot:
         """Let systemd read its units again, and restart some.  Raises `SrosError`."""
         for words in [["daemon-reload"], ["restart", *units]] if units else []:
             command = ["systemctl", *words]
-            self._shell.say(f"{'would run:' if dry_run else '$'} {shlex.join(command)}")
+            self._shell.say(f"{'would run:' if dry_run else '+'} {shlex.join(command)}")
             try:
                 ended = 0 if dry_run else subprocess.run(command, check=False).returncode
             except OSError as error:
@@ -1477,7 +1477,7 @@ class OpenRobot:
     def _check(self, *words: str) -> int:
         """Run `check`, show what it says if it finds an error, and return its status."""
         step = _Step(("check", *words, "--fail-on", "error"))
-        self._shell.say(f"$ {step.command}")
+        self._shell.say(f"+ {step.command}")
         status, output, messages = self._shell.run(step.words, False)
         self._say(f"{output}{messages}" if status else "")
         return status
@@ -1635,7 +1635,7 @@ class OpenRobot:
 
     def _status_and_json(self, step: _Step) -> tuple[int, Any]:
         """Return the status of a verb, and the JSON that it prints."""
-        self._shell.say(f"$ {step.command}")
+        self._shell.say(f"+ {step.command}")
         status, output, _ = self._shell.run(step.words, False)
         return status, json.loads(output)
 

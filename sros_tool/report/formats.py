@@ -294,7 +294,7 @@ def _card_legend(picture: Picture, scene: Scene) -> Iterable[str]:
     if any(card.chosen for card in scene.cards):
         rows.append((_BOX.format("chosen"), "in focus: information goes to it from the left"))
     if any(card.lacks for card in scene.cards):
-        rows.append((_BOX.format("lacking"), "nobody may send, or nobody may receive"))
+        rows.append((_BOX.format("lacking"), "may be used by one side only"))
     if rows:
         yield _row(rows)
     for units in picture.equal[:_MOST_LABELS]:
@@ -402,7 +402,7 @@ def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
     known = {(name.kind, name.name): name for name in picture.names}
     lines = [f"### {plain(picture.title)}: who may do what", ""]
     lines += [f"- {plain(headline)}" for headline in picture.headlines]
-    lines += ["", "| name | may send or call | may receive or serve |", "| --- | --- | --- |"]
+    lines += ["", "| name | may publish or call | may subscribe or serve |", "| --- | --- | --- |"]
     for (kind, name), ends in rows.items():
         cells = [f"{KIND_NAMES[kind]} {code(name)}"]
         stated = known[kind, name]

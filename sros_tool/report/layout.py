@@ -52,20 +52,20 @@ LEVEL_NAMES = {
     WireLevel.UNKNOWN: "protection unknown",
 }
 ONLOOKERS = {
-    "publish": "also written by",
-    "subscribe": "also read by",
+    "publish": "also published by",
+    "subscribe": "also subscribed by",
     "request": "also called by",
     "reply": "also served by",
     "call": "also called by",
-    "execute": "also carried out by",
+    "execute": "also executed by",
 }
 _REACHES = {
-    "publish": "writes",
-    "subscribe": "reads",
+    "publish": "publishes",
+    "subscribe": "subscribes to",
     "request": "calls",
     "reply": "serves",
     "call": "calls",
-    "execute": "carries out",
+    "execute": "executes",
 }
 _COMMON = {
     "topics": "used by every node",
@@ -76,7 +76,7 @@ _COMMON = {
 """The note on cards of names that every node may use, where these rights are not drawn."""
 OWN, OTHERS = "own:", ("other of", "others of")
 """Words on cards that the legend explains."""
-SENDERS, LISTENERS = "may send", "may receive"
+SENDERS, LISTENERS = "may publish or call", "may subscribe or serve"
 _NAMES = "topics, services, actions"
 
 

@@ -456,7 +456,7 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     )
     ended = robot.close(status=1)
     assert "; nothing was signed; if you want the change, edit robot/requirements.toml" in ended.out
-    assert "$ sros generate_artifacts" not in ended.err and "who may do what" not in ended.out
+    assert "+ sros generate_artifacts" not in ended.err and "who may do what" not in ended.out
     assert list_enclaves(robot.folder / "robot/export") == (
         "/listener",
         "/sros_observer",

@@ -122,7 +122,7 @@ def test_search_finds_enclaves_and_names_and_shows_who_may_do_what(
         page.click("#results button:has-text('/cmd_vel') >> nth=0")
         text = details(page)
         assert "May publish (1)" in text and "/mobile_robot/velocity_mux" in text
-        assert "May listen (3)" in text and "/mobile_robot/base" in text
+        assert "May subscribe (3)" in text and "/mobile_robot/base" in text
         assert "encrypted" in text
         shown = "#map .card.enclave:not(.faded)"
         assert len(texts(page, shown)) == 4, texts(page, shown)
@@ -259,7 +259,7 @@ def shown_flow(page: Page, name: str, upstream: bool) -> tuple[int, int]:
     page.fill("#search", name)
     page.keyboard.press("Enter")
     assert page.inner_text("#details h2") == name
-    page.click("text=What reaches it" if upstream else "text=What it reaches")
+    page.click("text=Who can influence it" if upstream else "text=Whom it influences")
     summary = page.inner_text("#summary")
     found = re.search(r"(\d+) enclaves? can .* within 2 hops(?:, (\d+) over)?", summary)
     assert found, summary
@@ -299,7 +299,7 @@ def test_hops_can_be_added_up_to_all(browser: Browser, robot_page: Path) -> None
     with opened(browser, robot_page) as page:
         page.fill("#search", "/cmd_vel")
         page.keyboard.press("Enter")
-        page.click("text=What reaches it")
+        page.click("text=Who can influence it")
         assert "3 enclaves can reach /cmd_vel within 2 hops" in page.inner_text("#summary")
         assert page.locator("#map .card.enclave").count() == 3
         page.click("#hops-less")
@@ -320,8 +320,9 @@ def test_the_timeline_holds_everything_that_ends(browser: Browser, robot_page: P
         ends = page.locator("#timeline time").all_inner_texts()
         assert ends == sorted(ends)
         page.click("#timeline button:has-text('/mobile_robot/camera') >> nth=0")
-        assert page.locator("#panel-map").is_visible()
         assert "/mobile_robot/camera" in details(page)
+        page.click("#close")
+        assert page.locator("#panel-timeline").is_visible()
 
 
 def test_what_ends_at_the_same_moment_is_one_row_where_there_is_much(
@@ -486,8 +487,8 @@ def test_names_cannot_run_script(browser: Browser, tmp_path: Path) -> None:
                 page.fill("#search", text[:40])
                 buttons.nth(number).click()
                 assert text in (page.locator("#details h2").text_content() or "")
-                if page.locator("text=What reaches it").count():
-                    page.click("text=What reaches it")
+                if page.locator("text=Who can influence it").count():
+                    page.click("text=Who can influence it")
                     page.click("#back")
         for tab in ("names", "timeline", "findings", "map"):
             page.click(f"#tab-{tab}")
@@ -572,7 +573,9 @@ def test_a_focus_says_its_answer_and_shows_what_leads_to_it(
         assert said.startswith("/mobile_robot/velocity_mux alone may publish /cmd_vel; ")
         assert texts(page, "#map .card.chosen") == {"/cmd_vel"}
         assert "/scan" not in " ".join(texts(page, "#map .card"))
-        assert {"2 HOPS BEFORE", "MAY SEND", "MAY RECEIVE"} == texts(page, "#map text.head")
+        assert {"2 HOPS BEFORE", "MAY PUBLISH OR CALL", "MAY SUBSCRIBE OR SERVE"} == texts(
+            page, "#map text.head"
+        )
 
 
 def test_the_table_has_every_name_and_those_that_only_one_side_may_use(

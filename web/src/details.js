@@ -2,7 +2,7 @@
 
 import { counted, el } from "./dom.js";
 import { byRight, sends } from "./model.js";
-import { KINDS, LEVELS, markText } from "./words.js";
+import { KINDS, LEVELS, RECEIVES, SENDS, markText } from "./words.js";
 import { daysLeft, dateText, leftText } from "./timeline.js";
 
 const VERBS = {
@@ -10,9 +10,10 @@ const VERBS = {
   subscribe: "May subscribe",
   request: "May call",
   reply: "May serve",
-  call: "May send goals",
-  execute: "May carry out",
+  call: "May call",
+  execute: "May execute",
 };
+const PERMITTED = "only the enclaves below";
 const MOST = 60;
 
 function chip(kind, text) {
@@ -155,8 +156,8 @@ export function nameDetails(model, kind, name, act) {
     el(
       "p",
       { class: "actions" },
-      hasFlow ? el("button", { type: "button", text: "What reaches it", onclick: () => act.flow(kind, name, true) }) : null,
-      hasFlow ? el("button", { type: "button", text: "What it reaches", onclick: () => act.flow(kind, name, false) }) : null,
+      hasFlow ? el("button", { type: "button", text: "Who can influence it", onclick: () => act.flow(kind, name, true) }) : null,
+      hasFlow ? el("button", { type: "button", text: "Whom it influences", onclick: () => act.flow(kind, name, false) }) : null,
     ),
   ];
   if (protection.level === "unknown") {
@@ -168,16 +169,16 @@ export function nameDetails(model, kind, name, act) {
         ["Data", protection.data],
         ["Metadata", protection.metadata],
         ["RTPS messages", protection.rtps],
-        ["Who may read", protection.read_control ? "whom permissions allow it" : bundle.everybody],
-        ["Who may write", protection.write_control ? "whom permissions allow it" : bundle.everybody],
+        [`Who may ${SENDS[kind]}`, protection.write_control ? PERMITTED : bundle.everybody],
+        [`Who may ${RECEIVES[kind]}`, protection.read_control ? PERMITTED : bundle.everybody],
       ]),
     );
   }
   if (bundle.lacks) parts.push(el("p", {}, chip("warning", bundle.lacks)));
   if (bundle.open) parts.push(el("p", {}, chip("warning", bundle.open)));
   for (const [title, wanted, controlled] of [
-    [kind === "topics" || kind === "dds" ? "May publish" : "May call", (tie) => !tie.deny && sends(tie), protection.write_control],
-    [kind === "topics" || kind === "dds" ? "May listen" : kind === "actions" ? "May carry out, or listen" : "May serve", (tie) => !tie.deny && !sends(tie), protection.read_control],
+    [`May ${SENDS[kind]}`, (tie) => !tie.deny && sends(tie), protection.write_control],
+    [kind === "actions" ? "May execute or subscribe" : `May ${RECEIVES[kind]}`, (tie) => !tie.deny && !sends(tie), protection.read_control],
     ["Denied", (tie) => tie.deny, true],
   ]) {
     const ties = bundle.ties.filter(wanted);

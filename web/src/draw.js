@@ -125,7 +125,7 @@ export function drawScene(node, scene, { overlay, problems, choose }) {
     .attr("tabindex", (_, number) => (number ? -1 : 0))
     .attr("aria-label", (card) => cardText(card, problems(card)))
     .on("click", (_, card) => choose(card))
-    .on("keydown", (event, card) => moved(event, card, drawn, choose))
+    .on("keydown", (event, card) => moved(event, card, drawn, scene.links, choose))
     .each(function draw(card) {
       drawCard(select(this), card, problems(card));
     });
@@ -200,8 +200,9 @@ function drawCard(group, card, problems) {
   }
 }
 
-// The arrow keys lead to the next card in their direction; only one card is in the tab order.
-function moved(event, card, drawn, choose) {
+// The arrow keys lead to the next card in their direction, sideways to one that is linked if there
+// is one; only one card is in the tab order.
+function moved(event, card, drawn, links, choose) {
   if (event.key === "Enter" || event.key === " ") {
     event.preventDefault();
     choose(card);
@@ -212,6 +213,7 @@ function moved(event, card, drawn, choose) {
   event.preventDefault();
   const centre = (each) => [each.x + each.width / 2, each.y + each.height / 2];
   const [x, y] = centre(card);
+  const linked = new Set(links.flatMap(({ source, target }) => (source === card.id ? [target] : target === card.id ? [source] : [])));
   let best = null;
   drawn.each(function look(other) {
     const [toX, toY] = centre(other);
@@ -219,7 +221,7 @@ function moved(event, card, drawn, choose) {
     const aside = Math.abs((toX - x) * way[1]) + Math.abs((toY - y) * way[0]);
     // Sideways a column is far; upwards and downwards one stays in it.
     if (ahead <= 20 || (way[1] && aside > 60)) return;
-    const distance = way[0] ? ahead * 0.2 + aside : ahead + aside;
+    const distance = way[0] ? ahead * 0.2 + aside + (linked.has(other.id) ? 0 : 1e6) : ahead + aside;
     if (!best || distance < best.distance) best = { distance, node: this };
   });
   if (best) {
@@ -253,7 +255,7 @@ export function legend(scene, overlay, equal, make) {
   if (scene.links.some((link) => link.differs)) line("differs", "not for the equal ones");
   const box = (kind, text) => add(icon("M1 1h40v12h-40z", `box ${kind}`, true), text);
   if (scene.cards.some((card) => card.chosen)) box("chosen", "in focus");
-  if (scene.cards.some((card) => card.lacks)) box("lacking", "nobody may send, or nobody may receive");
+  if (scene.cards.some((card) => card.lacks)) box("lacking", "may be used by one side only");
   if (overlay && scene.links.some((link) => link.mark === "first")) line("first", overlay.first);
   if (overlay && scene.links.some((link) => link.mark === "second")) line("second", overlay.second);
   for (const each of equal) {

@@ -20,6 +20,7 @@ const problemsOf = new Map(
     each.problems.length + model.findingsOf(each.path).filter((f) => f.severity === "error").length,
   ]),
 );
+const isSmall = () => window.innerWidth <= 720;
 const problems = (card) =>
   card.role === "names" ? 0 : card.members.reduce((sum, path) => sum + (problemsOf.get(path) ?? 0), 0);
 
@@ -44,7 +45,7 @@ function currentScene() {
     const bundles = model.filtered({ ...state.filters, common: state.scene > 0 });
     const scene = columns(bundles);
     const names = bundles.reduce((sum, bundle) => sum + bundle.names.length, 0);
-    scene.title = `${counted(names, "name")} fit`;
+    scene.title = `${counted(names, "name")} ${names === 1 ? "fits" : "fit"}`;
     if (bundles.length > MOST_BUNDLES) scene.title += `; drawn are the first ${MOST_BUNDLES} groups of them: filter further`;
     return scene;
   }
@@ -56,9 +57,9 @@ function showMap() {
   state.shown = scene;
   state.drawing = drawScene(byId("map"), scene, { overlay: model.overlay, problems, choose });
   byId("legend").replaceChildren(...legend(scene, model.overlay, model.equal, { el, svg }));
-  const why = scene.id === "essential" ? " that every node needs" : "";
+  const why = scene.id === "essential" ? " that every node needs (parameters, log, time)" : "";
   const summary = scene.shown
-    ? `${counted(model.enclaves.length, "enclave")}, ${counted(scene.shown, "name")}${scene.hidden ? `; not drawn: ${counted(scene.hidden, "name")}${why}` : ""}`
+    ? `${counted(model.enclaves.length, "enclave")}, ${counted(scene.shown, "name")}${scene.hidden ? `; left out: ${counted(scene.hidden, "name")}${why}` : ""}`
     : scene.title;
   byId("summary").textContent = scene.cards.length ? summary : "Nothing fits.";
   byId("back").hidden = !(state.flow || filtering());
@@ -87,11 +88,18 @@ function zoom(step) {
   const { width } = state.shown;
   const room = byId("canvas").clientWidth - 2;
   // On a small screen the letters stay readable, and the map is moved instead.
-  const least = window.innerWidth <= 720 ? 0.9 : 0.72;
+  const least = isSmall() ? 0.9 : 0.72;
   if (step === 0) state.zoom = Math.min(1.15, Math.max(least, room / width));
   else state.zoom = Math.min(2.5, Math.max(0.05, state.zoom * (step > 0 ? 1.2 : 1 / 1.2)));
   byId("map").setAttribute("width", Math.round(width * state.zoom));
   byId("map").setAttribute("height", Math.round(state.shown.height * state.zoom));
+  fadeEdge();
+}
+
+// What goes on to the right fades, so that one moves the map.
+function fadeEdge() {
+  const canvas = byId("canvas");
+  canvas.classList.toggle("more", canvas.scrollLeft + canvas.clientWidth < canvas.scrollWidth - 4);
 }
 
 // The whole drawing, however small; what opens first is as wide as the window, and readable.
@@ -102,6 +110,7 @@ function fit() {
   state.zoom = Math.max(0.05, Math.min(1.15, (canvas.clientWidth - 2) / width, tall / height));
   byId("map").setAttribute("width", Math.floor(width * state.zoom));
   byId("map").setAttribute("height", Math.floor(height * state.zoom));
+  fadeEdge();
   canvas.scrollIntoView({ block: "nearest" });
 }
 
@@ -114,7 +123,10 @@ function light() {
   }[chosen.type];
   // In a flow everything belongs to what was asked for.
   const found = state.drawing.highlight(state.flow ? null : belongs);
-  if (found || state.flow) state.drawing.card(belongs ?? ((card) => card.chosen))?.scrollIntoView({ block: "nearest", inline: "nearest" });
+  if (!found && !state.flow) return;
+  const card = state.drawing.card(belongs ?? ((each) => each.chosen));
+  // On a small screen, the details lie over the lower half.
+  card?.scrollIntoView({ block: isSmall() ? "center" : "nearest", inline: "nearest" });
 }
 
 // ── choosing ─────────────────────────────────────────────────────────────────────────────────
@@ -129,6 +141,7 @@ const act = {
   flow: (kind, name, upstream) => {
     clear();
     state.flow = { kind, name, upstream, hops: 2 };
+    unfoldSheet(false);
     showTab("map");
     showMap();
   },
@@ -154,13 +167,21 @@ function chosen(what) {
   }[what.type]();
   byId("details-content").replaceChildren(...content);
   document.body.classList.add("with-details");
+  unfoldSheet(true);
   if (byId("details").hidden) {
+    state.opener = document.activeElement;
     byId("details").hidden = false;
     zoom(0);
   }
   byId("details").scrollTop = 0;
   byId("details-content").querySelector("h2").focus({ preventScroll: true });
   light();
+}
+
+// On a small screen, the details are a sheet, of which only the title shows while one looks at a flow.
+function unfoldSheet(open) {
+  document.body.classList.toggle("with-title-only", !open);
+  byId("sheet").setAttribute("aria-expanded", String(open));
 }
 
 function close() {
@@ -170,7 +191,8 @@ function close() {
   document.body.classList.remove("with-details");
   zoom(0);
   light();
-  if (was) document.querySelector("#map [tabindex='0']")?.focus({ preventScroll: true });
+  const opener = state.opener?.checkVisibility() ? state.opener : document.querySelector("#map [tabindex='0']");
+  if (was) opener?.focus({ preventScroll: true });
 }
 
 function clear() {
@@ -214,7 +236,6 @@ function search() {
 
 function found(then) {
   byId("results").hidden = true;
-  showTab("map");
   then();
 }
 
@@ -230,6 +251,9 @@ function showTab(name) {
     byId(tab.getAttribute("aria-controls")).hidden = !on;
   }
   document.body.dataset.tab = name;
+  if (name !== "map" || !state.drawing) return;
+  zoom(0);
+  light();
 }
 
 function tabKeys(event) {
@@ -244,12 +268,8 @@ function tabKeys(event) {
 function fillLists() {
   const order = { error: 0, warning: 1, note: 2 };
   const sorted = [...model.findings].sort((a, b) => order[a.severity] - order[b.severity]);
-  const onEnclave = (path) => {
-    showTab("map");
-    act.enclave(path);
-  };
   const none = el("p", { class: "soft", text: "There are no findings." });
-  const item = (each) => findingItem(each, onEnclave);
+  const item = (each) => findingItem(each, act.enclave);
   const list = el("ul", { class: "plain cards" }, sorted.slice(0, MOST_FINDINGS).map(item));
   if (sorted.length > MOST_FINDINGS) {
     const rest = sorted.slice(MOST_FINDINGS);
@@ -260,18 +280,14 @@ function fillLists() {
   byId("findings").replaceChildren(sorted.length ? list : none);
   byId("tab-findings").textContent = sorted.length ? `Findings (${sorted.length})` : "Findings";
   const lacking = model.bundles.filter((each) => each.lacks && !each.ties.every((tie) => tie.common));
-  const onName = (kind, name) => {
-    showTab("map");
-    act.name(kind, name);
-  };
   byId("names").replaceChildren(
     ...namesTable(
       model.rows,
       lacking.reduce((sum, each) => sum + each.names.length, 0),
-      (kind, name) => model.bundle(kind, name) && (() => onName(kind, name)),
+      (kind, name) => model.bundle(kind, name) && (() => act.name(kind, name)),
     ),
   );
-  byId("timeline").replaceChildren(...timeline(model.validities, onEnclave));
+  byId("timeline").replaceChildren(...timeline(model.validities, act.enclave));
   byId("tab-differences").hidden = !model.overlay;
   if (!model.overlay) return;
   const items = model.differences.map((each) =>
@@ -297,7 +313,7 @@ function start() {
   byId("scene-label").hidden = model.scenes.length < 2;
   options("filter-enclave", [any("every enclave"), ...model.enclaves.map(({ path }) => [path, path])]);
   options("filter-namespace", [any("every namespace"), ...model.namespaces.filter((ns) => ns !== "/").map((ns) => [ns, ns])]);
-  options("filter-direction", [any("both directions"), ["send", "may send"], ["receive", "may receive"], ["deny", "denied"]]);
+  options("filter-direction", [any("both directions"), ["send", "may publish or call"], ["receive", "may subscribe or serve"], ["deny", "denied"]]);
   const levels = [...new Set(model.bundles.map((bundle) => bundle.protection.level))];
   options("filter-protection", [any("every protection"), ...levels.map((level) => [level, LEVELS[level]])]);
   document.body.dataset.overlay = model.overlay?.kind ?? "";
@@ -320,6 +336,8 @@ function start() {
   });
   byId("back").addEventListener("click", () => setScene(state.scene));
   byId("close").addEventListener("click", close);
+  byId("sheet").addEventListener("click", () => unfoldSheet(document.body.classList.contains("with-title-only")));
+  byId("canvas").addEventListener("scroll", fadeEdge);
   byId("zoom-in").addEventListener("click", () => zoom(1));
   byId("zoom-out").addEventListener("click", () => zoom(-1));
   byId("zoom-fit").addEventListener("click", fit);
@@ -335,8 +353,9 @@ function start() {
   }
   document.addEventListener("keydown", (event) => {
     if (event.key === "Escape") {
-      if (!byId("results").hidden) byId("results").hidden = true;
-      else close();
+      if (byId("results").hidden) return close();
+      byId("results").hidden = true;
+      byId("search").focus();
     }
     if (event.key === "/" && !/^(INPUT|SELECT|TEXTAREA)$/.test(document.activeElement.tagName)) {
       event.preventDefault();
@@ -345,10 +364,9 @@ function start() {
   });
   window.addEventListener("resize", () => zoom(0));
   // A small screen has no room for the columns of the whole map, and the table fits.
-  const small = window.innerWidth <= 720;
-  if (small) for (const fold of document.querySelectorAll(".fold")) fold.open = false;
+  if (isSmall()) for (const fold of document.querySelectorAll(".fold")) fold.open = false;
   fillLists();
-  showTab(small && !model.overlay && model.scenes[0].id !== "focus" ? "names" : "map");
+  showTab(isSmall() && !model.overlay && model.scenes[0].id !== "focus" ? "names" : "map");
   showMap();
   document.body.dataset.ready = "true";
 }

@@ -1,7 +1,7 @@
 // All names in a table: who may send, who may receive, and what nobody may do.
 
 import { counted, el } from "./dom.js";
-import { KINDS, LEVELS } from "./words.js";
+import { KINDS, LEVELS, RECEIVES, SENDS } from "./words.js";
 
 const SHOWN = 4;
 const MOST = 400;
@@ -22,11 +22,13 @@ function mentions(row, text) {
 function list(texts, none, all) {
   if (all) return [el("div", { class: "lack", text: all }), ...(texts.length ? list(texts, none) : [])];
   if (!texts.length) return el("span", { class: "soft", text: none });
-  const rest = texts.length - SHOWN;
-  return [
-    ...texts.slice(0, SHOWN).map((text) => el("div", { class: "mono", text })),
-    rest > 0 ? el("div", { class: "soft", text: `and ${rest} more` }) : null,
-  ].filter(Boolean);
+  return folded(texts.map((text) => el("div", { class: "mono", text })));
+}
+
+function folded(items) {
+  const rest = items.slice(SHOWN);
+  if (!rest.length) return items;
+  return [...items.slice(0, SHOWN), el("details", {}, el("summary", { text: `and ${rest.length} more` }), rest)];
 }
 
 // `lacking` is the number of names that only one side may use;
@@ -44,25 +46,27 @@ export function namesTable(rows, lacking, opens) {
       (row) => (basics.checked || !row.common) && (row.lacks || !only.checked) && (!text || mentions(row, text)),
     );
     body.replaceChildren(...fit.slice(0, MOST).map((row) => line(row, opens)));
-    status.textContent = fit.length > MOST ? `The first ${MOST} of ${fit.length} rows.` : counted(fit.length, "row");
+    const names = fit.reduce((sum, row) => sum + row.names.length, 0);
+    const shared = names > fit.length ? " (names with the same rights share a row)" : "";
+    const first = fit.length > MOST ? `; shown are the first ${MOST}` : "";
+    status.textContent = `${counted(names, "name")} in ${counted(fit.length, "row")}${shared}${first}.`;
   }
   search.addEventListener("input", show);
   only.addEventListener("change", show);
   basics.addEventListener("change", show);
   show();
-  const head = ["Name", "May send", "May receive", "Protection"].map((text) => el("th", { scope: "col", text }));
+  const head = ["Name", "May publish or call", "May subscribe or serve", "Protection"].map((text) => el("th", { scope: "col", text }));
   return [
     el("label", { class: "search" }, "Name or enclave ", search),
-    el("p", {}, lacking ? `${counted(lacking, "name")} may be used by one side only.` : "Every name has a sender and a receiver."),
-    el("p", { class: "choices" }, el("label", {}, only, " only names without a sender or a receiver"), el("label", {}, basics, " also names that every node needs")),
+    el("p", {}, lacking ? `${counted(lacking, "name")} may be used by one side only.` : "Every name may be used by both sides."),
+    el("p", { class: "choices" }, el("label", {}, only, " only names that one side may use"), el("label", {}, basics, " also names that every node needs")),
     status,
     el("table", { class: "names" }, el("thead", {}, el("tr", {}, head)), body),
   ];
 }
 
 function line(row, opens) {
-  const rest = row.names.length - SHOWN;
-  const names = row.names.slice(0, SHOWN).map((name) => {
+  const names = row.names.map((name) => {
     const open = opens(row.kind, name);
     const link = open && el("button", { type: "button", class: "link-button", text: name, onclick: open });
     return el("div", {}, link || el("code", { text: name }));
@@ -76,11 +80,10 @@ function line(row, opens) {
       { scope: "row" },
       el("span", { class: "kind", text: KINDS[row.kind] }),
       row.lacks ? [" ", el("span", { class: "chip warning", text: row.lacks })] : null,
-      names,
-      rest > 0 ? el("div", { class: "soft", text: `and ${rest} more` }) : null,
+      folded(names),
     ),
-    el("td", { "data-head": "May send" }, list(row.senders, "nobody", row.all_send && row.everybody)),
-    el("td", { "data-head": "May receive" }, list(row.receivers, "nobody", row.all_receive && row.everybody), denied),
+    el("td", { "data-head": `May ${SENDS[row.kind]}` }, list(row.senders, "nobody", row.all_send && row.everybody)),
+    el("td", { "data-head": `May ${RECEIVES[row.kind]}` }, list(row.receivers, "nobody", row.all_receive && row.everybody), denied),
     el("td", { "data-head": "Protection" }, LEVELS[row.level].replace("protection ", "")),
   );
 }

@@ -3,13 +3,16 @@
 export { counted } from "./dom.js";
 export { KINDS, LEVELS, sends } from "./model.js";
 
+export const SENDS = { topics: "publish", dds: "publish", services: "call", actions: "call" };
+export const RECEIVES = { topics: "subscribe", dds: "subscribe", services: "serve", actions: "execute" };
+
 export const ONLOOKERS = {
-  publish: "also written by",
-  subscribe: "also read by",
+  publish: "also published by",
+  subscribe: "also subscribed by",
   request: "also called by",
   reply: "also served by",
   call: "also called by",
-  execute: "also carried out by",
+  execute: "also executed by",
 };
 
 export function markText(overlay, mark) {
