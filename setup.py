@@ -1,7 +1,7 @@
 """What colcon runs to build and install sros in a ROS workspace; pip reads only pyproject.toml.
 
 Everything that pyproject.toml says is taken from there.  It is read here because the setuptools of
-Ubuntu 24.04 (68) refuses its present form, such as a licence without a table.
+Ubuntu 24.04 (68) refuses its current form, such as a licence without a table.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ def fleet(folder: Path, enclaves: int, rules: int) -> Iterator[Figure]:
 
 
 def _confirm(root: Path, robots: int) -> None:
-    """Have all robots but the last one confirm that they have the present files."""
+    """Have all robots but the last one confirm that they have the current files."""
     now = datetime.now(UTC)
     whole = make_confirmation(root, "r1", now=now)
     files: dict[str, dict[str, str]] = {}

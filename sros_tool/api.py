@@ -433,7 +433,7 @@ def fleet_status(
     Returns:
         The ``robots`` with ``robot``, ``state``, ``received`` and ``pending`` (the files that are
         not current), ``counts`` by state, ``overdue``, and ``complete``: whether every robot has
-        confirmed that it has the present files.
+        confirmed that it has the current files.
 
     Raises:
         KeystoreError: The keystore does not exist, has no fleet, or cannot be read.
@@ -686,7 +686,7 @@ def check(
         zone,
         _domain(domain),
         read,
-        find_distribution(distribution).named if distribution else "",
+        find_distribution(distribution).given_name if distribution else "",
         _vendors("", distribution),
         robots,
     )

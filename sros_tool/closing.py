@@ -244,7 +244,7 @@ class ObservedProcesses(NamedTuple):
         return {process.enclave: process.unit for process in self.processes if process.unit}
 
     def as_they_run(self, running: RunningProcesses) -> ObservedProcesses:
-        """Return a copy with the present ids and the present unknown processes."""
+        """Return a copy with the current ids and the current unknown processes."""
         pids = {process.pid for process in self.processes}
         commands = {tuple(process.command) for process in self.processes}
         unknown = [
@@ -348,7 +348,7 @@ class Closing(NamedTuple):
     steps: Sequence[CloseStep]
     """The steps in their order."""
     secured: Mapping[str, bool]
-    """The enclaves in which a process of the robot runs now, and whether with the present files;
+    """The enclaves in which a process of the robot runs now, and whether with the current files;
     otherwise it has to be restarted."""
     new: Sequence[str]
     """The enclaves of the policy without a process: none was observed, and none runs now."""
@@ -379,7 +379,7 @@ class Closing(NamedTuple):
 
     @property
     def left(self) -> Sequence[str]:
-        """The enclaves that should have a process with the present files, and have none."""
+        """The enclaves that should have a process with the current files, and have none."""
         names = {process.enclave for process in self.observed.processes} | {*self.new}
         names = names.difference(self.without) | self.secured.keys()
         return sorted(name for name in names if not self.secured.get(name))
@@ -1143,7 +1143,7 @@ class OpenRobot:
             why = "has ended" if name in closing.observed.ended else "is new"
             lines += ["", f"# {name} {why}: COMMAND is what starts it", f"{start} -- COMMAND"]
         if rest:
-            lines += ["", "# These processes run closed, with the present files."]
+            lines += ["", "# These processes run closed, with the current files."]
         return [*lines, *_commands(rest)]
 
     def _enclaves_left(self) -> list[str]:
@@ -1325,10 +1325,10 @@ class OpenRobot:
         return closing._replace(problems=[*self._texts_to_open(observed)])
 
     def _texts_to_open(self, observed: ObservedProcesses) -> Iterator[str]:
-        """Yield, for each process that runs in an enclave or does not run, how to start it open.
+        """Yield how to start each process open that runs in an enclave or does not run.
 
-        Processes of enclaves that were taken out of the policy are left out.  What sros cannot
-        tell from a process of this folder is named, so that nothing closed is taken for open.
+        Processes of enclaves that were taken out of the policy are left out.  Secured processes
+        that sros does not know are named, so that none of them is taken for open.
         """
         running = ProcessTable().look(self._shell.now())
         are_open = {
@@ -1509,7 +1509,7 @@ class OpenRobot:
         return "; ".join(reasons)
 
     def _enclaves_with_process(self, running: RunningProcesses) -> set[str]:
-        """Return the enclaves in which a process runs with the present files of the export."""
+        """Return the enclaves in which a process runs with the current files of the export."""
         return {
             enclave.name
             for process, enclave in self._secured(running)

@@ -64,14 +64,14 @@ class Distribution(NamedTuple):
     stands_for: str = ""
 
     @property
-    def named(self) -> str:
+    def given_name(self) -> str:
         """The name as the user wrote it."""
         return self.stands_for or self.name
 
     @property
     def title(self) -> str:
         """The name for messages, such as ``Lyrical``."""
-        return self.named.capitalize()
+        return self.given_name.capitalize()
 
     @property
     def shipped(self) -> tuple[Shipped, ...]:

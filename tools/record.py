@@ -1,4 +1,4 @@
-"""The record of a finished setup, and its comparison with the present state."""
+"""The record of a finished setup, and its comparison with the current state."""
 
 from __future__ import annotations
 

@@ -501,7 +501,7 @@ class _Round:
             time.sleep(_LOOK_SECONDS)
 
     def _look(self, names: Iterable[str]) -> EnclaveProcesses:
-        """Examine the processes at the present time, which is later than the start of the round."""
+        """Examine the processes at the current time, which is later than the start of the round."""
         passed = timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME) - self._began)
         machine = self._machine
         return look_at_processes(
@@ -586,7 +586,7 @@ class _Round:
         return None
 
     def _keep_replaced_list(self, text: str | None) -> None:
-        """Keep the present revocation list: a release may replace it by a shorter one.
+        """Keep the current revocation list: a release may replace it by a shorter one.
 
         A release leaves out entries that have expired; but a keystore that was restored from a
         backup may have lost entries.
@@ -596,7 +596,7 @@ class _Round:
             self._attempt(lambda: replace_file(path, text.encode()))
 
     def _drop_replaced_list(self, names: Iterable[str]) -> None:
-        """Remove the kept revocation list if the present list revokes the same certificates."""
+        """Remove the kept revocation list if the current list revokes the same certificates."""
         kept, present = self._replaced_list(), self._revocation_list(names)
         if kept and present and _revoked(kept) <= _revoked(present):
             with suppress(OSError):
@@ -678,7 +678,7 @@ class _Round:
         return ask(last)
 
     def _client_certificates(self) -> list[ClientCertificate]:
-        """Return the files of some enclaves for TLS, in the order of expiry, the last first."""
+        """Return the certificates and keys for TLS that expire last, the last first."""
         found: list[tuple[datetime, ClientCertificate]] = []
         for name in self._enclaves():
             place = enclave_path(self._folder, name)
@@ -816,7 +816,7 @@ def _enclave_key(folder: Path, name: str, secrets: Secrets) -> PrivateKey:
 class Renewals(NamedTuple):
     """The signing requests (PEM) for a message, and who has to sign it.
 
-    Only the enclave itself can vouch for its new key, with its present one.  So a message has the
+    Only the enclave itself can vouch for its new key, with its current one.  So a message has the
     request of only one enclave that asks with a new key, ``signer``; every hour, it is another
     enclave's turn.
     """
@@ -832,7 +832,7 @@ def _renewals(
 ) -> Renewals:
     """Return requests for the enclaves ``names`` whose certificates expire.
 
-    With ``new_key``, the requests are for new keys, which wait next to the present keys until their
+    With ``new_key``, the requests are for new keys, which wait next to the current keys until their
     certificates are installed; a key on a token stays.  ``secrets`` is asked for the PIN of a
     token.
     """

@@ -97,7 +97,7 @@ def pin_root(agent_folder: Path, data: bytes, *, now: datetime) -> str:
     Args:
         agent_folder: the agent's folder, ``FOLDER/.agent``, which exists.
         data: the content of the file.
-        now: the present time.
+        now: the current time.
 
     Raises:
         FetchError: it is no root metadata that its own keys signed, or it expired.
@@ -124,7 +124,7 @@ def pin_root(agent_folder: Path, data: bytes, *, now: datetime) -> str:
             FetchProblem.EXPIRED,
             f"the root metadata expired at {iso(root.signed.expires)}",
             "",
-            "Use the present root.json of the publishing folder; or set the clock of this robot.",
+            "Use the current root.json of the publishing folder; or set the clock of this robot.",
         )
     with Folder(agent_folder) as folder:
         if folder.is_folder(_METADATA):
@@ -154,7 +154,7 @@ def fetch_release(
         state: the agent's folder, ``FOLDER/.agent``, with the pinned root.
         source: the publishing folder: ``https://…``, ``http://…``, or the path of a folder.
         robot: the name of this robot.
-        now: the present time, which decides whether metadata has expired.
+        now: the current time, which decides whether metadata has expired.
         installed: the number of the installed release; 0 if none is.
         client_certificate: certificate and key for TLS.
         tls_ca: CA certificates (PEM) of the server; None: those of the system.
@@ -239,7 +239,7 @@ def _updater(state: Path, transport: HttpTransport | FolderTransport, now: datet
         config=UpdaterConfig(targets_max_length=_MOST_METADATA),
         bootstrap=read_bytes(path, "root metadata", max_bytes=_MOST_METADATA),
     )
-    # The present time is passed in; the client would ask the clock of the machine.
+    # The current time is passed in; the client would ask the clock of the machine.
     updater._trusted_set.reference_time = now
     return updater
 

@@ -272,7 +272,7 @@ def _check_lists(folder: Folder, enclaves: Mapping[str, Mapping[str, bytes]]) ->
             has = f"the number {list_number(sent)}" if sent else "none"
             raise KeystoreError(
                 f"the revocation list for {name} in the release is older than the one here",
-                f"The present list has the number {number}, the release has {has}: revoked "
+                f"The current list has the number {number}, the release has {has}: revoked "
                 "enclaves would be trusted again. The keystore may come from a backup. "
                 "Nothing was changed.",
                 "Where the keystore is, run `sros fleet collect KEYSTORE INBOX`, which takes the "
@@ -325,8 +325,8 @@ def _change(
     """Return what changes in an enclave, after trying its new files with its key.
 
     Raises:
-        SrosError: the new files cannot be used, or the present ones cannot be replaced.
-        OSError: the present files cannot be read.
+        SrosError: the new files cannot be used, or the current ones cannot be replaced.
+        OSError: the current files cannot be read.
     """
     place = enclave_folder(name)
     _check_place(folder, place)
@@ -398,7 +398,7 @@ def _present_key(folder: Folder, name: str, files: Mapping[str, bytes]) -> Publi
     """Return the public key of an enclave, from its key file, its request or its certificate.
 
     A key on a token has no file: the enclave's signing request shows the public key, or, without a
-    request, the enclave's present certificate.
+    request, the enclave's current certificate.
 
     Raises:
         SrosError: the key is not on this robot, or cannot be read.

@@ -853,8 +853,8 @@ ROOT_ENCLAVE = FindingKind(
 def _check_root_enclave(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     """Yield a finding about an enclave / that has the rights of nodes, or of other enclaves.
 
-    A single node counts only if it has a plain name, and rights that not every node needs: tools
-    (``_ros2cli_*``) and a profile for any node have no better enclave.
+    A single node counts only if it has a plain name (not ``_ros2cli_*`` or an expression) and
+    rights that not every node needs.
     """
     root = checked_policy.policy.enclave("/")
     if root is None:

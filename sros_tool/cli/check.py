@@ -169,7 +169,7 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
 )
 @all_distros_option("Report the findings for all supported ROS 2 distributions.")
 @distro_option(
-    "Report only the differences after an update to this ROS 2 distribution, from the present "
+    "Report only the differences after an update to this ROS 2 distribution, from the current "
     "one: --distro, else the keystore's settings, else $ROS_DISTRO.",
     "--upgrade-to",
 )
@@ -550,7 +550,7 @@ def _nodes_of(distro: Distribution | None, *, all_distros: bool) -> str:
     """Return the distribution of the nodes in policies; "" stands for the latest."""
     if all_distros:
         return ""
-    return distro.named if distro else os.environ.get("ROS_DISTRO", "")
+    return distro.given_name if distro else os.environ.get("ROS_DISTRO", "")
 
 
 def _vendors(

@@ -382,25 +382,27 @@ class SeveralValues(Verb):
         return super().parse_args(ctx, spread)
 
 
-def split_root(words: Sequence[str]) -> tuple[Path, tuple[str, ...]]:
-    """Return the keystore (from the first word or the environment) and the remaining words.
+def split_root(arguments: Sequence[str]) -> tuple[Path, tuple[str, ...]]:
+    """Return the keystore (the first argument or from the environment) and the other arguments.
 
-    The first word is the keystore, unless it can only be the name of an enclave: it starts with
+    The first argument is the keystore, unless it can only be the name of an enclave: it starts with
     "/", is not a folder, and $ROS_SECURITY_KEYSTORE is set.
     """
-    first = words[0] if words else ""
+    first = arguments[0] if arguments else ""
     only_a_name = first.startswith("/") and not Path(first).is_dir()
     if not first or (only_a_name and os.environ.get(KEYSTORE_VARIABLE)):
-        return keystore_from_environment(), tuple(words)
-    return Path(first), tuple(words[1:])
+        return keystore_from_environment(), tuple(arguments)
+    return Path(first), tuple(arguments[1:])
 
 
-def root_and_file(words: Sequence[str], usage: str) -> tuple[Path, Path]:
-    """Return keystore and file from one or two words; one word is the file.
+def root_and_file(arguments: Sequence[str], usage: str) -> tuple[Path, Path]:
+    """Return keystore and file from one or two arguments; a single argument is the file.
 
-    Raises `UsageError` with ``usage`` if there are other words.
+    Raises `UsageError` with ``usage`` if there are other arguments.
     """
-    root, rest = split_root(words) if len(words) > 1 else (keystore_from_environment(), words)
+    root, rest = (
+        split_root(arguments) if len(arguments) > 1 else (keystore_from_environment(), arguments)
+    )
     if len(rest) != 1:
         raise UsageError(usage)
     return root, PATH.convert(rest[0], None, None)
@@ -440,7 +442,7 @@ def complete_keystore_and_enclave(
     from sros_tool.keystore.layout import is_keystore, search_enclaves
 
     path = ctx.params.get("path")
-    given = ctx.params.get("words") or ((path,) if path else ())
+    given = ctx.params.get("arguments") or ((path,) if path else ())
     root = Path(given[0]) if given else Path(os.environ.get(KEYSTORE_VARIABLE, ""))
     if given or (os.environ.get(KEYSTORE_VARIABLE) and incomplete.startswith("/")):
         names = search_enclaves(root)[0] if is_keystore(root) else ()
@@ -448,10 +450,10 @@ def complete_keystore_and_enclave(
     return [CompletionItem(incomplete, type="dir")]
 
 
-def words_argument(metavar: str, **more: Any) -> Callable[[Decorated], Decorated]:
-    """Add the words of a keystore and of enclaves, for `split_root`, as argument to a verb."""
+def keystore_arguments(metavar: str, **more: Any) -> Callable[[Decorated], Decorated]:
+    """Add a keystore and enclaves as arguments to a verb, for `split_root`."""
     return click.argument(
-        "words",
+        "arguments",
         metavar=metavar,
         nargs=-1,
         **{"required": True, "shell_complete": complete_keystore_and_enclave, **more},
@@ -468,7 +470,7 @@ def complete_robot(ctx: click.Context, _parameter: click.Parameter, incomplete: 
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.reader import Keystore
 
-    words = ctx.params.get("words") or ctx.params.get("sources")
+    words = ctx.params.get("arguments") or ctx.params.get("sources")
     words = words or (ctx.params.get("root") or ctx.params.get("folder"),)
     given = words[0] or os.environ.get(KEYSTORE_VARIABLE)
     fleet = None

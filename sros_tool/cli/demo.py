@@ -167,7 +167,7 @@ def demo(
     it takes about 30 s on Cyclone DDS and 60 s on rclpy. On Zenoh (--backend zenoh), all scenarios
     run, in about 25 s.
 
-    With talker, listener or router, run only this node until Ctrl-C, with the present environment
+    With talker, listener or router, run only this node until Ctrl-C, with the current environment
     variables, so that you can see who hears whom. The node runs on Cyclone DDS, rclpy, or Zenoh,
     which also needs a router. The node says at once whether it is secured. In an enclave, it needs
     only the right for its topic, whatever its nodes are called. A listener reads

@@ -23,6 +23,7 @@ from sros_tool.cli.common import (
     key_option,
     keyring,
     keystore_argument,
+    keystore_arguments,
     moment_of,
     now,
     print_json,
@@ -34,7 +35,6 @@ from sros_tool.cli.common import (
     several_enclaves,
     split_root,
     verb,
-    words_argument,
 )
 from sros_tool.errors import UsageError
 from sros_tool.terminal import Coloured, echo, echo_bytes
@@ -55,7 +55,7 @@ _STREAM = Path("-")
 
 
 @verb("distribute_key")
-@words_argument("[KEYSTORE] [ENCLAVE...] TARGET")
+@keystore_arguments("[KEYSTORE] [ENCLAVE...] TARGET")
 @several_enclaves
 @click.option("--force", is_flag=True, help="Replace files in TARGET that differ.")
 @click.option(
@@ -66,7 +66,7 @@ _STREAM = Path("-")
 @dry_run_option
 @json_option
 def distribute_key(
-    words: tuple[str, ...],
+    arguments: tuple[str, ...],
     all_enclaves: bool,
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
@@ -93,7 +93,7 @@ def distribute_key(
     from sros_tool.keystore.delivery.export import distribute, pack_enclaves, select
     from sros_tool.keystore.outcomes import changes_below
 
-    root, rest = split_root(words)
+    root, rest = split_root(arguments)
     names = rest[:-1]
     if not rest or not (names or all_enclaves or patterns or robots):
         raise UsageError("distribute_key takes a keystore, one or more enclaves and a target")
@@ -324,7 +324,7 @@ def create_request(
 
 
 @verb("sign_request")
-@words_argument("[KEYSTORE] REQUEST", shell_complete=complete_file)
+@keystore_arguments("[KEYSTORE] REQUEST", shell_complete=complete_file)
 @click.option(
     "-p",
     "--policy-file",
@@ -365,7 +365,7 @@ def create_request(
 @dry_run_option
 @json_option
 def sign_request(
-    words: tuple[str, ...],
+    arguments: tuple[str, ...],
     policy_file: Path | None,
     fleet_file: Path | None,
     output: Path | None,
@@ -397,7 +397,7 @@ def sign_request(
     from sros_tool.keystore.delivery.signing import sign_request as sign
     from sros_tool.runtime.variables import domain_from
 
-    root, request = root_and_file(words, "sign_request takes a keystore and one request")
+    root, request = root_and_file(arguments, "sign_request takes a keystore and one request")
     if no_answer:
         if output is not None or force:
             raise UsageError("--no-answer makes no file: leave out -o and --force")

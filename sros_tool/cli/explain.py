@@ -60,7 +60,7 @@ if TYPE_CHECKING:
     from sros_tool.proof.requirements import Requirement
     from sros_tool.zenoh.delivery import Check
 
-_WORDS = ("publish", "subscribe", "call", "serve", "execute", "request", "reply", "join")
+_OPERATIONS = ("publish", "subscribe", "call", "serve", "execute", "request", "reply", "join")
 _KINDS = {
     **dict.fromkeys(("publish", "subscribe"), "topics"),
     **dict.fromkeys(("call", "serve", "request", "reply"), "services"),
@@ -74,18 +74,18 @@ _VENDORS = (*(vendor.value for vendor in Vendor), ZENOH)
 # ── options ────────────────────────────────────────────────────────────────────────────────
 
 
-def _complete_words(
+def _complete_arguments(
     ctx: click.Context, parameter: click.Parameter, incomplete: str
 ) -> list[CompletionItem | str]:
-    """Complete the keystore, its enclaves, the operations of `_WORDS`, and then the ROS names."""
+    """Complete the keystore, its enclaves, the `_OPERATIONS`, and then the ROS names."""
     from sros_tool.keystore.layout import is_keystore
 
-    given: tuple[str, ...] = ctx.params.get("words") or ()
+    given: tuple[str, ...] = ctx.params.get("arguments") or ()
     named = bool(given) and is_keystore(Path(given[0]))
     rest = given[1:] if named else given
     before = 0 if ctx.params.get("who") else 1  # the enclave
     if len(rest) == before:
-        return [word for word in _WORDS if word.startswith(incomplete)]
+        return [word for word in _OPERATIONS if word.startswith(incomplete)]
     if len(rest) == before + 1:
         root = Path(given[0]) if named else ctx.params.get("keystore")
         names = _names_in_rights(ctx.params.get("policy") or root, _KINDS.get(rest[-1], ""))
@@ -116,7 +116,7 @@ def _complete_enclave(
     from sros_tool.keystore.layout import is_keystore, search_enclaves
 
     given = (
-        ctx.params.get("words") or ctx.args
+        ctx.params.get("arguments") or ctx.args
     )  # click fills only args if an option lacks its value
     named = ctx.params.get("keystore") or (given[0] if given else "")
     root = Path(named or os.environ.get(KEYSTORE_VARIABLE, ""))
@@ -157,10 +157,10 @@ def _refuse_ignored(mode: str) -> None:
 
 @verb("explain")
 @click.argument(
-    "words",
+    "arguments",
     metavar="[KEYSTORE|POLICY] [ENCLAVE] [publish|subscribe|call|serve|execute|join [NAME]]",
     nargs=-1,
-    shell_complete=_complete_words,
+    shell_complete=_complete_arguments,
 )
 @click.option(
     "--type",
@@ -195,7 +195,7 @@ def _refuse_ignored(mode: str) -> None:
     "--at",
     "moment",
     metavar="MOMENT",
-    help="Decide with the present files as of a date (2027-06-01) or a time from now (90d). "
+    help="Decide with the current files as of a date (2027-06-01) or a time from now (90d). "
     "[default: now]",
 )
 @click.option(
@@ -232,7 +232,7 @@ def _refuse_ignored(mode: str) -> None:
 )
 @json_option
 def explain(
-    words: tuple[str, ...],
+    arguments: tuple[str, ...],
     kind: str | None,
     keystore: Path | None,
     policy: Path | None,
@@ -288,7 +288,7 @@ def explain(
     mode = "--who" if who else "--reach" if reach else "--log" if logs else ""
     _refuse_ignored(mode)
     check_one_decider()
-    root, rest = _split(words, keystore, verb=0 if who else 1)
+    root, rest = _split(arguments, keystore, verb=0 if who else 1)
     from sros_tool.explain.asking import is_policy
 
     names_policy = root is not None and is_policy(root)
@@ -355,27 +355,29 @@ def explain(
 
 
 def _split(
-    words: tuple[str, ...], keystore: Path | None, *, verb: int
+    arguments: tuple[str, ...], keystore: Path | None, *, verb: int
 ) -> tuple[Path | None, tuple[str, ...]]:
-    """Split off the keystore (first word, or the option); return it and the other words.
+    """Split off the keystore (first argument, or the option); return it and the other arguments.
 
-    ``verb`` is the index of the operation (such as publish) in ``words`` without a keystore.
+    ``verb`` is the index of the operation (such as publish) in ``arguments`` without a keystore.
     """
     from sros_tool.keystore.layout import is_keystore
 
-    if keystore is not None and words and is_keystore(Path(words[0])):
+    if keystore is not None and arguments and is_keystore(Path(arguments[0])):
         raise UsageError(
-            f"two keystores are named, '{words[0]}' and '{keystore}'", "", "Leave one of them out."
+            f"two keystores are named, '{arguments[0]}' and '{keystore}'",
+            "",
+            "Leave one of them out.",
         )
-    if keystore is not None or not words or _is_word(words, verb):
-        return keystore, words
-    if _is_word(words, verb + 1) or Path(words[0]).exists():
-        return Path(words[0]), words[1:]
-    return None, words
+    if keystore is not None or not arguments or _is_operation(arguments, verb):
+        return keystore, arguments
+    if _is_operation(arguments, verb + 1) or Path(arguments[0]).exists():
+        return Path(arguments[0]), arguments[1:]
+    return None, arguments
 
 
-def _is_word(words: tuple[str, ...], place: int) -> bool:
-    return words[place : place + 1] != () and words[place] in _WORDS
+def _is_operation(arguments: tuple[str, ...], place: int) -> bool:
+    return arguments[place : place + 1] != () and arguments[place] in _OPERATIONS
 
 
 def _circumstances(
@@ -471,32 +473,32 @@ def _policy_alone(
     return [Note("explain.policy-alone", text)]
 
 
-def _question(root: Path | None, words_after_root: tuple[str, ...], kind: str | None) -> Question:
-    """Return the question in the words after the keystore: enclave, operation and name."""
+def _question(root: Path | None, other_arguments: tuple[str, ...], kind: str | None) -> Question:
+    """Return the question in the arguments after the keystore: enclave, operation and name."""
     from sros_tool.explain.answer import ask
     from sros_tool.keystore.layout import is_keystore
 
     if (
         root is None
-        and len(words_after_root) > 1
-        and words_after_root[1] in _WORDS
-        and is_keystore(Path(words_after_root[0]))
+        and len(other_arguments) > 1
+        and other_arguments[1] in _OPERATIONS
+        and is_keystore(Path(other_arguments[0]))
     ):
-        asked = " ".join(map(quote, words_after_root[1:]))
+        asked = " ".join(map(quote, other_arguments[1:]))
         raise UsageError(
             "no enclave is named",
             "",
-            f"Write `sros explain {quote(words_after_root[0])} ENCLAVE {asked}`, or ask for all "
+            f"Write `sros explain {quote(other_arguments[0])} ENCLAVE {asked}`, or ask for all "
             "enclaves: "
-            f"`sros explain {quote(words_after_root[0])} --who {asked}`.",
+            f"`sros explain {quote(other_arguments[0])} --who {asked}`.",
         )
-    if not 2 <= len(words_after_root) <= 3:
+    if not 2 <= len(other_arguments) <= 3:
         remedy = "Write for example `sros explain /talker publish /chatter`."
-        if root and len(words_after_root) == 1 and words_after_root[0].startswith("/"):
-            folder = quote(f"{root}/enclaves{words_after_root[0]}")
+        if root and len(other_arguments) == 1 and other_arguments[0].startswith("/"):
+            folder = quote(f"{root}/enclaves{other_arguments[0]}")
             remedy += f" `sros inspect {folder}` shows everything that this enclave may do."
         raise UsageError("explain takes an enclave, an operation and a name", "", remedy)
-    return ask(words_after_root[1], words_after_root[2] if len(words_after_root) > 2 else "", kind)
+    return ask(other_arguments[1], other_arguments[2] if len(other_arguments) > 2 else "", kind)
 
 
 def _echo(lines: Iterator[str]) -> None:
@@ -785,7 +787,7 @@ def _link_text(link: CheckedLink) -> str:
 
 def _show_who(
     root: Path | None,
-    words_after_root: tuple[str, ...],
+    other_arguments: tuple[str, ...],
     kind: str | None,
     chosen_vendor: tuple[Vendor, str] | None,
     why_zenoh: str,
@@ -805,7 +807,7 @@ def _show_who(
     from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.selection import select_enclaves
 
-    question = _question_to_all(words_after_root, kind)
+    question = _question_to_all(other_arguments, kind)
     keystore = Keystore(root or keystore_from_environment())
     keystore.check()
     patterns, robots = only
@@ -841,7 +843,7 @@ def _show_who(
 def _show_who_in_policy(
     policy: Path,
     root: Path | None,
-    words_after_root: tuple[str, ...],
+    other_arguments: tuple[str, ...],
     kind: str | None,
     chosen_vendor: tuple[Vendor, str] | None,
     asking: AskingContext,
@@ -863,22 +865,22 @@ def _show_who_in_policy(
         raise UsageError(
             "--robot takes a keystore", "", f"Add --match '/{robots[0]}/*' in place of it."
         )
-    question = _question_to_all(words_after_root, kind)
+    question = _question_to_all(other_arguments, kind)
     fleet = fleet_of(asking.fleet_file, None)
     _, stated = policy_to_ask(policy, fleet)
     decider = VendorOfPolicy(stated, *chosen_vendor, asking, patterns or ("*",))
     return _print_everybody(decider, question, kind, (fleet, asking.domain, None, ""), as_json)
 
 
-def _question_to_all(words_after_root: tuple[str, ...], kind: str | None) -> Question:
-    """Return the question in the words after the keystore: operation and name."""
+def _question_to_all(other_arguments: tuple[str, ...], kind: str | None) -> Question:
+    """Return the question in the arguments after the keystore: operation and name."""
     from sros_tool.explain.answer import ask
 
-    if not 1 <= len(words_after_root) <= 2:
+    if not 1 <= len(other_arguments) <= 2:
         raise UsageError(
             "--who takes an operation and a name", "", "Write for example publish /cmd_vel."
         )
-    return ask(words_after_root[0], words_after_root[1] if len(words_after_root) > 1 else "", kind)
+    return ask(other_arguments[0], other_arguments[1] if len(other_arguments) > 1 else "", kind)
 
 
 def _print_everybody(
@@ -955,7 +957,7 @@ def _who_lines(
 def _show_reach(
     enclave: str,
     root: Path | None,
-    words_after_root: tuple[str, ...],
+    other_arguments: tuple[str, ...],
     stated: tuple[Path | None, Path | None],
     infrastructure: bool,
     domain: int | None,
@@ -973,9 +975,9 @@ def _show_reach(
     from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 
     policy, fleet_file = stated
-    if root is None and len(words_after_root) == 1:
-        root, words_after_root = Path(words_after_root[0]), ()
-    if words_after_root:
+    if root is None and len(other_arguments) == 1:
+        root, other_arguments = Path(other_arguments[0]), ()
+    if other_arguments:
         raise UsageError("--reach takes an enclave, and no operation or name")
     if zenoh and policy:
         raise UsageError(
@@ -1027,17 +1029,17 @@ def _followed_lines(followed: FollowedReach) -> Iterator[str]:
 def _show_log(
     log: str,
     root: Path | None,
-    words_after_root: tuple[str, ...],
+    other_arguments: tuple[str, ...],
     asking: AskingContext,
     as_json: bool,
 ) -> int:
     """Print explanations of a DDS log, or of standard input for "-"; return 1 if there are any."""
     from sros_tool.explain.log import explain_log_of
 
-    if len(words_after_root) > 1:
+    if len(other_arguments) > 1:
         raise UsageError("--log takes at most a keystore and an enclave")
     text = read_log(log)
-    explained = explain_log_of(log, text, root, "".join(words_after_root), asking)
+    explained = explain_log_of(log, text, root, "".join(other_arguments), asking)
     if as_json:
         print_json(explained)
         return 1 if explained.findings else 0

@@ -30,6 +30,7 @@ from sros_tool.cli.common import (
     json_text,
     keyring,
     keystore_argument,
+    keystore_arguments,
     now,
     output_option,
     print_json,
@@ -39,7 +40,6 @@ from sros_tool.cli.common import (
     robot_option,
     root_and_file,
     save,
-    words_argument,
 )
 from sros_tool.cli.program import VerbGroup
 from sros_tool.errors import NOT_DONE, Note, SrosError, UsageError
@@ -154,7 +154,7 @@ def _dds_here(moment: datetime) -> RobotDds:
 
 
 @fleet.command("confirm")
-@words_argument("[KEYSTORE] FILE", shell_complete=complete_file)
+@keystore_arguments("[KEYSTORE] FILE", shell_complete=complete_file)
 @click.option(
     "--robot",
     metavar="NAME",
@@ -164,7 +164,7 @@ def _dds_here(moment: datetime) -> RobotDds:
 )
 @dry_run_option
 @json_option
-def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -> None:
+def _confirm(arguments: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -> None:
     """Store in KEYSTORE what a robot reports about its files.
 
     FILE is what `sros fleet report` or the Ansible collection made on the robot; - is standard
@@ -187,7 +187,7 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
     from sros_tool.keystore.layout import confirmation_file
     from sros_tool.keystore.reader import Keystore
 
-    root, file = root_and_file(words, "fleet confirm takes a keystore and one file")
+    root, file = root_and_file(arguments, "fleet confirm takes a keystore and one file")
     recorded_fleet(Keystore(root)).robot(robot)
     what = "standard input" if str(file) == "-" else f"'{file}'"
     data = read_named(file, "confirmation", max_bytes=MAX_BYTES)
@@ -224,7 +224,7 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
 
 
 @fleet.command("collect")
-@words_argument("[KEYSTORE] INBOX", shell_complete=complete_file)
+@keystore_arguments("[KEYSTORE] INBOX", shell_complete=complete_file)
 @click.option(
     "--restored",
     multiple=True,
@@ -243,7 +243,7 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
 @dry_run_option
 @json_option
 def _collect(
-    words: tuple[str, ...],
+    arguments: tuple[str, ...],
     folder: Path | None,
     restored: tuple[str, ...],
     allow_refusal: tuple[Vendor, ...],
@@ -273,7 +273,7 @@ def _collect(
     from sros_tool.keystore.delivery.collect import PublishedAnswers, collect
 
     moment = now()
-    root, inbox = root_and_file(words, "fleet collect takes a keystore and one folder")
+    root, inbox = root_and_file(arguments, "fleet collect takes a keystore and one folder")
     with progress("collecting"):
         collected = collect(
             root,
@@ -379,7 +379,7 @@ _VALIDITIES = {
 
 
 @fleet.command("publish")
-@words_argument("[KEYSTORE] PUB", shell_complete=complete_file)
+@keystore_arguments("[KEYSTORE] PUB", shell_complete=complete_file)
 @click.option(
     "--root-key",
     type=PATH,
@@ -409,7 +409,7 @@ _VALIDITIES = {
 @dry_run_option
 @json_option
 def _publish(
-    words: tuple[str, ...],
+    arguments: tuple[str, ...],
     root_key: Path | None,
     rotated: tuple[str, ...],
     restored: bool,
@@ -447,7 +447,7 @@ def _publish(
     from sros_tool.validity import parse_duration
 
     moment = now()
-    root, folder = root_and_file(words, "fleet publish takes a keystore and one folder")
+    root, folder = root_and_file(arguments, "fleet publish takes a keystore and one folder")
     given = {
         name.removesuffix("_validity"): parse_duration(text)
         for name, text in validities.items()
@@ -1002,7 +1002,7 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
         names = first_few(robot.lacks_key, _MOST_GROUPS)
         yield f"lacks the key of {names}, which no release brings"
     elif robot.is_locked_out and robot.enclaves:
-        yield "all its certificates are revoked: a web server with the present list refuses it"
+        yield "all its certificates are revoked: a web server with the current list refuses it"
     if robot.restart:
         yield f"processes of {first_few(robot.restart, _MOST_GROUPS)} may run with earlier files"
     if robot.enclaves and robot.stage not in ("", "unknown", stage):

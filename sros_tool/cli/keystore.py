@@ -32,6 +32,7 @@ from sros_tool.cli.common import (
     key_option,
     keyring,
     keystore_argument,
+    keystore_arguments,
     keystore_from_environment,
     now,
     policy_for,
@@ -42,7 +43,6 @@ from sros_tool.cli.common import (
     several_enclaves,
     split_root,
     verb,
-    words_argument,
 )
 from sros_tool.errors import Note, UsageError
 from sros_tool.terminal import echo
@@ -56,11 +56,11 @@ if TYPE_CHECKING:
 
 
 @verb("create_enclave")
-@words_argument("[KEYSTORE] ENCLAVE...")
+@keystore_arguments("[KEYSTORE] ENCLAVE...")
 @key_option
 @dry_run_option
 @json_option
-def create_enclave(words: tuple[str, ...], key: str, dry_run: bool, as_json: bool) -> None:
+def create_enclave(arguments: tuple[str, ...], key: str, dry_run: bool, as_json: bool) -> None:
     """Create ENCLAVE... in KEYSTORE.
 
     An existing enclave keeps its key and its permissions; missing files are added. With --key, the
@@ -76,7 +76,7 @@ def create_enclave(words: tuple[str, ...], key: str, dry_run: bool, as_json: boo
     """
     from sros_tool.keystore.lifecycle.create import create_enclaves
 
-    root, names = split_root(words)
+    root, names = split_root(arguments)
     if not names:
         raise UsageError("no enclave is named", "", "Name one or more, such as /talker.")
     with progress("signing", len(names)) as step:
@@ -101,7 +101,7 @@ _revoke_old_option = click.option(
 
 
 @verb("create_permission")
-@words_argument("[KEYSTORE] [ENCLAVE...] POLICY_FILE")
+@keystore_arguments("[KEYSTORE] [ENCLAVE...] POLICY_FILE")
 @several_enclaves
 @fleet_option("The robots that the placeholders of the policy stand for.")
 @_revoke_old_option
@@ -109,7 +109,7 @@ _revoke_old_option = click.option(
 @dry_run_option
 @json_option
 def create_permission(
-    words: tuple[str, ...],
+    arguments: tuple[str, ...],
     all_enclaves: bool,
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
@@ -133,7 +133,7 @@ def create_permission(
     """
     from sros_tool.keystore.lifecycle.create import create_permission as create
 
-    root, rest = split_root(words)
+    root, rest = split_root(arguments)
     if len(rest) < (1 if all_enclaves or patterns or robots else 2):
         raise UsageError(
             "create_permission takes a keystore, one or more enclaves and a policy", "", _ORDER

@@ -27,13 +27,13 @@ from sros_tool.cli.common import (
     key_option,
     keyring,
     keystore_argument,
+    keystore_arguments,
     now,
     print_json,
     progress,
     several_enclaves,
     split_root,
     verb,
-    words_argument,
 )
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.terminal import echo
@@ -54,7 +54,7 @@ _crl_option = click.option(
 
 
 @verb("renew")
-@words_argument("[KEYSTORE] [ENCLAVE...]", required=False)
+@keystore_arguments("[KEYSTORE] [ENCLAVE...]", required=False)
 @several_enclaves
 @click.option(
     "--all-expiring",
@@ -74,7 +74,7 @@ _crl_option = click.option(
 @dry_run_option
 @json_option
 def renew(
-    words: tuple[str, ...],
+    arguments: tuple[str, ...],
     all_enclaves: bool,
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
@@ -106,7 +106,7 @@ def renew(
     from sros_tool.keystore.expiry import parse_threshold
     from sros_tool.keystore.lifecycle.renew import renew as work
 
-    root, names = split_root(words)
+    root, names = split_root(arguments)
     if names or patterns or robots or all_enclaves or all_expiring is None:
         names = chosen_enclaves(root, names, patterns, robots, all_enclaves=all_enclaves)
     threshold = parse_threshold(all_expiring) if all_expiring is not None else None
@@ -176,7 +176,7 @@ def _complete_reason(
 
 
 @verb("revoke")
-@words_argument("[KEYSTORE] [ENCLAVE...]", required=False)
+@keystore_arguments("[KEYSTORE] [ENCLAVE...]", required=False)
 @several_enclaves
 @click.option(
     "--reason",
@@ -197,7 +197,7 @@ def _complete_reason(
 @dry_run_option
 @json_option
 def revoke(
-    words: tuple[str, ...],
+    arguments: tuple[str, ...],
     all_enclaves: bool,
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
@@ -226,7 +226,7 @@ def revoke(
     from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.selection import select_to_revoke
 
-    root, given = split_root(words)
+    root, given = split_root(arguments)
     check_chosen(given, patterns, robots, all_enclaves=all_enclaves)
     names, selection_notes = select_to_revoke(
         Keystore(root), given, patterns, robots, all_enclaves=all_enclaves

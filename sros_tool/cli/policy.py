@@ -640,7 +640,7 @@ def policies(
     --copy adds missing files to an existing folder, and replaces nothing: if a file differs,
     nothing is copied.
 
-    --convert gives a policy of version 0.1.0 (ROS 2 Crystal to Eloquent) the present format, with
+    --convert gives a policy of version 0.1.0 (ROS 2 Crystal to Eloquent) the current format, with
     the same rights: each node becomes an enclave with the node's name. Nodes of a later ROS 2 need
     more rights; --with-node-rights adds them. The result is one file: includes are resolved, and
     comments are lost. The exit status is 1 if a part was left out.

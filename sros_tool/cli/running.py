@@ -26,6 +26,7 @@ from sros_tool.cli.common import (
     dry_run_option,
     enclave_environment,
     json_option,
+    keystore_arguments,
     now,
     print_json,
     print_notes,
@@ -33,7 +34,6 @@ from sros_tool.cli.common import (
     several_enclaves,
     split_root,
     verb,
-    words_argument,
 )
 from sros_tool.enclave_environment import (
     INSTALLED,
@@ -61,7 +61,7 @@ _NO_PIN = (
     f"no file has the PIN of the token (pin-source), so Fast DDS takes it from ${_FAST_DDS_PIN}, "
     "which root and this user can read in /proc."
 )
-_WORDS = words_argument("[KEYSTORE] ENCLAVE")
+_WORDS = keystore_arguments("[KEYSTORE] ENCLAVE")
 _DOMAIN = click.option(
     "--domain", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or the keystore's]"
 )
@@ -173,7 +173,7 @@ def _form_of(arguments: Sequence[str]) -> str:
 @_ACCEPT_KEY
 @json_option
 def env(
-    words: tuple[str, ...],
+    arguments: tuple[str, ...],
     form: str,
     target_dir: str | None,
     container: str | None,
@@ -210,7 +210,7 @@ def env(
     from sros_tool.runtime.environment import PrintedEnvironment, render_environment
 
     check_one_format()
-    root, rest = split_root(words)
+    root, rest = split_root(arguments)
     if len(rest) != 1:
         raise UsageError("env takes a keystore and one enclave")
     for option, value in (("--name", container), ("--image", image)):
@@ -287,7 +287,7 @@ class _WithCommand(Verb):
 
 
 @verb("run", cls=_WithCommand)
-@words_argument("[KEYSTORE] ENCLAVE -- COMMAND...", required=False, type=click.UNPROCESSED)
+@keystore_arguments("[KEYSTORE] ENCLAVE -- COMMAND...", required=False, type=click.UNPROCESSED)
 @click.option(
     "--policy",
     metavar="FILE",
@@ -302,7 +302,7 @@ class _WithCommand(Verb):
 @click.pass_context
 def run(
     ctx: click.Context,
-    words: tuple[str, ...],
+    arguments: tuple[str, ...],
     policy: Path | None,
     domain: str | None,
     rmw: str | None,
@@ -329,7 +329,7 @@ def run(
     """
     from sros_tool.runtime.environment import enclave_argument, named_enclave, with_enclave
 
-    root, rest = split_root(words)
+    root, rest = split_root(arguments)
     if policy and rest and ctx.meta[_COMMAND]:
         raise UsageError(
             f"--policy and the enclave {rest[0]} exclude each other",
@@ -419,7 +419,7 @@ class _WithCommandAfterDashes(_WithCommand):
 
 
 @verb("units", cls=_WithCommandAfterDashes)
-@words_argument("[KEYSTORE] [ENCLAVE...] FOLDER [-- COMMAND...]")
+@keystore_arguments("[KEYSTORE] [ENCLAVE...] FOLDER [-- COMMAND...]")
 @several_enclaves
 @click.option(
     "--job",
@@ -481,7 +481,7 @@ class _WithCommandAfterDashes(_WithCommand):
 @click.pass_context
 def units(
     ctx: click.Context,
-    words: tuple[str, ...],
+    arguments: tuple[str, ...],
     all_enclaves: bool,
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
@@ -523,7 +523,7 @@ def units(
         write_units,
     )
 
-    root, rest = split_root(words)
+    root, rest = split_root(arguments)
     command = tuple(ctx.meta[_COMMAND])
     several = bool(all_enclaves or patterns or robots)
     if not rest or not (rest[1:] or several or jobs):

@@ -1,6 +1,6 @@
 """The library that runs the demo's nodes: rclpy, Cyclone DDS, or Zenoh.
 
-A single node can also be run by hand, in the present environment, such as that of ``sros run``.
+A single node can also be run by hand, in the current environment, such as that of ``sros run``.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ ros2cli takes the last of the packages that have the command.  Source: ros2cli 0
 ``entry_points.py``: entry points by name, in the order of ``sys.path``.
 
 The report to attach to a question says what runs here, and nothing that is secret or private:
-values are shown only where they are one of a few known ones; all other text, such as what a DDS
-logged, is made neutral first: secrets, keys, tokens, names of hosts and users, and paths.
+only a few known values are shown; secrets, keys, tokens, names of hosts and users, and paths are
+removed from all other text, such as what a DDS logged.
 """
 
 from __future__ import annotations
@@ -259,16 +259,16 @@ _SYSTEM = ("/dev/", "/etc/", "/lib/", "/lib64/", "/opt/ros/", "/proc/", "/sys/",
 def support_report(
     environment: Mapping[str, str], sections: Mapping[str, Sequence[str]], *, secrets: Iterable[str]
 ) -> str:
-    """Return the report as text: versions, system, environment, and ``sections`` made neutral.
+    """Return the report without private data: versions, system, environment, and ``sections``.
 
     ``secrets`` are values that no section may show, in addition to those of ``environment``.
     """
-    neutral = _Neutral(environment, secrets)
+    without_private = _PrivateDataRemover(environment, secrets)
     parts = {
         "Versions": _versions(),
         "System": _system(),
         "Environment": _environment(environment),
-        **{title: [neutral(line) for line in lines] for title, lines in sections.items()},
+        **{title: [without_private(line) for line in lines] for title, lines in sections.items()},
     }
     lines: list[str] = []
     for title, body in parts.items():
@@ -310,8 +310,8 @@ def _environment(environment: Mapping[str, str]) -> list[str]:
     return lines + [f"{name} is set" for name in _PRESENT if name in environment]
 
 
-class _Neutral:
-    """Remover of private data from texts: secrets, keys, tokens, hosts, users, and paths."""
+class _PrivateDataRemover:
+    """Removes private data from texts: secrets, keys, tokens, hosts, users, and paths."""
 
     def __init__(self, environment: Mapping[str, str], secrets: Iterable[str]) -> None:
         user = pwd.getpwuid(getuid()) if _has_entry() else None

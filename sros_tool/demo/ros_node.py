@@ -211,7 +211,7 @@ def _listener(node: Any, options: NodeOptions, events: EventWriter) -> None:
 def _observer(node: Any, options: NodeOptions, events: EventWriter) -> None:
     """Count the publishers of topics, as any intruder could."""
 
-    def look() -> None:
+    def count_publishers() -> None:
         counts = {topic: node.count_publishers(topic) for topic in (options.topic, *options.also)}
         # A node lists its own topics too, so the list of names is only logged: the count of
         # publishers shows whether a talker is visible.
@@ -219,7 +219,7 @@ def _observer(node: Any, options: NodeOptions, events: EventWriter) -> None:
         node.get_logger().info(f"Publishers: {counts}; topics: {listed}")
         events.report(EventKind.SEEN, listed, publishers=counts)
 
-    node.create_timer(options.period, look)
+    node.create_timer(options.period, count_publishers)
 
 
 # ── services ───────────────────────────────────────────────────────────────────────────────

@@ -366,7 +366,7 @@ class Answer(NamedTuple):
 
     `sros_tool.explain.explanation` fills in the other fields.  ``lines`` are the lines of the
     policy file from which the deciding rule comes, and ``provenance`` says whether the permissions
-    were made from that file.  ``sign`` says that the present policy file would allow the access
+    were made from that file.  ``sign`` says that the current policy file would allow the access
     once it is signed.
     """
 

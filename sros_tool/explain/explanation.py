@@ -89,12 +89,12 @@ def _provenance(enclave: LoadedEnclave, recorded: str) -> Provenance | None:
         return Provenance.PLANNED
     if not recorded:
         return Provenance.UNKNOWN
-    if not _states_policy(enclave):
+    if not _has_rules_of_policy(enclave):
         return Provenance.CHANGED
     return Provenance.SAME if recorded == enclave.policy.digest else Provenance.EQUAL
 
 
-def _states_policy(enclave: LoadedEnclave) -> bool:
+def _has_rules_of_policy(enclave: LoadedEnclave) -> bool:
     """Return whether the rules of the grant that DDS reads are those of the policy."""
     from sros_tool.translate import permissions_for
 
@@ -120,7 +120,7 @@ def _with_policy_change(evaluator: Evaluator, answer: Answer) -> Answer | None:
         return None
     if change.add or change.lift:
         return answer._replace(change=change)
-    # The present policy allows it.
+    # The current policy allows it.
     return answer._replace(sign=True) if answer.provenance is Provenance.CHANGED else None
 
 

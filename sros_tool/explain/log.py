@@ -636,7 +636,7 @@ class _Examiner:
             known += [f"the peer is enclave {name}: {cause}" for cause, _ in causes]
             remedies += [f"{cause} Then restart its processes." for _, cause in causes if cause]
             if not causes:
-                known.append(f"the peer is enclave {name}, whose present files have no fault")
+                known.append(f"the peer is enclave {name}, whose current files have no fault")
                 if not (rotating and finding.id in _OF_ROTATION):
                     remedies.append(_OLDER_FILES.format(peer=name))
         if peers and rotating and finding.id in _OF_ROTATION:
@@ -675,7 +675,7 @@ class _Examiner:
             return replace(finding, remedy=named_remedy)
         answer = self._answer(enclave, denial.vendor, _question(denial))
         if answer.allowed:
-            facts = ["the present permissions allow it"]
+            facts = ["the current permissions allow it"]
             elsewhere, remedy = self._other_folder_cause(denial, enclave)
             facts += elsewhere
             remedy = remedy or (

@@ -363,7 +363,7 @@ class VendorOutcome(NamedTuple):
 
     @property
     def stopped(self) -> str:
-        """Why no process can run in the enclave with its present files, or ""."""
+        """Why no process can run in the enclave with its current files, or ""."""
         runs = self.outcome not in (Outcome.REFUSED, Outcome.CRASHES)
         return "" if runs else self.text.partition(": ")[2]
 

@@ -49,7 +49,7 @@ class EnclaveOutcome(Protocol):
 
     @property
     def stopped(self) -> str:
-        """Why no process can run in the enclave with its present files, or ""."""
+        """Why no process can run in the enclave with its current files, or ""."""
 
     @property
     def domains(self) -> str:

@@ -255,7 +255,7 @@ def _duplicate_path_error(path: str, enclave: Enclave, other: Enclave) -> Policy
 _NAMESPACE = "{namespace"
 
 
-def absolute(policy: Policy) -> Policy:
+def with_absolute_names(policy: Policy) -> Policy:
     """Return the policy with "/" before each name that begins with ``{namespace}``.
 
     A namespace begins with "/", so such names are absolute; with the "/" they also look so.
@@ -264,12 +264,12 @@ def absolute(policy: Policy) -> Policy:
 
 
 def as_written(text: str) -> str:
-    """Return names in a text as the policy file has them: the reverse of `absolute`."""
+    """Return names in a text as the policy file has them: the reverse of `with_absolute_names`."""
     return text.replace(f"/{_NAMESPACE}", _NAMESPACE)
 
 
-def written(policy: Policy) -> Policy:
-    """Return the policy with names as the policy file has them: the reverse of `absolute`."""
+def with_names_as_written(policy: Policy) -> Policy:
+    """Return the policy with names as its file has them: the reverse of `with_absolute_names`."""
     return _renamed(policy, as_written)
 
 
@@ -284,13 +284,13 @@ def _renamed(policy: Policy, change: Callable[[str], str]) -> Policy:
 def with_placeholders(policy: FleetPolicy, observed: Iterable[Right]) -> frozenset[Right]:
     """Return observed rights, in which placeholders replace the names of robots.
 
-    Names have the form of `absolute`.  A right that the policy does not state keeps its name; if
-    the policy does not have its enclave, the right also keeps the enclave.
+    Names have the form of `with_absolute_names`.  A right that the policy does not state keeps its
+    name; if the policy does not have its enclave, the right also keeps the enclave.
     """
     expanded: set[Right] = set()
     for path, rights in _rights_by_enclave(observed).items():
         if path in policy:
-            expanded.update(_stated(policy, path, unfolded(rights)))
+            expanded.update(_as_stated(policy, path, unfolded(rights)))
         else:
             expanded.update(rights)
     return frozenset(expanded)
@@ -318,7 +318,7 @@ def check_narrowed(policy: FleetPolicy, result: MinimizedPolicy, observed: Itera
     Raises:
         PolicyError: a wildcard of the policy means something else for another robot.
     """
-    after = FleetPolicy(written(result.policy), policy.fleet)
+    after = FleetPolicy(with_names_as_written(result.policy), policy.fleet)
     seen = _rights_by_enclave(observed)
     replaced = {use.enclave for use in result.uses if use.wildcards}
     for path in policy:
@@ -346,14 +346,15 @@ def _rights_by_enclave(observed: Iterable[Right]) -> dict[str, list[Right]]:
     return by_enclave
 
 
-def _stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Iterator[Right]:
+def _as_stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Iterator[Right]:
     """Yield the observed rights of an enclave as the policy states them.
 
     A right to an action is yielded as rights to its parts.
     """
     enclave, robot = policy.stated(path)
     policy[path]  # which has a bounded number of names
-    stated = [e for e in policy_rights(absolute(Policy((enclave,)))) if e.qualifier is ALLOW]
+    rights = policy_rights(with_absolute_names(Policy((enclave,))))
+    stated = [right for right in rights if right.qualifier is ALLOW]
     exact: dict[tuple[str, str], list[Right]] = defaultdict(list)
     for right in stated:
         for name in _names(policy, right.name, robot):
@@ -384,7 +385,7 @@ def _stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Iterat
 def _names(policy: FleetPolicy, name: str, robot: Robot | None) -> Iterable[str]:
     """Return the names that a name with placeholders stands for, for a robot.
 
-    The name has the form of `absolute`.
+    The name has the form of `with_absolute_names`.
     """
     if not has_placeholder(name):
         return (name,)

@@ -111,7 +111,7 @@ class Learned:
     source: RightsFound = RightsFound.GRAPH
 
     def noting(self, notes: Iterable[Note]) -> Learned:
-        """Return a copy with ``notes`` in front of the present notes."""
+        """Return a copy with ``notes`` in front of the current notes."""
         return replace(self, notes=(*notes, *self.notes))
 
     @property
@@ -748,7 +748,7 @@ class LearnedPolicy(NamedTuple):
 class Draft(NamedTuple):
     """A change of the policy file at ``path`` that is not written yet.
 
-    ``before`` is the present content of the file, None if there is no file; ``document`` is the
+    ``before`` is the current content of the file, None if there is no file; ``document`` is the
     new content.  ``copies`` maps the paths of files to create, relative to the policy's folder, to
     their content.  ``document`` must give all rights in ``least`` and no right outside of ``most``.
     """

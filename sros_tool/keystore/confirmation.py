@@ -427,7 +427,7 @@ def receive(data: bytes, robot: str, label: str, *, now: datetime) -> Received:
         data: JSON that `render_confirmation` writes.
         robot: name of the robot.
         label: name of the document in errors.
-        now: the present time.
+        now: the current time.
 
     Raises:
         DocumentError: ``data`` is not a confirmation, or is the confirmation of another robot.

@@ -988,7 +988,7 @@ class HistoryStatus(StrEnum):
 
 @shows(spread=("entry",))
 class HistoryItem(NamedTuple):
-    """An entry of the ledger, and the present state of the recorded item."""
+    """An entry of the ledger, and the current state of the recorded item."""
 
     entry: Entry
     """Entry of the ledger."""
@@ -1012,7 +1012,7 @@ class History(NamedTuple):
 
 
 def history(root: Path, *, now: datetime) -> History:
-    """Return the entries of a keystore's ledger, with the present state of the recorded items."""
+    """Return the entries of a keystore's ledger, with the current state of the recorded items."""
     issued, revoked_files = _files(root, _active_paths(root)), _files(root, _revoked_paths(root))
     retired = _files(root, _retired_paths(root))
     keystore = Keystore(root)

@@ -82,16 +82,16 @@ class State(StrEnum):
     NONE = "none"
     """The robot has no enclave in the keystore."""
     RESTART = "restart"
-    """The robot has the present files, and processes that still run with earlier ones."""
+    """The robot has the current files, and processes that still run with earlier ones."""
     UNUSABLE = "unusable"
-    """The robot has the present files, and says that no process could start in an enclave."""
+    """The robot has the current files, and says that no process could start in an enclave."""
     EARLIER = "earlier"
     """An earlier file that the keystore issued for the same enclave."""
     DIFFERENT = "different"
-    """A Zenoh file that is not the present one; the ledger does not record earlier Zenoh files."""
+    """A Zenoh file that is not the current one; the ledger does not record earlier Zenoh files."""
     MISSING = "missing"
     EXPIRED = "expired"
-    """A file that the robot has, also if it is the present one, has expired."""
+    """A file on the robot has expired, even if it is the current one."""
     OFFLINE = "offline"
     """The robot has sent nothing for too long, whatever files it had then."""
     BROKEN = "broken"
@@ -99,7 +99,7 @@ class State(StrEnum):
     NEVER = "never"
     """The robot has sent no confirmation."""
     REFUSED = "refused"
-    """The last message of the robot was refused, so its present files are not known."""
+    """The last message of the robot was refused, so its current files are not known."""
     LATER = "later"
     """The robot says that it has installed a later release than was ever published for it."""
     UNKNOWN = "unknown"
@@ -199,8 +199,8 @@ class RobotStatus:
 
     ``others`` are enclaves of the robot that the fleet does not record.  ``has_release`` is for a
     robot whose files differ from the keystore's: whether the release that was published last for it
-    has the present files of the keystore.  ``short_lived`` are enclaves with such a validity, of
-    which a file expires soon or has expired.  ``has_list`` says whether it has the present
+    has the current files of the keystore.  ``short_lived`` are enclaves with such a validity, of
+    which a file expires soon or has expired.  ``has_list`` says whether it has the current
     revocation list, in force or not, and ``renew_from`` from when a file of it expires soon.
     ``lacks_key`` are enclaves whose key the keystore has and the robot does not, which no release
     brings.  ``reads_copy`` says that it fetched after the publication and got an earlier release,
@@ -251,7 +251,7 @@ class RobotStatus:
     """The files that the processes of each enclave of the robot have loaded, by its last
     confirmation; null if the confirmation does not tell."""
     crl_in_force: bool | None
-    """Whether the robot has the present revocation list, says that no process may run with earlier
+    """Whether the robot has the current revocation list, says that no process may run with earlier
     files (``restart`` is empty), and is not ``offline``; false if this is not known, or the
     keystore is older than its robots; null if the keystore has no list, or the robot has no
     enclave. Robots do not say which of their earlier files a process has, so a restart for other
@@ -264,7 +264,7 @@ class RobotStatus:
     """What the robot's agent could not do, or what is wrong on the robot, in its own words, or that
     it fetches from an old copy of what was published; null if the confirmation does not tell."""
     notes: tuple[str, ...]
-    """Remarks, as clauses, such as on the robot's clock."""
+    """Remarks (clauses), for example about the robot's clock."""
     to_do: str = ""
     """What you have to do for the robot, in a few words; empty if nothing."""
     has_release: bool = False
@@ -277,7 +277,7 @@ class RobotStatus:
 
     @property
     def is_published(self) -> bool:
-        """Whether the robot reports the published release, which has the present files."""
+        """Whether the robot reports the published release, which has the current files."""
         return self.has_release and bool(self.release) and self.release == self.published
 
     @property
@@ -453,7 +453,7 @@ class FleetStatus:
 
     @property
     def complete(self) -> bool:
-        """Whether every robot that has enclaves confirmed the present files in time, says that no
+        """Whether every robot that has enclaves confirmed the current files in time, says that no
         restart is due and that its agent has no problem, and robots still accept what was
         published; if not, the exit status is 1. Robots of which all enclaves were revoked do not
         count.
@@ -792,7 +792,7 @@ class _Known:
         return release > (self._last_release if last is None else last)
 
     def has_release(self, compared_robot: _ComparedRobot) -> bool:
-        """Return whether the last release of a robot that fetches has the present files."""
+        """Return whether the last release of a robot that fetches has the current files."""
         published = self._published.get(compared_robot.robot.name)
         if published is None or not (compared_robot.received and compared_robot.received.message):
             return False
@@ -1147,7 +1147,7 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_revocation_list_in_force",
-            "Whether the present revocation list is in force on a robot (1), or not, or it is not "
+            "Whether the current revocation list is in force on a robot (1), or not, or it is not "
             "known (0).",
             per_robot(
                 lambda robot: None if robot.crl_in_force is None else int(robot.crl_in_force)

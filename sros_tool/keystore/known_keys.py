@@ -176,7 +176,7 @@ class KnownKeys:
     ) -> None:
         """Raise `KeystoreError` if ``key`` was revoked; ``holder`` names its holder in the error.
 
-        ``certificate`` is the present certificate for the key: a backup may have restored a revoked
+        ``certificate`` is the current certificate for the key: a backup may have restored a revoked
         certificate.
         """
         revoked = self._revoked.get(key_digest(key))

@@ -376,7 +376,7 @@ def _is_inside(path: str, top: str) -> bool:
 def enclave_names(root: Path, *, hidden: bool = False) -> tuple[str, ...]:
     """Return the sorted names of the enclaves: every folder that has a certificate or a key.
 
-    With ``hidden``, as `search_enclaves`.
+    ``hidden`` is as in `search_enclaves`.
 
     Raises:
         KeystoreError: an enclave may be missing, because a folder cannot be read.
@@ -407,7 +407,7 @@ def enclaves_below(root: Path, name: str) -> tuple[str, ...]:
 def has_zenoh_files(root: Path, *, hidden: bool = False) -> bool:
     """Return whether any enclave that this user can read has a Zenoh configuration.
 
-    With ``hidden``, as `search_enclaves`.
+    ``hidden`` is as in `search_enclaves`.
     """
     return any(
         is_enclave(Path(folder)) and Path(folder, file).is_file()

@@ -126,7 +126,7 @@ class Ledger(NamedTuple):
     """The readable entries of a ledger, oldest first, and its faults.
 
     ``gaps`` are clauses about lines that are missing, changed or unreadable; faults from before the
-    present CAs are left out, because nothing that other CAs signed is valid.  ``certain`` are the
+    current CAs are left out, because nothing that other CAs signed is valid.  ``certain`` are the
     entries after the last gap: nothing is missing among them.  ``unchained`` is the number of lines
     from before the chain, some of which may have been removed.  ``lines`` is the number of all
     lines.

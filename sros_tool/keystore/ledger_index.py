@@ -256,7 +256,7 @@ class LedgerIndex:
 
 
 class IndexUpdate:
-    """The index of a ledger to which lines are added; ``base`` is the present one, None without.
+    """The index of a ledger to which lines are added; ``base`` is the current one, None without.
 
     Without a base, all lines of the ledger have to be added.
     """
@@ -299,7 +299,7 @@ class IndexUpdate:
         """Return the root of the index with all lines that were added, in hexadecimal.
 
         Raises:
-            IndexDamagedError: the present index is not what it was when the head was signed.
+            IndexDamagedError: the current index is not what it was when the head was signed.
         """
         digests = bytearray(self._base.digests if self._base else _EMPTY * _BUCKETS)
         changed: dict[int, dict[str, bool]] = {bucket: {} for bucket in self._added}

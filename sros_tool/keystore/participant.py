@@ -155,7 +155,7 @@ def load_enclave_of(keystore: Keystore, name: str, *, moment: datetime) -> Loade
 def deciding_enclave(keystore: Keystore, name: str, *, moment: datetime) -> LoadedEnclave:
     """Return an enclave as `load_enclave_of` does, to decide what its documents allow.
 
-    In a copy of a keystore without any keys, its key counts as there.
+    In a copy of a keystore without any keys, its key is not reported as missing.
     """
     enclave = load_enclave_of(keystore, name, moment=moment)
     lacks_key = enclave.state is not None and KEY_FILE not in enclave.state.files

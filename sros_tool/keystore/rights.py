@@ -925,7 +925,7 @@ class RecordedRights:
 
         Args:
             name: the enclave.
-            digest: the SHA-256 of its present permissions document, in hexadecimal.
+            digest: the SHA-256 of its current permissions document, in hexadecimal.
 
         Raises:
             KeystoreError: it is not the last document that the ledger records for the enclave.

@@ -367,7 +367,7 @@ def with_values(
     Args:
         template: the template.
         values: keys, such as ``protection.rtps``, with their new values as text.
-        rules: protections of names, which replace the present protection of these names.
+        rules: protections of names, which replace the current protection of these names.
         dropped: kinds and names (``topic``, ``/camera/*``) whose own protection is removed.  Names
             without a leading / count from the root, as in a template.
 

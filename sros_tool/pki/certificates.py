@@ -29,7 +29,7 @@ from sros_tool.errors import PkiError
 from sros_tool.pki import der, tolerant
 from sros_tool.pki import pem as pem_file
 from sros_tool.pki.distinguished_names import (
-    is_of_reading,
+    may_be_read_error,
     read_name,
     reading,
     same_name,
@@ -351,7 +351,7 @@ def _load_known_der(data: bytes) -> x509.Certificate:
     try:
         return _read_in_full(x509.load_der_x509_certificate(data))
     except BaseException as error:
-        if not is_of_reading(error):
+        if not may_be_read_error(error):
             raise
     return _read_names(tolerant.read_certificate(data))
 

@@ -28,7 +28,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.distinguished_names import (
     canonical,
-    is_of_reading,
+    may_be_read_error,
     read_name,
     reading,
     same_name,
@@ -197,7 +197,7 @@ def _read(content: bytes) -> x509.CertificateRevocationList:
     try:
         return _read_in_full(x509.load_der_x509_crl(data))
     except BaseException as error:
-        if not is_of_reading(error):
+        if not may_be_read_error(error):
             raise
     return _read_in_full(tolerant.read_list(data))
 

@@ -95,12 +95,12 @@ def reading(what: str, why: str, remedy: str = "") -> Iterator[None]:
     try:
         yield
     except BaseException as error:
-        if is_of_reading(error):
+        if may_be_read_error(error):
             raise PkiError(what, why, remedy) from error
         raise
 
 
-def is_of_reading(error: BaseException) -> bool:
+def may_be_read_error(error: BaseException) -> bool:
     """Return whether `cryptography` may raise this error for a malformed document."""
     return isinstance(error, Exception) or type(error).__name__ == "PanicException"
 

@@ -648,7 +648,7 @@ def _empty_list_clauses(
 
 
 def _why_never_fails(requirement: Requirement, world: World) -> str:
-    """Return why a requirement cannot fail with the present enclaves, as a clause, or "".
+    """Return why a requirement cannot fail with the current enclaves, as a clause, or "".
 
     A list with the names of all present enclaves is no such reason: enclaves may be added.
     """

@@ -176,7 +176,7 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
 
 def _step(use: Use, world: World, system: System) -> Step:
     """Return a use with the right that allows it; the right can be one of another enclave."""
-    holder = world.whose_permissions(use.enclave, use.writes, use.topic)
+    holder = world.other_sufficient_enclave(use.enclave, use.writes, use.topic)
     stating = replace(use, enclave=holder) if holder else use
     return Step(use, system.places.find(stating), holder)
 
@@ -283,7 +283,7 @@ def _fact(violation: Violation) -> str:
             if violation.missing:
                 return "does not exist"
             if violation.idle:
-                return "cannot start with its present files; `sros check` shows why"
+                return "cannot start with its current files; `sros check` shows why"
             return f"may not {steps[0].action_text()}"
         case Protected():
             return "its messages are not"

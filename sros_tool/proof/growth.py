@@ -217,11 +217,13 @@ class Growth:
         """
         names = {*renamed, *renamed.values()}
 
-        def is_other(gain: Gain) -> bool:
+        def is_no_rename(gain: Gain) -> bool:
             own = gain.right is not None and gain.enclaves == (gain.right.enclave,)
             return not own or gain.enclaves[0] not in names or gain.denied is not None
 
-        added, removed = (tuple(filter(is_other, gains)) for gains in (self.added, self.removed))
+        added, removed = (
+            tuple(filter(is_no_rename, gains)) for gains in (self.added, self.removed)
+        )
         reach = self.reach
         if not added:
             reach = tuple(new for new in reach if names.isdisjoint((new.source, new.target)))

@@ -260,7 +260,7 @@ def _present_distributions(
         raise UsageError(
             f"it is not known from which distribution {what} is updated to {later.title}",
             "Neither --distro, nor $ROS_DISTRO, nor the keystore names another distribution.",
-            "Name the present distribution, for example with --distro jazzy.",
+            "Name the current distribution, for example with --distro jazzy.",
         )
     return by_distribution
 
@@ -321,7 +321,7 @@ def _rights_needed_after(
 ) -> Iterator[Finding]:
     """Yield rights that a policy denies and that nodes need only after the update."""
     now, then = (
-        policy_findings([path], replace(circumstances, distribution=distribution.named))
+        policy_findings([path], replace(circumstances, distribution=distribution.given_name))
         for distribution in (before, after)
     )
     yield from (finding for finding in then if finding not in now)

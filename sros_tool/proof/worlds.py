@@ -357,7 +357,7 @@ class World:
         able = (enclave, *self.fitting_others.get(enclave, ()))
         return any(self.confirm_own(name, writes, topic) for name in able)
 
-    def whose_permissions(self, enclave: str, writes: bool, topic: str) -> str:
+    def other_sufficient_enclave(self, enclave: str, writes: bool, topic: str) -> str:
         """Return another enclave whose permissions let ``enclave`` use a topic.
 
         "" if the enclave's own permissions are enough, or no others fit.

@@ -679,7 +679,7 @@ class _Draft:
         return [*links, *self._further_links(cards)]
 
     def _further_links(self, cards: Mapping[str, Card]) -> Iterator[Link]:
-        """Yield a link to each last drawn card from the card of the enclaves further away."""
+        """Yield links of the outermost drawn cards to the card of the enclaves further away."""
         for before, paths in zip((True, False), self._further, strict=True):
             if not paths:
                 continue

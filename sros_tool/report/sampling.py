@@ -146,7 +146,7 @@ def _digest_of(
 
 
 def _without_unit_names(text: str, unit: DrawnUnit, names: UnitNames) -> str:
-    """Return a text with a mark in place of the unit's names, one for each of its ``values``."""
+    """Return a text in which a mark replaces each name of the unit."""
     for word in sorted(unit.values, key=len, reverse=True):
         if word in names.words:
             text = _with_mark(text, word, _MARKS[names.words[word][1]])

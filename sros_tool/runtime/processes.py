@@ -672,7 +672,7 @@ _MOST_FOLDERS = 200
 
 @dataclass(frozen=True, slots=True)
 class LoadedFile:
-    """The present state of a file that a process loads at its start.
+    """The current state of a file that a process loads at its start.
 
     ``changed`` is when the file, or a link to it, was last written, replaced or given another mode
     or owner; None if the file does not exist.  ``problem`` is a clause on why it could not be
@@ -688,7 +688,7 @@ class LoadedFile:
 
 @dataclass(frozen=True, slots=True)
 class ProcessEnclave:
-    """The enclave that a process names, and the present state of its files.
+    """The enclave that a process names, and the current state of its files.
 
     ``keystore`` is the path that the process names.  ``moved`` maps folders of the keystore whose
     last change added or removed no file (they were moved, or got another mode) to the time of that

@@ -696,7 +696,7 @@ class Enforcement:
 
     @cached_property
     def _combinations(self) -> Mapping[_Combination, tuple[str, ...]]:
-        """The ids of the subjects, by their values of all properties."""
+        """The ids of the subjects that have a combination of property values."""
         ids_of: dict[_Combination, list[str]] = {}
         for subject in self.subjects:
             values = (getattr(subject, name) or (None,) for name in PROPERTIES)

@@ -165,7 +165,7 @@ class Thief:
         self.lead_to({name: version})
 
     def archive(self, robot: str) -> tuple[bytes, int]:
-        """Return the present archive of a robot, and its number."""
+        """Return the current archive of a robot, and its number."""
         target = self.present(self.bin_of(robot)).signed.targets[release_target(robot)]
         (path,) = target.get_prefixed_paths()
         return (self.pub / "targets" / path).read_bytes(), target.custom["number"]

@@ -21,7 +21,7 @@ NAMES = ("/r1/a", "/r1/b", "/r1/c")
 
 
 def moment() -> datetime:
-    """Return the present time, by which the keystores of tests are made, too."""
+    """Return the current time, by which the keystores of tests are made, too."""
     return datetime.now(UTC)
 
 

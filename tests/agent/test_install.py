@@ -316,7 +316,7 @@ def test_what_a_play_brought_meanwhile_is_not_taken_back(home: Home, robot: Path
 
 
 def older_a(home: Home) -> dict[str, bytes]:
-    """Return the files of /r1/a as first delivered, with the present revocation list."""
+    """Return the files of /r1/a as first delivered, with the current revocation list."""
     return {path: data for path, data in home.first.files.items() if in_one_of(path, ("/r1/a",))}
 
 

@@ -79,7 +79,7 @@ def commands(finding: Finding, policy: Path, target: Path, **others: object) -> 
 
 
 def at(moment: datetime, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have the program take a moment for the present one."""
+    """Have the program take a moment for the current one."""
     for each in pkgutil.iter_modules(cli.__path__, "sros_tool.cli."):
         importlib.import_module(each.name)  # one that is imported later would keep the moment
     for name, module in list(sys.modules.items()):

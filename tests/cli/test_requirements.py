@@ -276,14 +276,14 @@ def test_a_keystore_is_decided_as_it_is_signed(keystore: Path, tmp_path: Path) -
     late = ("--at", "2099-01-01", "--vendor", "fastdds")
     ended = sros(*asked, tmp_path / "must.toml", *late, cwd=folder)
     assert ended.status == 1
-    assert "/mux: cannot start with its present files; `sros check` shows why" in ended.out
+    assert "/mux: cannot start with its current files; `sros check` shows why" in ended.out
     # Of the public part of a keystore, the keys are elsewhere; of this one, a key is gone.
     copied = tmp_path / "public"
     copy_of(keystore, copied)
     (copied / "enclaves" / "mux" / "key.pem").unlink()
     again = ("check", copied, *ONLY[2:], "--requirements", tmp_path / "must.toml")
     ended = sros(*again)
-    assert (ended.status, "/mux: cannot start with its present files" in ended.out) == (1, True)
+    assert (ended.status, "/mux: cannot start with its current files" in ended.out) == (1, True)
     for key in copied.glob("enclaves/*/key.pem"):
         key.unlink()
     sros(*again).ok()

@@ -175,7 +175,7 @@ def test_no_older_list_takes_the_place_of_a_newer_one(
         with pytest.raises(RefusedError, match=f"older than .* the keystore has {number}"):
             check_lists(files[before], files[after], str(tmp_path))
     (remark,) = check_lists(files["revoked"], files["restored twice"], str(tmp_path))
-    assert remark.startswith("The present revocation list has 1 serial numbers")
+    assert remark.startswith("The current revocation list has 1 serial numbers")
     monkeypatch.setenv("PATH", "/nonexistent")
     with pytest.raises(RefusedError, match="lacks openssl"):
         check_lists(files["revoked"], files["ks"], str(tmp_path))

@@ -3,7 +3,7 @@
 Everything on which a decision rests is drawn: rules and their order, wildcards, sets, partitions,
 domains and ranges, validity in zones, several grants, subjects, defaults, access control switched
 off, and now and then one of the oddities over which vendors' parsers differ.  Dates are drawn
-around the present moment, whole hours and 15 minutes off it, so that no zone and no slow machine
+around the current moment, whole hours and 15 minutes off it, so that no zone and no slow machine
 brings a vendor near the edge of a window.
 """
 

@@ -766,7 +766,7 @@ def test_the_peer_whose_permissions_expired_is_named(
     peer = Enclave(keystore, OTHER)
     log = log_about(peer.folder, f"{vendor}.peer_expired.log", tmp_path)
     fine = sros("explain", keystore, ENCLAVE, "--log", log).out
-    assert f"the peer is enclave {OTHER}, whose present files have no fault" in fine
+    assert f"the peer is enclave {OTHER}, whose current files have no fault" in fine
     BREAKAGES["permissions expired"](peer)
     found = sros("explain", keystore, ENCLAVE, "--log", log).out
     assert f"the peer is enclave {OTHER}: " in found and "expired at" in found
@@ -804,7 +804,7 @@ def test_a_process_that_was_not_restarted_in_a_rotation_is_named(
     assert "  found " not in stranger
     sros("rotate_ca", keystore, "--next").ok()
     after = sros("explain", keystore, "--log", log).out
-    assert f"the peer is enclave {OTHER}, whose present files have no fault" in after
+    assert f"the peer is enclave {OTHER}, whose current files have no fault" in after
     assert f"Restart the processes of {OTHER}, and then this process" in after
 
 
@@ -819,7 +819,7 @@ def test_a_denied_topic_is_compared_with_what_is_signed(keystore: Path, tmp_path
     )
     found = sros("explain", keystore, ENCLAVE, "--log", log)
     assert found.status == 1
-    assert "the present permissions allow it" in found.out
+    assert "the current permissions allow it" in found.out
     assert "Restart the process" in found.out
     assert "no rule allows publish rt/other" in found.out
     assert f"sros explain {keystore} {ENCLAVE} publish /other" in found.out

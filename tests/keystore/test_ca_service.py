@@ -236,7 +236,7 @@ def test_without_the_program_nothing_is_issued_and_a_dry_run_does_not_ask(
         renew(site, ["/talker"], now=now())
     monkeypatch.chdir(tmp_path)
     install(office(tmp_path))
-    monkeypatch.setenv("PATH", "bin:/usr/bin:/bin")  # of whoever made the present folder
+    monkeypatch.setenv("PATH", "bin:/usr/bin:/bin")  # of whoever made the current folder
     with pytest.raises(KeystoreError, match="no program"):
         renew(site, ["/talker"], now=now())
     assert snapshot(site) == before

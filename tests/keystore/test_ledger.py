@@ -1,4 +1,4 @@
-"""The ledger lists everything that was issued, and the history shows its present state."""
+"""The ledger lists everything that was issued, and the history shows its current state."""
 
 from __future__ import annotations
 

@@ -286,7 +286,7 @@ def test_a_list_that_no_ca_signed_revokes_nobody_and_keeps_nobody(
 
     done = revoke(root, ["/a"], now=NOW)
 
-    assert any("signed its present revocation list" in each.text for each in done.remarks)
+    assert any("signed its current revocation list" in each.text for each in done.remarks)
     found = crl_of(root)
     assert {(each.serial, each.reason) for each in found.revoked} == {
         (earlier.revoked[0].serial, "unspecified"),

@@ -291,7 +291,7 @@ LEDGER_DAMAGED = FindingKind(
     ERROR,
     "a ledger with lines that are missing or were changed",
     "The ledger may lack certificates that `sros revoke` should revoke, and permissions newer "
-    "than the present ones.",
+    "than the current ones.",
     "sros: each line of ledger.jsonl has the digest of the line before it; ledger.p7s has the "
     "digest of the last line.",
     "Restore ledger.jsonl and ledger.p7s from the same backup. Without one, state all rights again "

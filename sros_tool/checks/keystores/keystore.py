@@ -85,7 +85,7 @@ _OF_SEVERAL_FILES = frozenset(
         *(kind.id for kind in upgrade.OF_ENCLAVES),
     }
 )
-"""Ids of findings that have one cause if their texts are equal, such as a shared CA or list."""
+"""Ids of findings that have one cause, such as a shared CA, if their texts are equal."""
 
 
 @read_consistently

@@ -24,7 +24,7 @@ NO_ROS_NAME = FindingKind(
     "it should deny may be allowed.",
     _MAPPING,
     "Write the DDS name, such as rt/chatter, rq/addRequest and rr/addReply, or let sros write it: "
-    "`sros create_permission KEYSTORE ENCLAVE POLICY_FILE`. The present name is right only for a "
+    "`sros create_permission KEYSTORE ENCLAVE POLICY_FILE`. The current name is right only for a "
     "program that uses DDS without ROS.",
 )
 NOT_FOR_ROS = FindingKind(

@@ -52,8 +52,8 @@ PEERS_REVOKED = FindingKind(
     "it, on either side.",
     "RFC 5280, 5; rmw_dds_common (crl.pem); Fast DDS 2.6 to 3.6; tested.",
     "If an enclave is meant to be revoked, remove its files. If not, export it again from its "
-    "keystore, which may have a new certificate already. If it has none there: `sros "
-    "generate_artifacts -k KEYSTORE -e ENCLAVE -p POLICY_FILE`, and export it again.",
+    "keystore, which may have a new certificate already. If it has none: `sros "
+    "generate_artifacts -k KEYSTORE -e ENCLAVE -p POLICY_FILE`, and export the enclave again.",
 )
 PEERS_PROTECTION = FindingKind(
     "keystore.peers-protection",
@@ -296,10 +296,10 @@ class _Governed:
 
     def meets(self, other: _Governed) -> bool:
         """Return whether two enclaves may join one domain, also if that cannot be known."""
-        return _meet(self.first, other.first) or _meet(self.domains, other.domains)
+        return _domains_meet(self.first, other.first) or _domains_meet(self.domains, other.domains)
 
 
-def _meet(some: Sequence[DomainSet], others: Sequence[DomainSet]) -> bool:
+def _domains_meet(some: Sequence[DomainSet], others: Sequence[DomainSet]) -> bool:
     pairs = list(product(some, others))
     return not pairs or any((one & other).ranges for one, other in pairs)
 

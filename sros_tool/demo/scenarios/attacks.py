@@ -582,7 +582,7 @@ _RIGHTS_ROWS: tuple[Row, ...] = (
             Identity(Undefended(template=forger.open_default), "newcomer"),
             RowStatus.HEARD,
             "an enclave without a policy may do everything",
-            defence_removed="the template's rule to deny by default",
+            defence_removed="the template's default DENY",
         ),
     ),
 )

@@ -822,10 +822,10 @@ _WILDCARD_ROWS = (
 
 
 class _FalseToken(NamedTuple):
-    """A graph token that an impostor announces: for its node ``talker``, of the enclave ``part``.
+    """A graph token that says more than the enclave of ``part``, which announces it, may.
 
-    ``announced`` is the enclave that it names in place of its own; ``role`` says whether ``topic``
-    is a topic or a service.
+    ``announced`` is the enclave that it names instead of its own, "" for its own; ``role``
+    says whether ``topic`` is a topic or a service.
     """
 
     attack: str
@@ -1047,14 +1047,14 @@ _EARLIER_ROWS = (
 # ── what is known to be open ───────────────────────────────────────────────────────────────
 
 
-def _open(row: Row, because: str, remedy: str) -> Row:
+def _succeeding_attack(row: Row, because: str, remedy: str) -> Row:
     """Return the only row of an attack that is known to succeed."""
     return known_open(replace(row, attack=row.name), because, remedy)
 
 
 _LATE = replace(_permitted_party("late talker", Role.TALKER, OWN, "admin"), intruder=True, turn=3)
 _OPEN_ROWS = (
-    _open(
+    _succeeding_attack(
         _stolen_files_row(
             "revoked identity whose name is used again",
             zenoh_forger.revoked_name_in_use_again,
@@ -1065,7 +1065,7 @@ _OPEN_ROWS = (
         "give the enclave another name, or run `sros rotate_ca`; use a short validity",
     ),
     replace(
-        _open(
+        _succeeding_attack(
             _attempt_row(
                 "rights taken away while all run",
                 RowStatus.HEARD,
@@ -1079,7 +1079,7 @@ _OPEN_ROWS = (
         meanwhile=zenoh_forger.rights_taken_away,
     ),
     *(
-        _open(
+        _succeeding_attack(
             _rogue_router_row(
                 f"the router itself {'reads' if reads else 'injects'}",
                 zenoh_forger.talkative_router,
@@ -1092,7 +1092,7 @@ _OPEN_ROWS = (
         )
         for reads in (False, True)
     ),
-    _open(
+    _succeeding_attack(
         _attempt_row(
             "an enclave without rights lists topics",
             RowStatus.VISIBLE,

@@ -125,7 +125,7 @@ class CollectedMessage(NamedTuple):
     sequence: int | None
     """Sequence number of the message; null without a message that was verified."""
     remarks: Sequence[str]
-    """Remarks as clauses, such as on the robot's clock or an expired certificate."""
+    """Remarks (clauses), for example about the robot's clock or an expired certificate."""
     requests: Sequence[CollectedRequest]
     """The requests for renewal in the message."""
 
@@ -190,7 +190,7 @@ def collect(
     Args:
         root: the keystore.
         inbox: the folder with a folder for each robot.
-        now: the present time.
+        now: the current time.
         restored: robots whose disk was restored, so that one lower sequence number is accepted.
         allow_refusal: vendors whose nodes may stop working by the renewal.
         keyring: opens the keys of the CAs.
@@ -669,7 +669,7 @@ class _Renewals:
             raise _RefusedError("the keystore does not have this enclave, or it was revoked")
         present = keystore.certificate_of(name)
         if present.serial_number in self._revoked:
-            raise _RefusedError("its present certificate was revoked")
+            raise _RefusedError("its current certificate was revoked")
         same_key = present.public_key() == request.public_key
         on_robot = message.confirmation.certificates.get(
             f"{enclave_folder(name)}/{CERTIFICATE_FILE}", ()
@@ -697,7 +697,7 @@ class _Renewals:
             )
         if not same_key and message.certificate.public_key() != present.public_key():
             raise _RefusedError(
-                f"it has a new key, so the present key of {name} has to sign the message, but an "
+                f"it has a new key, so the current key of {name} has to sign the message, but an "
                 "earlier key signed it"
             )
         for certificate in (message.certificate, present):
@@ -778,7 +778,7 @@ def _revoke_again(
             text = f"a certificate that the ledger lacks cannot be recorded: {error.what}"
             return "", [Note("fleet.certificates-restored", text)], []
         why = (
-            f"{have} a revocation list that the keystore signed and does not know, and it cannot "
+            f"{have} a revocation list that the keystore signed but does not know, and it cannot "
             f"sign another: {error.what}"
         )
         for request in requests:

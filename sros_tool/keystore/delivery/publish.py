@@ -176,7 +176,7 @@ def publish(
     Args:
         root: the keystore.
         folder: the publishing folder, which is made if it is missing.
-        now: the present time.
+        now: the current time.
         expiry: how long new metadata is valid.
         root_key: the file of the root key; None: in the keystore.  It is made if there is none yet.
         rotate: the roles that get new keys.
@@ -302,7 +302,7 @@ class _Keys:
         """
         if not self._elsewhere or not self.roots.versions:
             return
-        spare = self._next_to(self._elsewhere)
+        spare = self._new_key_path(self._elsewhere)
         is_new_key = self._is_root_key(spare)
         if is_new_key and dry_run:
             self._root_file = spare
@@ -411,7 +411,7 @@ class _Keys:
         """Write a new root key that is not in the keystore, next to the one that it replaces."""
         if self._new_elsewhere and self._elsewhere:
             exists = self._elsewhere.exists()
-            path = self._next_to(self._elsewhere) if exists else self._elsewhere
+            path = self._new_key_path(self._elsewhere) if exists else self._elsewhere
             if os.path.lexists(path):
                 raise KeystoreError(
                     f"'{path}' is in the way",
@@ -425,7 +425,7 @@ class _Keys:
         """Put a new root key outside of the keystore in its place, and remove the replaced keys."""
         if self._new_elsewhere and self._elsewhere:
             with Folder(self._elsewhere.parent) as folder:
-                spare = self._next_to(self._elsewhere).name
+                spare = self._new_key_path(self._elsewhere).name
                 if folder.state(spare):
                     folder.replace(spare, self._elsewhere.name)
         with Folder(self._root) as folder:
@@ -433,7 +433,7 @@ class _Keys:
                 folder.unlink(fleet_key(f"{role}.{_BEFORE}"), missing_ok=True)
 
     @staticmethod
-    def _next_to(path: Path) -> Path:
+    def _new_key_path(path: Path) -> Path:
         """Return where a new root key is until robots know it."""
         return path.with_name(f"{path.name}.new")
 
@@ -447,7 +447,7 @@ class _Changed(NamedTuple):
 
 
 class _ReleaseOutcome(NamedTuple):
-    """What came of a robot's release; ``published`` is None if it was refused."""
+    """Outcome of publishing a robot's release; ``published`` is None if it was refused."""
 
     robot: str
     published: PublishedRobot | None
@@ -975,7 +975,7 @@ class _Run:
     def write(self, keys: _Keys) -> None:
         """Write the metadata, the timestamp last; then remove files that were unused for long.
 
-        A new root is written first if the present metadata already fits it; otherwise after the
+        A new root is written first if the current metadata already fits it; otherwise after the
         new metadata, which the keys of both roots have signed.  So robots find complete metadata
         at every moment.
         """

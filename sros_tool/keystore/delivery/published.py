@@ -61,7 +61,7 @@ class PublishedRelease(NamedTuple):
 def check_count(value: object, maximum: int = MOST_NUMBER) -> int:
     """Return a number of a release or a version; raise `ValueError` if it is none."""
     if type(value) is not int or not 1 <= value <= maximum:
-        raise ValueError("a number or version is not a number, or is too high")
+        raise ValueError("a release number or version is no number, or is too high")
     return value
 
 

@@ -133,7 +133,7 @@ class Roots:
 
     @property
     def last(self) -> Root:
-        """The present root metadata."""
+        """The current root metadata."""
         return self.versions[-1].signed
 
     def as_json(self) -> list[dict[str, object]]:
@@ -159,7 +159,7 @@ class Roots:
         self.versions.append(version)
 
     def has_key(self, role: str, signer: CryptoSigner) -> bool:
-        """Return whether the present root metadata names the key of ``signer`` for ``role``."""
+        """Return whether the current root metadata names the key of ``signer`` for ``role``."""
         return signer.public_key.keyid in self.last.roles[role].keyids
 
     def check_signer(self, role: str, signer: CryptoSigner, path: Path) -> None:
@@ -323,7 +323,7 @@ class Composed(NamedTuple):
 class Composer:
     """Makes the metadata for releases, and keeps existing metadata that still fits.
 
-    ``signers`` has the signers of each role: the present one, and during a rotation of its key also
+    ``signers`` has the signers of each role: the current one, and during a rotation of its key also
     the previous one: robots that do not know the new root yet ask for its signature.
     """
 
@@ -341,11 +341,11 @@ class Composer:
 
         Args:
             present: what is in the publishing folder.
-            signers: by role, the present one first.
+            signers: by role, the current one first.
             known: the versions that were published before, as far as the keystore knows.
             least: what new versions have to be higher than.
             expiry: how long new metadata is valid.
-            now: the present time.
+            now: the current time.
         """
         self._least = least
         self._present = present
@@ -389,7 +389,7 @@ class Composer:
     def _roles(self, robots: int) -> SuccinctRoles:
         """Return the bins (TUF); their number is a power of two that grows with the fleet.
 
-        The present number stays until four times as many are wanted.
+        The current number stays until four times as many are wanted.
         """
         bits = max(1, ceil(log2(max(1, robots / _ROBOTS_OF_A_BIN))))
         before = self._present.targets and self._present.targets.signed.delegations

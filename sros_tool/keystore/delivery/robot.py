@@ -438,7 +438,7 @@ def import_answer(
         data: the answer (``.tar.gz``).
         pinned: SHA-256 of permissions CAs; if not empty, one of these CAs must have signed the
             answer, also with ``force``.
-        force: accept an answer that is older than the present files, or comes from other CAs.
+        force: accept an answer that is older than the current files, or comes from other CAs.
         allow_refusal: vendors whose nodes of the enclave may stop working.
 
     Raises:

@@ -126,7 +126,7 @@ def sign_request(
     """Certify the key of a request, sign the permissions, and make the answer for the robot.
 
     The keystore gets all files of the enclave except the key.  The rights come from ``policy``;
-    without a policy, from the present permissions if ``renew`` is set, otherwise from the
+    without a policy, from the current permissions if ``renew`` is set, otherwise from the
     keystore's template.  If ``policy`` is for a fleet, the keystore's fleet records the enclave's
     path with its placeholders.
 
@@ -383,7 +383,7 @@ class _Signer:
 
         Args:
             request: the request whose key is certified.
-            renew: the enclave exists; it keeps its present rights unless the policy states others.
+            renew: the enclave exists; it keeps its current rights unless the policy states others.
             named: whether the operator named the enclave, and not the request alone.
         """
         change, root, name = self._change, self._root, request.name
@@ -572,7 +572,7 @@ def _check_result(answer: RequestAnswer, request: SigningRequest, now: datetime)
 
 
 def _new_key_note(old: x509.Certificate, request: SigningRequest) -> list[Note]:
-    """Return a note if the request's key is not the key of the present certificate ``old``."""
+    """Return a note if the request's key is not the key of the current certificate ``old``."""
     if old.public_key() == request.public_key:
         return []
     until = iso(validity_of(old).not_after)
@@ -603,7 +603,7 @@ def _lost_rights_notes(
 def _earlier_rights(
     change: KeystoreChange, name: str, present_certificate: x509.Certificate
 ) -> SignedRights:
-    """Return the rights in an enclave's present permissions, after verifying their signature."""
+    """Return the rights in an enclave's current permissions, after verifying their signature."""
     subject = text_of(present_certificate.subject)
     old = change.keystore.signed_grant(name, subject)
     old.signed.verify(change.permissions.certificate)

@@ -390,7 +390,7 @@ def _example(
     )
     files[CERTIFICATE_FILE] = pem(certificate)
     files[PERMISSIONS_FILE] = signer.sign(render_permissions(permissions), "example permissions")
-    return _complete(files)
+    return _if_complete(files)
 
 
 # ── the enclaves that change ───────────────────────────────────────────────────────────────
@@ -465,17 +465,17 @@ class _FilesOfChange:
         return self._places[linked]
 
     def before(self, name: str) -> Files:
-        """Return the present files of an enclave; empty if a required file is missing."""
+        """Return the current files of an enclave; empty if a required file is missing."""
         folder = enclave_folder(name)
-        return _complete({file: self.content(f"{folder}/{file}") for file in _LOADED})
+        return _if_complete({file: self.content(f"{folder}/{file}") for file in _LOADED})
 
     def after(self, name: str) -> Files:
         """Return an enclave's files after the transaction; empty if a required file is missing."""
         places = self.places_after(name)
-        return _complete({file: self.content_after(place) for file, place in places.items()})
+        return _if_complete({file: self.content_after(place) for file, place in places.items()})
 
     def content(self, path: str) -> bytes:
-        """Return the present content of a file; empty if it cannot be read."""
+        """Return the current content of a file; empty if it cannot be read."""
         try:
             return self._keystore.read(path, "file")
         except SrosError:
@@ -535,7 +535,7 @@ def _kinds(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[str]]:
     return kinds
 
 
-def _complete(files: Mapping[str, bytes | None]) -> Files:
+def _if_complete(files: Mapping[str, bytes | None]) -> Files:
     complete = {file: data for file, data in files.items() if data}
     return complete if all(file in complete for file in _NEEDED) else {}
 

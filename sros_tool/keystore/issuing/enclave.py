@@ -252,9 +252,9 @@ class EnclaveWriter:
     def would_change_only_dates(
         self, rights: StatedRights, certificate: x509.Certificate, validity: Window, text: bytes
     ) -> bool:
-        """Return whether `write` would change only dates, and the present expiry is late enough.
+        """Return whether `write` would change only dates, and the current expiry is late enough.
 
-        ``text`` is the present document, with LF line ends.  Its ``validity`` is long enough until
+        ``text`` is the current document, with LF line ends.  Its ``validity`` is long enough until
         two thirds of a new validity are over (`Window.can_be_kept`).
 
         Raises:

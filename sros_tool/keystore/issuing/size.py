@@ -12,11 +12,11 @@ from sros_tool.dds.permissions import MAX_SIGNED_BYTES, render_permissions
 from sros_tool.errors import Note
 from sros_tool.fleet.expansion import (
     FleetPolicy,
-    absolute,
     check_narrowed,
     unobserved_robots,
+    with_absolute_names,
+    with_names_as_written,
     with_placeholders,
-    written,
 )
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.rights import load_rights
@@ -171,12 +171,12 @@ def minimized_policy(
             )
             for path, home in sorted(homes.items())
         ]
-    stated = absolute(policy)
+    stated = with_absolute_names(policy)
     result = minimize(stated, observed_rights, () if strict else _node_basics())
     if robots:
         check_narrowed(robots, result, used)
     notes += _scope_notes(policy, result, observed_rights)
-    narrowed = written(result.policy)
+    narrowed = with_names_as_written(result.policy)
     document = checked_text(narrowed, output, "narrowed", placeholders=fleet is not None)
     return Minimization(document, _measured_enclaves(stated, result, observed_rights, fleet), notes)
 
@@ -242,5 +242,5 @@ def _measured_enclaves(
 
 def _longest_enclave(policy: Policy, fleet: Fleet | None) -> Enclave:
     """Return the only enclave of a policy, expanded for the robot with the longest enclave path."""
-    robots = FleetPolicy(written(policy), fleet) if fleet else None
+    robots = FleetPolicy(with_names_as_written(policy), fleet) if fleet else None
     return robots[max(robots, key=len)] if robots else policy.enclaves[0]

@@ -225,7 +225,7 @@ class KeystoreChange:
         return Authorities(self.identity, self.permissions)
 
     def open_authorities(self) -> None:
-        """Open both CAs now, with the key places in the present settings."""
+        """Open both CAs now, with the key places in the current settings."""
         self.authorities  # noqa: B018 - read once
 
     def _authority(self, role: str) -> Authority:
@@ -309,7 +309,7 @@ class KeystoreChange:
         return with_routers_of_robots(network, before, self.fleet, gone)
 
     def set_network(self, network: ZenohNetwork) -> None:
-        """Stage settings with another Zenoh network, unless it is the present one.
+        """Stage settings with another Zenoh network, unless it is the current one.
 
         Raises:
             KeystoreError: the settings or other files were edited by hand.

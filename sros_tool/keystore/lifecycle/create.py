@@ -990,7 +990,7 @@ class _EnclaveMaker:
         are ``replaced`` in this step.
 
         Raises:
-            KeystoreError: the certificate cannot be used, or the present permissions are not the
+            KeystoreError: the certificate cannot be used, or the current permissions are not the
                 latest.
         """
         change, root = self._change, self._root

@@ -190,7 +190,7 @@ class _Renewer:
         return Superseded.record(name, state.certificate, issued.certificate, now)
 
     def _issuance(self, state: Credentials) -> Issuance:
-        """Return what to issue for an enclave, after verifying its present files."""
+        """Return what to issue for an enclave, after verifying its current files."""
         name = state.name
         rights = checked_rights(state, self._change.authorities, self._change.recorded)
         # Once earlier permissions were cut off by a unique subject, they stay cut off.
@@ -213,7 +213,7 @@ class _Renewer:
         if (folder / KEY_URI_FILE).exists():
             raise KeystoreError(
                 f"the key of enclave {name} is on a token",
-                f"A new key in a file would have no effect: {KEY_URI_FILE} names the present key.",
+                f"A new key in a file would have no effect: {KEY_URI_FILE} names the current key.",
                 f"Make a key on the token: `sros renew {quote(str(self._root))} {name} --key "
                 "'pkcs11:token=NAME;object=LABEL'`, with a label that the token does not have.",
             )

@@ -93,7 +93,7 @@ def earlier_permissions(
     authority: x509.Certificate,
     certificate: x509.Certificate | None = None,
 ) -> EarlierPermissions | None:
-    """Return the present permissions of an enclave; None if DDS would refuse them.
+    """Return the current permissions of an enclave; None if DDS would refuse them.
 
     ``authority`` is the permissions CA, ``certificate`` the enclave's, if it was read already.
     """

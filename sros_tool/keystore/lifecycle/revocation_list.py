@@ -72,7 +72,7 @@ from sros_tool.validity import BACKDATE, Window, iso
 
 
 class Forgotten:
-    """What a keystore signed and does not know any more, as after a backup was restored.
+    """What a keystore signed but does not know any more, as after a backup was restored.
 
     An identity CA of the keystore signed these ``lists`` and ``certificates``, so they are true
     wherever they come from.  Certificates map serial numbers (hexadecimal) to ledger entries.
@@ -277,7 +277,7 @@ class RevocationListSigner:
         `sign` then remarks if the ledger may lack some of these certificates.
 
         Args:
-            last: maps the enclaves to their present certificates.
+            last: maps the enclaves to their current certificates.
             reason: the reason, as RFC 5280 spells it.
             keep: maps enclaves to the digests of keys that stay valid, though the certificates do
                 not.
@@ -382,7 +382,7 @@ class RevocationListSigner:
             name for name, entry in self._last.items() if int(entry.serial, 16) not in recorded
         )
         if unknown := sorted(lacking):
-            why.append(f"it does not have the present certificate of {', '.join(unknown)}")
+            why.append(f"it does not have the current certificate of {', '.join(unknown)}")
         if restored := restored_at(self._keystore):
             why.append(f"the keystore was restored from a backup ({restored})")
         if why:
@@ -407,7 +407,7 @@ class RevocationListSigner:
         if crl is None or any(signed_by(crl.list, authority) for authority in trusted):
             return crl
         text = (
-            "No identity CA of this keystore signed its present revocation list, so its "
+            "No identity CA of this keystore signed its current revocation list, so its "
             "entries do not count: find out who wrote it."
         )
         self.remarks.append(Note("crl.not-signed-here", text))
@@ -487,7 +487,7 @@ class RevocationListSigner:
 
         Raises:
             KeystoreError: it was not given, the identity CA did not sign it, it is not later than
-                the present list, is not valid now, or does not revoke all ``serials``.
+                the current list, is not valid now, or does not revoke all ``serials``.
         """
         numbers = ", ".join(sorted(f"{serial:x}" for serial in serials)) or "nothing"
         remedy = (
@@ -522,7 +522,7 @@ class RevocationListSigner:
         )
 
     def _lost_revocations(self, expiries: Mapping[int, str]) -> list[Revoked]:
-        """Return the revocations that the present list lacks, if it is older than the last list."""
+        """Return the revocations that the current list lacks, if it is older than the last list."""
         entries = self._keystore.ledger_file.with_values("what", ("revocation", "crl")).entries
         count = max(
             (i for i, entry in enumerate(entries, 1) if entry.what == "revocation"), default=0
@@ -604,7 +604,7 @@ class RevocationListSigner:
             if not coming:
                 self._handle_missing_key(other, error, new_entries, old, incomplete=incomplete)
             return None
-        # The next stage replaces the present list with this one, so its number must be higher.
+        # The next stage replaces the current list with this one, so its number must be higher.
         least = (self.present.number if self.present else 0) + 2 if coming else 0
         signed = self._sign(authority, old, () if coming else new_entries, expiries, least)
         bundle = b"".join(map(pem, certificates)) + signed.document

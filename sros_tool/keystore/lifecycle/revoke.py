@@ -278,8 +278,8 @@ def refresh_crl(
 ) -> Revocation:
     """Sign the revocation list again, so that it is valid for longer.
 
-    Its entries are kept, except certificates that expired before the present list was signed.  If
-    a CA service is the identity CA, its new list ``crl`` (PEM) replaces the present list.
+    Its entries are kept, except certificates that expired before the current list was signed.  If
+    a CA service is the identity CA, its new list ``crl`` (PEM) replaces the current list.
     """
     change = KeystoreChange(
         root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run

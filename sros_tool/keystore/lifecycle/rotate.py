@@ -134,7 +134,7 @@ def rotate_ca(
 
     If the keystore is already at the stage ``to``, nothing is changed.  ``roles`` ("identity",
     "permissions"; default: both) and the ``validity`` of the new CAs are only used when a rotation
-    begins.  ``keyring`` opens the present keys; ``new_keys`` names the places of new keys outside
+    begins.  ``keyring`` opens the current keys; ``new_keys`` names the places of new keys outside
     of the keystore.  In a keystore with a fleet, a stage that cuts off robots, because they have
     not confirmed the previous stage, needs ``allow_unconfirmed``.  The nodes of the vendors in
     ``allow_refusal`` may stop working.
@@ -236,7 +236,7 @@ def _cut_off_error(
     return KeystoreError(
         f"not every robot has confirmed the stage {rotation.stage}: {names}",
         "After the next stage, they could not communicate with the other robots.",
-        "Deliver the present files, restart processes that run with earlier files, and confirm "
+        "Deliver the current files, restart processes that run with earlier files, and confirm "
         f"both; see `sros fleet status {where}`. --allow-unconfirmed goes on without them.",
     )
 
@@ -326,7 +326,7 @@ def renew_identity_ca(
     Raises:
         KeystoreError: the keystore has a single CA, a rotation is in progress, or the CA is not
             self-signed, or its key is weak or missing, or ``issued`` is of another CA.
-        UsageError: the new certificate would expire before the present one, or is missing.
+        UsageError: the new certificate would expire before the current one, or is missing.
     """
     change = KeystoreChange(
         root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
@@ -777,8 +777,8 @@ def _make_successors(
 ) -> list[_Successor]:
     """Create new CAs for ``roles`` (empty: for both roles), and stage their keys.
 
-    With ``next_to``, new keys in the keystore get file names next to the present keys; otherwise
-    they replace the present keys.
+    With ``next_to``, new keys in the keystore get file names next to the current keys; otherwise
+    they replace the current keys.
     """
     template = change.template
     files = change.keystore.authority_files
@@ -813,7 +813,7 @@ def _check_place(change: KeystoreChange, file: str, role: str, new_keys: Keyring
         raise KeystoreError(
             f"the key of the {role} CA is not in the keystore, so the key of the new CA should not "
             "be there either",
-            f"The present key is at '{change.keyring.place(role, change.template)}'.",
+            f"The current key is at '{change.keyring.place(role, change.template)}'.",
             f"Name a place for the new key with --{role}-key.",
         )
 
@@ -836,7 +836,7 @@ def _make_successor(
     key = new_keys.make(transaction, at, roles[0], elsewhere, compared=True)
     if same_key(old[0], key):
         raise KeystoreError(
-            f"the key at '{place}' belongs to the present {roles[0]} CA",
+            f"the key at '{place}' belongs to the current {roles[0]} CA",
             "A new CA needs a new key.",
             f"Name another place with --{roles[0]}-key.",
         )

@@ -83,7 +83,7 @@ class Rotation:
     replacements: tuple[Replacement, ...] = ()
 
     def next_stage(self) -> RotationStage:
-        """Return the stage after the present one."""
+        """Return the stage after the current one."""
         order = list(RotationStage)
         return order[order.index(self.stage) + 1]
 

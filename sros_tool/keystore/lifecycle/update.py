@@ -202,7 +202,7 @@ def edited_settings(root: Path, present_settings: PresentSettings) -> tuple[Temp
 
 
 def _checked_target(root: Path, present_settings: PresentSettings, target: Template) -> Template:
-    """Return ``target`` with the places of the present CA keys.
+    """Return ``target`` with the places of the current CA keys.
 
     Raises:
         UsageError: the keystore cannot be changed to ``target``.

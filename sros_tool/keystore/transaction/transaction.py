@@ -416,7 +416,7 @@ class Transaction:
         return name == CRL_FILE and (folder.removeprefix(ENCLAVES) or "/") in self._linked
 
     def _present_content(self, path: str) -> str | None:
-        """Return the present content of a path, in the form of `Move.before`."""
+        """Return the current content of a path, in the form of `Move.before`."""
         state = self._in.state(path)
         if state is None:
             return None

@@ -73,9 +73,9 @@ def verify(folder: str, enclaves: list[str], program: list[str]) -> dict:
 
 
 def check_lists(before: Files, after: Files, spare: str) -> list[str]:
-    """Return remarks on certificates that new revocation lists lack and the present ones have.
+    """Return remarks on certificates that new revocation lists lack and the current ones have.
 
-    The owner of the enclaves can write whatever into the present files.  So only a list counts that
+    The owner of the enclaves can write whatever into the current files.  So only a list counts that
     is signed by a CA that the new files trust.
 
     Args:
@@ -118,7 +118,7 @@ def check_lists(before: Files, after: Files, spare: str) -> list[str]:
         lost = present.serials - new.serials
         if lost and present.authority == new.authority:
             remarks[present] = (
-                f"The present revocation list has {len(lost)} serial numbers that the new one"
+                f"The current revocation list has {len(lost)} serial numbers that the new one"
                 f" lacks, such as {min(lost)}. This is right if these certificates have expired,"
                 " but not if the keystore comes from a backup."
             )

@@ -11,7 +11,7 @@ short_description: Install the enclaves of a robot from a keystore of sros
 description:
   - Exports the enclaves of the robot on the keystore machine with C(sros distribute_key), and
     installs them on the robot, all of them or, if anything fails, none.
-  - The new files are verified next to the present ones, and only then take their place; who is
+  - The new files are verified next to the current ones, and only then take their place; who is
     interrupted in between ends it at the next run. Folders stay the same folders, so that units and
     containers that mounted them still have them.
   - Enclaves that the keystore does not have any more are removed. An enclave that waits for the
@@ -25,7 +25,7 @@ description:
 options:
   keystore:
     description:
-      - The keystore. Without it nothing is installed, and the present enclaves are
+      - The keystore. Without it nothing is installed, and the current enclaves are
         verified.
     type: path
   robot:
@@ -56,7 +56,7 @@ options:
     type: str
   replace_authorities:
     description:
-      - Also install enclaves of another keystore, which share no CA with the present ones.
+      - Also install enclaves of another keystore, which share no CA with the current ones.
     type: bool
     default: false
   allow_older_lists:
