@@ -210,7 +210,14 @@ def is_keystore(root: Path) -> bool:
 
 def has_authorities(root: Path) -> bool:
     """Return whether a folder is an original keystore, not an export or an enclave's folder."""
-    return (root / PRIVATE).is_dir() or (root / LEDGER).is_file()
+    if (root / LEDGER).is_file():
+        return True
+    try:
+        return any((root / PRIVATE).iterdir())
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:  # another user's
+        return True
 
 
 def remedy_in_keystore(root: Path, remedy: str) -> str:
