@@ -1,15 +1,16 @@
 """Compose the picture of one source, or the overlay of two, from rights and governance.
 
 A wildcard is replaced by the known names that it matches, and denials override permissions.  Known
-names are the exact names in the rights of all sources.  An action is shown as one name, also for a
-right to only some of its parts, such as the right of a recorder that subscribes to ``/*``.
+names are the exact names in the rights of all sources.  A wildcard that would not be seen then is
+drawn as a name, such as one whose known names are all denied.  An action is shown as one name, also
+for a right to only some of its parts, such as the right of a recorder that subscribes to ``/*``.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
@@ -130,9 +131,9 @@ def compose(first_source: PictureSource, hosts: Mapping[str, str] = _NO_HOSTS) -
 
     ``hosts`` maps paths of enclaves, or of their namespaces, to names of hosts.
     """
-    known = Known(first_source.rights)
-    edges = _edges_of(first_source.rights, known)
-    stated = dict.fromkeys(folded(first_source.rights), OverlaySide.BOTH)
+    rights = first_source.rights
+    known, edges = _with_all_wildcards(rights, lambda known: _edges_of(rights, known))
+    stated = dict.fromkeys(folded(rights), OverlaySide.BOTH)
     return _picture((first_source,), edges, stated, known, hosts)
 
 
@@ -148,9 +149,12 @@ def overlay(
     if scope is not None:
         sources = tuple(source.only_for(scope) for source in sources)
     rights = [source.rights for source in sources]
-    known = Known(rights[0] | rights[1])
-    sides = [_edges_of(own, known) for own in rights]
-    edges = _marked_rights(*sides, allowed_by=kind == "use")
+
+    def marked_edges(known_names: Known) -> list[Edge]:
+        sides = [_edges_of(own, known_names) for own in rights]
+        return _marked_rights(*sides, allowed_by=kind == "use")
+
+    known, edges = _with_all_wildcards(rights[0] | rights[1], marked_edges)
     normal = [folded(own) for own in rights]
     stated = {
         right: OverlaySide.BOTH
@@ -162,7 +166,8 @@ def overlay(
     if kind == "use":
         unseen = frozenset(right.enclave for right in rights[0] - rights[1])
         unseen -= {right.enclave for right in rights[1]}
-        edges = [_neutral_edge(edge, unseen) for edge in edges]
+        observed = NamesOfRights(rights[1])
+        edges = [_neutral_edge(edge, unseen, observed) for edge in edges]
     picture = _picture(sources, edges, stated, known, hosts)
     return replace(
         picture,
@@ -236,7 +241,14 @@ def _picture(
     governance = next(
         (source.governance for source in reversed(sources) if source.governance), None
     )
-    sides = _senders_and_receivers(edges)
+    drawn = _senders_and_receivers(edges)
+
+    def sides(kind: str, name: str) -> Sequence[bool]:
+        known = known_names.matching_names(kind, name) if is_expression(name) else ()
+        # What is not drawn under its own name is a part of an action, which has both sides.
+        others = [drawn.get((kind, other), (True, True)) for other in known]
+        return [any(ends) for ends in zip(drawn[kind, name], *others, strict=True)]
+
     said = next((source.protections for source in reversed(sources) if source.protections), ())
     demanded = _Demanded(() if governance else said)
     names = sorted({(edge.kind, edge.name) for edge in edges})
@@ -252,7 +264,7 @@ def _picture(
                 protection := demanded.protection(kind, name)
                 or protection_of(governance, kind, name),
                 is_expression(name),
-                _lack(protection, *sides[kind, name]),
+                _lack(protection, *sides(kind, name)),
             )
             for kind, name in names
         ),
@@ -387,9 +399,14 @@ def _marked_rights(
     return edges
 
 
-def _neutral_edge(edge: Edge, unseen: frozenset[str]) -> Edge:
-    """Return ``edge`` marked BOTH if it is a denial, or its enclave is in ``unseen``."""
+def _neutral_edge(edge: Edge, unseen: frozenset[str], observed: NamesOfRights) -> Edge:
+    """Return ``edge`` marked BOTH if nothing shows whether it was used.
+
+    That is so for a denial, for an enclave in ``unseen``, and for a wildcard drawn as a name of
+    which a name is in ``observed``.
+    """
     neutral = edge.qualifier is not ALLOW or edge.enclave in unseen
+    neutral = neutral or (is_expression(edge.name) and observed.match(edge))
     return replace(edge, mark=OverlaySide.BOTH) if neutral else edge
 
 
@@ -439,13 +456,61 @@ def _unused_rights(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
     )
 
 
+class NamesOfRights:
+    """The exact names of rights, by enclave and right."""
+
+    def __init__(self, rights: Collection[Right]) -> None:
+        self._names: dict[tuple[str, str], list[str]] = defaultdict(list)
+        for right in unfolded(rights) | folded(rights):
+            if not is_expression(right.name):
+                self._names[right.enclave, right.right].append(right.name)
+
+    def match(self, edge: Edge) -> bool:
+        """Return whether a wildcard drawn as a name matches a name of its enclave and right."""
+        names = self._names.get((edge.enclave, edge.right), ())
+        return any(matches(edge.name, name) for name in names)
+
+
 # ── names that rights match ─────────────────────────────────────────────────────────────
 
 
-class Known:
-    """The exact names of topics, services and actions that appear in rights."""
+def _with_all_wildcards(
+    rights: Collection[Right], edges_of: Callable[[Known], list[Edge]]
+) -> tuple[Known, list[Edge]]:
+    """Return known names, and the edges for them in which every wildcard of the rights is seen.
 
-    def __init__(self, rights: Iterable[Right]) -> None:
+    Edges to known names do not show a wildcard if all names that it matches are denied, or if the
+    enclave also has rights to these names themselves.  Then it is drawn as a name.
+    """
+    known = Known(rights)
+    edges = edges_of(known)
+    by = {
+        Right(edge.enclave, edge.qualifier, right, text)
+        for edge in edges
+        for right in (edge.right, *_RIGHTS_IN.get(edge.right, ()))
+        for text in edge.by
+    }
+    drawn = {(edge.enclave, edge.right, edge.name) for edge in edges}
+    unseen = [
+        right
+        for right in folded(rights)
+        if is_expression(right.name)
+        and right not in by
+        and (right.enclave, right.right, right.name) not in drawn
+    ]
+    if unseen:
+        known = Known(rights, unseen)
+        edges = edges_of(known)
+    return known, edges
+
+
+class Known:
+    """The exact names of topics, services and actions that appear in rights.
+
+    ``wildcards`` are rights whose wildcards are drawn as names, although they match known names.
+    """
+
+    def __init__(self, rights: Iterable[Right], wildcards: Iterable[Right] = ()) -> None:
         rights = frozenset(rights)
         known: dict[str, set[str]] = defaultdict(set)
         for part in unfolded(rights):
@@ -459,8 +524,11 @@ class Known:
         self._names = {kind: sorted(names) for kind, names in known.items()}
         self._matched: dict[tuple[str, str], tuple[str, ...]] = {}
         wild: dict[str, list[str]] = defaultdict(list)
+        chosen = unfolded(wildcards)
         for part in sorted(unfolded(rights)):
-            if is_expression(part.name) and not self.matching_names(part.kind, part.name):
+            if is_expression(part.name) and (
+                part in chosen or not self.matching_names(part.kind, part.name)
+            ):
                 wild[part.kind].append(part.name)
         self._open = {kind: _Wild(names) for kind, names in wild.items()}
 
@@ -474,9 +542,9 @@ class Known:
         return self._matched[key]
 
     def names_to_draw(self, right: Right) -> tuple[str, ...]:
-        """Return the names to draw for a right: exact names, and wildcards that match none.
+        """Return the names to draw for a right: exact names, and wildcards that are drawn as names.
 
-        A wildcard that matches no exact name is drawn for each ALLOW that overlaps it, and for each
+        Such a wildcard is drawn for each ALLOW that overlaps it, and for each
         DENY that covers it.
         """
         if not is_expression(right.name):
@@ -499,7 +567,7 @@ class Known:
 
 
 class _Wild:
-    """The wildcards in rights that match no known name."""
+    """The wildcards in rights that are drawn as names."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = Names(names)
@@ -524,13 +592,15 @@ _WHOLE: dict[str, frozenset[tuple[str, str]]] = {
     )
     for right in ("call", "execute")
 }
+_RIGHTS_IN = {right: {part for part, _ in whole} for right, whole in _WHOLE.items()}
+"""Maps a right to a whole action to the rights to its topics and services."""
 _Found = dict[Qualifier, set[str]]
 
 
 def _edges_of(rights: Collection[Right], known_names: Known) -> list[Edge]:
     """Return one edge for each right or denial and each name that it matches, unsorted.
 
-    A wildcard that matches no known name is drawn as a name.
+    A wildcard that matches no known name, or would not be seen, is drawn as a name.
     """
     nodes = NodeRights(rights)
     topics: dict[tuple[str, str, str, str], _Found] = defaultdict(lambda: defaultdict(set))

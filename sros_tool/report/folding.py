@@ -2,9 +2,10 @@
 
 A unit is a robot of a fleet.  Without a fleet, units are sibling namespaces or enclaves that
 contain nearly the same enclaves.  Two units are equal if their drawings differ only in the names of
-the units.  The drawing of a unit has the rights and denials of its enclaves, and the rights and
-denials of other enclaves to its names.  If a unit has rights to names of other units, such as the
-robots whose poses a robot reads, only the number of these units has to be equal.
+the units.  The drawing of a unit has the rights and denials of its enclaves, also by wildcards that
+the picture shows at known names only, and the rights and denials of other enclaves to its names.
+If a unit has rights to names of other units, such as the robots whose poses a robot reads, only the
+number of these units has to be equal.
 
 A label such as ``{r01…r50}`` stands for each equal unit: ``/{r01…r50}/base`` may publish
 ``/{r01…r50}/odom`` means that each robot may publish its own topic.
@@ -30,6 +31,7 @@ from itertools import chain
 from typing import NamedTuple
 
 from sros_tool.fleet.robots import Robot
+from sros_tool.names import is_expression
 from sros_tool.policy.model import ALLOW
 from sros_tool.report.compose import edge_order, namespace_of
 from sros_tool.report.focus import HOPS, flow_scene
@@ -315,7 +317,7 @@ class _Draft:
                     *(enclave.path in alarming, roles.get(enclave.path)),
                 )
                 yield self._kind(drawn), (*owner.units, *group.units), enclave.path
-        for edge in self._picture.edges:
+        for edge in chain(self._picture.edges, self._stated_edges()):
             owner, name = owners[edge.enclave], self._text(edge.name)
             by = tuple(map(self._text, edge.by))
             units = (
@@ -333,6 +335,17 @@ class _Draft:
                 *((used.protection, used.wildcard) if used else ()),
             )
             yield self._kind(drawn), units, edge
+
+    def _stated_edges(self) -> Iterator[Edge]:
+        """Yield the rights as they are stated which the picture shows otherwise, or not at all.
+
+        These are wildcards; in a picture with a focus, all rights.
+        """
+        for enclave in self._picture.enclaves:
+            for stated in enclave.statements:
+                if self._picture.focus or is_expression(stated.name):
+                    right = stated.kind, stated.name, stated.right, stated.qualifier
+                    yield Edge(enclave.path, *right, mark=stated.mark)
 
     def _kind(self, drawn: object) -> int:
         return self._kinds.setdefault(drawn, len(self._kinds))

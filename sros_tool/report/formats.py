@@ -15,6 +15,7 @@ from textwrap import wrap
 from sros_tool.errors import UnavailableError
 from sros_tool.markdown import code, plain
 from sros_tool.policy.model import ALLOW
+from sros_tool.policy.patterns import matches
 from sros_tool.report.folding import Folding
 from sros_tool.report.layout import (
     KIND_NAMES,
@@ -32,6 +33,7 @@ from sros_tool.report.layout import (
 from sros_tool.report.pages import escape, render_page
 from sros_tool.report.picture import (
     Lack,
+    Name,
     Overlay,
     OverlaySide,
     Picture,
@@ -408,12 +410,24 @@ def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
         stated = known[kind, name]
         controls = stated.protection.write_control, stated.protection.read_control
         sides = Lack.SENDER, Lack.RECEIVER
-        for end, lack, controlled in zip(ends, sides, controls, strict=True):
+        for end, lack, controlled, sends in zip(ends, sides, controls, (True, False), strict=True):
             first = [stated.protection.everybody] if not controlled else []
             first += ["nobody"] if stated.lacks is lack else []
-            cells.append(", ".join(dict.fromkeys((*first, *end))))
+            who = ", ".join(dict.fromkeys((*first, *end)))
+            cells.append(who or _who_for_single_names(picture, stated, sends=sends))
         lines.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
     return "\n".join((*lines, ""))
+
+
+def _who_for_single_names(picture: Picture, name: Name, *, sends: bool) -> str:
+    """Return what is said of a wildcard if enclaves may use only known names of it on one side."""
+    single = (
+        edge
+        for edge in picture.edges
+        if (edge.kind, edge.sends, edge.qualifier) == (name.kind, sends, ALLOW)
+        and matches(name.name, edge.name)
+    )
+    return "others, for single names only" if name.wildcard and any(single) else ""
 
 
 def _graphviz_svg(dot: str) -> str:

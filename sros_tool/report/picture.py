@@ -148,7 +148,7 @@ class Lack(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Name:
-    """A topic, service or action; or a ``wildcard`` without any known name.
+    """A topic, service or action; or a ``wildcard`` that is drawn as a name.
 
     ``lacks`` is the side that nobody may take.  The server of a service is its receiver.
     """
@@ -162,7 +162,7 @@ class Name:
     protection: Protection
     """Protection of the name by the governance."""
     wildcard: bool = False
-    """Whether it is a wildcard that matches no known name."""
+    """Whether it is a wildcard, drawn as a name because no right to a known name shows it."""
     lacks: Lack = Lack.NOTHING
     """The side that is missing because no enclave has the right; the server of a service is its
     receiver.

@@ -12,8 +12,11 @@ from sros_tool.names import PARAMETER_SERVICES
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.minimize import minimize
 from sros_tool.policy.model import DomainProtection, Level, NamedProtection, TopicProtection
+from sros_tool.proof.sources import AT
 from sros_tool.report.compose import compose, group_of, overlay, protection_of
-from sros_tool.report.picture import OverlaySide
+from sros_tool.report.folding import Folding
+from sros_tool.report.formats import render
+from sros_tool.report.picture import Lack, OverlaySide
 from sros_tool.report.picture import WireLevel as Shown
 from sros_tool.translate import governance_for
 from tests.report.pictures import edge, group, mobile_robot, source_of
@@ -37,10 +40,29 @@ def test_a_wildcard_that_became_names_is_a_difference_though_nothing_moved(tmp_p
     after = source_of(tmp_path, {"/a": group("topics", "publish", "/x")}, "new.xml")
     picture = overlay(before, after, "change")
     assert edge(picture, "/a", "publish", "/x").mark is OverlaySide.BOTH
+    assert edge(picture, "/a", "publish", "/*").mark is OverlaySide.FIRST
     assert {d.text: d.notes for d in picture.differences} == {
         "/a ALLOW publish topic /*": (),
         "/a ALLOW publish topic /x": ("the other side has it by publish topic /*",),
     }
+
+
+def test_a_wildcard_is_seen_though_its_known_names_are_denied_or_stated(tmp_path: Path) -> None:
+    """It is a name of its own then, of which nobody is said to lack what single names have."""
+    denied = group("topics", "publish", "/arm/safe", qualifier="DENY")
+    enclaves = {
+        "/a": group("topics", "publish", "/arm/*", "/log*", "/log") + denied,
+        "/b": group("topics", "subscribe", "/arm/safe") + group("actions", "call", "/go", "/g*"),
+    }
+    picture = compose(source := source_of(tmp_path, enclaves))
+    wild = {name.name: name.lacks for name in picture.names if name.wildcard}
+    assert wild == {"/arm/*": Lack.NOTHING, "/log*": Lack.RECEIVER, "/g*": Lack.RECEIVER}
+    table = render(picture, Folding.of(picture), "markdown", AT)
+    assert "| topic `/arm/*` | `/a` | others, for single names only |" in table
+    used = source_of(tmp_path, {"/a": group("topics", "publish", "/log")}, "used.xml")
+    unused = {each.text for each in overlay(source, used, "use").differences}
+    assert "/a ALLOW publish topic /arm/*" in unused
+    assert "/a ALLOW publish topic /log*" not in unused
 
 
 def test_over_privilege_stands_out_and_agrees_with_minimize_policy(tmp_path: Path) -> None:

@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from sros_tool.fleet.robots import Robot
 from sros_tool.policy.model import ALLOW, DENY
 from sros_tool.policy.rights import Right
-from sros_tool.report.compose import PictureSource, compose
+from sros_tool.report.compose import PictureSource, compose, overlay
+from sros_tool.report.focus import focused_picture
 from sros_tool.report.folding import Folding
 from sros_tool.report.picture import Picture, SourceTitle
-from tests.report.pictures import group, picture_of
+from tests.report.pictures import group, picture_of, source_of
 from tests.support.harness import policy_text, sros
 
 ROBOTS = [f"r{number}" for number in range(1, 13)]
@@ -87,6 +88,34 @@ def test_a_robot_that_differs_stands_alone_and_says_in_what(
     assert len(marked) == 1
     assert {each.path for each in folding.picture.enclaves} >= {"/r5/base", "/{r1…r12}/base"}
     assert any(link.differs for scene in folding.scenes() for link in scene.links)
+
+
+@pytest.mark.parametrize("more", ["/parameter_*", "/left/*", "/left/more"])
+def test_units_are_equal_only_in_all_their_rights(tmp_path: Path, more: str) -> None:
+    """Also if a wildcard matches only names of both, or a focus does not draw the right."""
+    own = {
+        f"/{name}/gripper": group("topics", "publish", "/parameter_events", "/both")
+        for name in ("left", "right")
+    }
+    equal = compose(source := source_of(tmp_path, own))
+    assert Folding.of(equal).equal
+    assert Folding.of(focused_picture(equal, [source], ["/both"])).equal
+    unlike = own | {"/left/gripper": own["/left/gripper"] + group("topics", "publish", more)}
+    picture = compose(source := source_of(tmp_path, unlike))
+    assert not Folding.of(picture).equal
+    focused = focused_picture(picture, [source], ["/both"])
+    assert not Folding.of(focused).equal
+    before, after = (
+        source_of(
+            tmp_path,
+            {
+                path: own[path] + group("topics", "publish", wild)
+                for path, wild in zip(own, wilds, strict=True)
+            },
+        )
+        for wilds in (("/parameter_*", "/param*"), ("/param*", "/parameter_*"))
+    )
+    assert not Folding.of(overlay(before, after, "change")).equal
 
 
 def test_robots_that_name_each_other_are_equal_by_how_many(tmp_path: Path) -> None:

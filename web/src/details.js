@@ -2,7 +2,7 @@
 
 import { counted, el } from "./dom.js";
 import { byRight, sends } from "./model.js";
-import { KINDS, LEVELS, RECEIVES, SENDS, markText } from "./words.js";
+import { KINDS, LEVELS, RECEIVES, SENDS, markText, noneText } from "./words.js";
 import { daysLeft, dateText, leftText } from "./timeline.js";
 
 const VERBS = {
@@ -182,6 +182,7 @@ export function nameDetails(model, kind, name, act) {
     ["Denied", (tie) => tie.deny, true],
   ]) {
     const ties = bundle.ties.filter(wanted);
+    const allowed = bundle.ties.filter((tie) => !tie.deny);
     if (!ties.length && title === "Denied") continue;
     const items = ties.map((tie) =>
       el(
@@ -194,7 +195,7 @@ export function nameDetails(model, kind, name, act) {
         chips(model, { ...tie, deny: false }),
       ),
     );
-    const nobody = el("p", { class: "soft", text: controlled ? "Nobody." : "Nobody is named." });
+    const nobody = el("p", { class: "soft", text: controlled ? noneText(bundle, allowed, "Nobody.") : "Nobody is named." });
     const everybody = controlled ? null : el("p", { text: "Everybody with an identity; permissions allow it to:" });
     const heading = controlled ? `${title} (${ties.length})` : `${title} (everybody)`;
     parts.push(section(heading, ...[everybody, ties.length ? longList(items) : nobody].filter(Boolean)));

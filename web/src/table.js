@@ -1,7 +1,7 @@
 // All names in a table: who may send, who may receive, and what nobody may do.
 
 import { counted, el } from "./dom.js";
-import { KINDS, LEVELS, RECEIVES, SENDS } from "./words.js";
+import { KINDS, LEVELS, RECEIVES, SENDS, noneText } from "./words.js";
 
 const SHOWN = 4;
 const MOST = 400;
@@ -82,8 +82,8 @@ function line(row, opens) {
       row.lacks ? [" ", el("span", { class: "chip warning", text: row.lacks })] : null,
       folded(names),
     ),
-    el("td", { "data-head": `May ${SENDS[row.kind]}` }, list(row.senders, "nobody", row.all_send && row.everybody)),
-    el("td", { "data-head": `May ${RECEIVES[row.kind]}` }, list(row.receivers, "nobody", row.all_receive && row.everybody), denied),
+    el("td", { "data-head": `May ${SENDS[row.kind]}` }, list(row.senders, noneText(row, row.receivers), row.all_send && row.everybody)),
+    el("td", { "data-head": `May ${RECEIVES[row.kind]}` }, list(row.receivers, noneText(row, row.senders), row.all_receive && row.everybody), denied),
     el("td", { "data-head": "Protection" }, LEVELS[row.level].replace("protection ", "")),
   );
 }

@@ -19,3 +19,9 @@ export function markText(overlay, mark) {
   if (!overlay || mark === "both") return "";
   return mark === "first" ? overlay.first : overlay.second;
 }
+
+// Who may use only known names of a wildcard has rows of these names.
+export function noneText({ names, lacks }, others, nobody = "nobody") {
+  if (lacks || !names.some((name) => /[*?[]/.test(name))) return nobody;
+  return others.length ? "others, for single names only" : "";
+}
