@@ -1098,6 +1098,16 @@ UNKNOWN_GROUP = FindingKind(
     "Correct the groups of the robots in the fleet file, or name all policies of the fleet.",
 )
 
+ROBOT_WRITTEN_OUT = FindingKind(
+    "policy.robot-written-out",
+    WARNING,
+    "the name of a robot in place of its placeholder",
+    "sros takes the enclave for one of no robot: nothing delivers, renews or revokes it with the "
+    "robot.",
+    "sros (placeholder {robot}).",
+    "Write the path with the placeholder that the finding names.",
+)
+
 _CHECKS = (
     _check_rules,
     _check_nodes,
@@ -1149,13 +1159,13 @@ def policy_file_findings(
         on_zenoh: whether their nodes use Zenoh.
     """
     read: list[Policy] = []
-    groups = set[str]()
+    patterns: list[str] = []
     for path in paths:
         try:
             known = policy if policy and len(paths) == 1 else None
             if fleet:
                 expanded = FleetPolicy(read_policy(path, placeholders=True), fleet)
-                groups.update(group_of(parts_of(pattern)) for pattern in expanded.patterns)
+                patterns += expanded.patterns
                 known = known or expanded.policy()
             known = known or read_policy(path)
         except SrosError as error:
@@ -1165,8 +1175,11 @@ def policy_file_findings(
         yield from _include_findings(path)
         if fleet and (shared := [*_shared_namespaces(fleet)]):
             yield SHARED_NAMESPACE.found(str(path), first_few(shared, 3, "; "), str(path))
+    groups = {group_of(parts_of(pattern)) for pattern in patterns}
     if fleet and len(read) == len(paths) and (text := _robots_in_unknown_groups(groups, fleet)):
         yield UNKNOWN_GROUP.found(str(paths[0]), text, str(paths[0]))
+    if fleet:
+        yield from _robots_that_are_written_out(read, fleet.with_enclaves(patterns))
     yield from findings_in(read, distribution)
     if on_zenoh:
         yield from _check_zenoh(enclave for policy in read for enclave in policy.enclaves)
@@ -1224,6 +1237,21 @@ def _robots_in_unknown_groups(named: Collection[str], fleet: Fleet) -> str:
         if not (robot.groups or for_all):
             clauses.append(f"{robot.name} (in no group)")
     return f"no enclave for the group of {first_few(clauses, 5)}" if clauses else ""
+
+
+def _robots_that_are_written_out(policies: Sequence[Policy], fleet: Fleet) -> Iterator[Finding]:
+    """Yield a finding for each enclave whose path has a robot's name without a placeholder."""
+    from sros_tool.fleet.robots import robot_of
+
+    for policy in policies:
+        for enclave in policy.enclaves:
+            name, _, rest = enclave.path[1:].partition("/")
+            robot = fleet.robots.get(name)
+            if robot and robot_of(fleet, enclave.path) is None:
+                group = f":{robot.groups[0]}" if robot.groups else ""
+                path = f"/{{robot{group}}}/{rest}".rstrip("/")
+                text = f"{enclave.path} is no enclave of the robot {name}: write {path}"
+                yield ROBOT_WRITTEN_OUT.found(enclave.path, text, enclave.source.file)
 
 
 def _robots_on_one_domain(
