@@ -191,8 +191,8 @@ def _robots_enclaves(
             if left := _enclaves_named_after(keystore, name):
                 raise KeystoreError(
                     f"the fleet in keystore '{root}' gives no enclave to a robot {name}",
-                    f"It has {_names_text(left)}: perhaps the robot left the fleet or a group, or the path is "
-                    "written without {robot}.",
+                    f"It has {_names_text(left)}: perhaps the robot left the fleet or a group, or "
+                    "the path is written without {robot}.",
                     f"Name the enclaves themselves: {arguments_for(root, left)}.",
                 )
             fleet.robot(name)
