@@ -3,9 +3,13 @@
 The source folder is the project's, so that a link holds in the checkout and on the site.
 """
 
+import re
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
+
+from sphinx.application import Sphinx
 
 _PROJECT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(_PROJECT))  # autodoc imports sros_tool, which may not be installed
@@ -43,3 +47,22 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_extra_path = ["_root"]
 html_theme_options = {"navigation_with_keys": True}
+
+
+def _keep_options_whole(
+    _app: Sphinx, _page: str, _template: str, context: dict[str, Any], _tree: object
+) -> None:
+    """Mark the options in commands, within which a browser would break the line."""
+    context["body"] = re.sub(
+        r"<pre>.*?</pre>",
+        lambda pre: re.sub(
+            r"(?<=[\s>])--?[a-z][\w-]*", r'<span class="option">\g<0></span>', pre[0]
+        ),
+        context.get("body", ""),
+        flags=re.DOTALL,
+    )
+
+
+def setup(app: Sphinx) -> None:
+    """Connect to Sphinx, which calls this."""
+    app.connect("html-page-context", _keep_options_whole)

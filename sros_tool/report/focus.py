@@ -29,9 +29,7 @@ from sros_tool.policy.rights import Right
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, HopPath, Network, path_text, unguarded
 from sros_tool.report.compose import PictureSource, edge_order, namespace_of, protection_of
 from sros_tool.report.layout import (
-    LISTENERS,
     MARGIN,
-    SENDERS,
     SIDE_LETTERS,
     Card,
     Head,
@@ -67,7 +65,7 @@ _VERBS = {
     "topics": ("publish", "publisher", "subscribe to"),
     "services": ("call", "caller", "serve"),
     "actions": ("call action", "caller", "execute"),
-    "dds": ("write DDS topic", "writer", "read"),
+    "dds": ("publish DDS topic", "publisher", "subscribe to"),
 }
 """Words by kind of name: verb of senders, noun for senders, verb of receivers."""
 _ONE_WAY = ("publish", "subscribe")
@@ -419,9 +417,9 @@ def _sentence(
     near = sum(influence.hops == 2 for influence in influencing)
     if not influencing:
         return f"{text}; no other enclave influences {them}"
-    s = "s" if near == 1 else ""
-    over = "" if near == len(influencing) else f", {len(influencing)} over several hops"
-    return f"{text}; {counted(near, 'other enclave')} influence{s} {them} directly{over}"
+    s = "s" if len(influencing) == 1 else ""
+    far = " directly" if near == len(influencing) else f", {near} of them directly"
+    return f"{text}; {counted(len(influencing), 'other enclave')} influence{s} {them}{far}"
 
 
 def _counted_influences(influences: Sequence[Influence], direct: int) -> str:
@@ -702,12 +700,16 @@ class _Draft:
 
     def heads(self, cards: Mapping[str, Card]) -> Iterator[Head]:
         """Yield the heading of each column."""
-        enclaves = any(focus.kind == _ENCLAVE for focus in self._picture.focus)
+        kinds = {focus.kind for focus in self._picture.focus}
+        sends, receives = "in focus" if _ENCLAVE in kinds else "1 hop before", "1 hop behind"
+        if len(kinds) == 1 and _ENCLAVE not in kinds:
+            publish, _, subscribe = _VERBS[kinds.pop()]
+            sends, receives = f"may {publish}", f"may {subscribe.removesuffix(' to')}"
         texts = {
             self._column_of(before, hop): text
             for before, near, far, most in (
-                (True, "in focus" if enclaves else SENDERS, "hops before", self._left),
-                (False, LISTENERS, "hops behind", self._right),
+                (True, sends, "hops before", self._left),
+                (False, receives, "hops behind", self._right),
             )
             for hop in range(1, most + 1)
             for text in (near if hop == 1 else f"{hop} {far}",)
