@@ -76,7 +76,7 @@ _COMMON = {
 """The note on cards of names that every node may use, where these rights are not drawn."""
 OWN, OTHERS = "own:", ("other of", "others of")
 """Words on cards that the legend explains."""
-SENDERS, LISTENERS = "may publish or call", "may subscribe or serve"
+_SENDERS, _LISTENERS = "may publish or call", "may subscribe or serve"
 _NAMES = "topics, services, actions"
 
 
@@ -341,9 +341,9 @@ class _Draft:
                 Onlooker(tag, node, right) for (node, right), tag in self._tags.items()
             ),
             heads=(
-                Head(MARGIN, "start", SENDERS),
+                Head(MARGIN, "start", _SENDERS),
                 Head(width // 2, "middle", _NAMES),
-                Head(width - MARGIN, "end", LISTENERS),
+                Head(width - MARGIN, "end", _LISTENERS),
             ),
         )
 
