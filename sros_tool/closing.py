@@ -368,7 +368,7 @@ class Closing(NamedTuple):
     changes: FileChanges
 
     def is_proved(self, *, partial: bool) -> bool:
-        """Return whether the proof holds; ``partial`` accepts what could not be asked."""
+        """Return whether the proof holds; ``partial`` accepts what could not be examined."""
         claims = [proof.holds or (partial and proof.may_be_left_out) for proof in self.proofs]
         return bool(claims) and all(claims)
 

@@ -100,7 +100,7 @@ class Distribution(NamedTuple):
         why = "has no releases" if self.stands_for == _ROLLING else "is not supported any more"
         return f"ROS 2 {self.title} {why}: assumed to decide as {self.name.capitalize()}."
 
-    def why(self, vendor: Vendor) -> str:
+    def reason_for(self, vendor: Vendor) -> str:
         """Return why a vendor decides: ``as in ROS 2 Jazzy``, with what is assumed."""
         parts = [f"as in ROS 2 {self.title}"]
         if self.stands_for:

@@ -743,9 +743,9 @@ def other_node_notes(
 ) -> tuple[Note, ...]:
     """Return a note if a command gives its nodes a name that the enclave's permissions lack.
 
-    A command that names no namespace counts as one for "/", if it certainly starts nodes.  Without
-    a ledger with the permissions, only nodes show that offer their standard services: then a node
-    is missed only if the permissions have its name in another namespace.
+    A command that names no namespace counts as one for "/", if it certainly starts nodes.  If
+    the ledger lacks the permissions, sros knows only nodes that offer their standard services: then
+    it returns a note only if the permissions have the name in another namespace.
     """
     from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.rights import RecordedRights

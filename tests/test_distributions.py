@@ -19,7 +19,7 @@ def test_each_release_has_its_own_rules_or_is_called_not_tested() -> None:
             assert shipped.vendor.traits.product == shipped.product
             own = [each for each in TESTED if shipped.vendor.title.startswith(shipped.release)]
             assert shipped.tested is bool(own)
-            assert ("not tested" in known.why(shipped.vendor)) is not shipped.tested
+            assert ("not tested" in known.reason_for(shipped.vendor)) is not shipped.tested
     assert find_distribution("lyrical").vendors[1] is Vendor.CYCLONE_11
     assert find_distribution("jazzy").vendors == (Vendor.FAST, Vendor.CYCLONE)
 

@@ -803,7 +803,7 @@ def _show_who(
     With ``stated``, the vendor of the distribution that the keystore or its fleet states decides.
     """
     from sros_tool.keystore.fleet import load_fleet
-    from sros_tool.keystore.layout import has_authorities
+    from sros_tool.keystore.layout import is_original_keystore
     from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.selection import select_enclaves
 
@@ -833,7 +833,7 @@ def _show_who(
 
         decider = ZenohOfKeystore(keystore, why_zenoh, asking, names)
     fleet = load_fleet(keystore) if chosen_vendor else None
-    is_export = not has_authorities(keystore.root)
+    is_export = not is_original_keystore(keystore.root)
     domains = None if is_export else keystore.domains
     asked_in = " in this export" if is_export else ""
     where = (fleet, asking.domain, domains, asked_in)

@@ -27,7 +27,12 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import DomainRule, ProtectionKind, TopicRule
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import UsageError
-from sros_tool.keystore.layout import CLOSED_POLICY, FLEET, folder_of_closed_robot, has_authorities
+from sros_tool.keystore.layout import (
+    CLOSED_POLICY,
+    FLEET,
+    folder_of_closed_robot,
+    is_original_keystore,
+)
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, VendorParticipant
 from sros_tool.keystore.reader import Keystore, Problem
 from sros_tool.names import (
@@ -499,7 +504,7 @@ class Answer(NamedTuple):
     @property
     def is_of_export(self) -> bool:
         """Whether the enclave was exported, so that its keystore may have later permissions."""
-        return self.enclave.root is not None and not has_authorities(self.enclave.root)
+        return self.enclave.root is not None and not is_original_keystore(self.enclave.root)
 
     @property
     def commands(self) -> list[str]:

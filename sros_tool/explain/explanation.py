@@ -43,7 +43,7 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_FILE,
     ca_certificate,
     enclave_path,
-    has_authorities,
+    is_original_keystore,
 )
 from sros_tool.keystore.participant import LoadedEnclave, plan_enclave
 from sros_tool.names import NODE_SERVICES, is_expression, nodes_served
@@ -185,7 +185,7 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
         file = file or (GOVERNANCE_FILE if fault in _OF_GOVERNANCE else "")
         text = fault.remedy_in(file)
     keystore = Path(root) if root and Path(root).is_dir() else None
-    if keystore and not has_authorities(keystore):
+    if keystore and not is_original_keystore(keystore):
         if "`" not in text or fault is Fault.GOVERNANCE_DOMAIN:
             return _filled_remedy(text, root, enclave, file)
         if fault:

@@ -27,7 +27,7 @@ from sros_tool.explain.explanation import likely_names, remedy
 from sros_tool.faults import NEEDS_CA_KEYS, ORIGINAL_KEYSTORE, Fault, remedy_in_original_keystore
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.keystore.known_keys import enclaves_by_identity
-from sros_tool.keystore.layout import ROUTER_FILE, has_authorities, is_keystore
+from sros_tool.keystore.layout import ROUTER_FILE, is_keystore, is_original_keystore
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave
 from sros_tool.keystore.reader import Keystore
@@ -387,8 +387,10 @@ def _strongest_hits(hits: Iterable[_Hit], reported: set[str]) -> Iterator[_Hit]:
     least = dict.fromkeys(reported, 0)
     for hit in all_hits:
         if hit.meaning is not UNKNOWN:
-            least[hit.process] = min(hit.meaning.weak, least.get(hit.process, hit.meaning.weak))
-    return (hit for hit in all_hits if hit.meaning.weak <= least.get(hit.process, 0))
+            least[hit.process] = min(
+                hit.meaning.vagueness, least.get(hit.process, hit.meaning.vagueness)
+            )
+    return (hit for hit in all_hits if hit.meaning.vagueness <= least.get(hit.process, 0))
 
 
 def _grouped_hits(hits: Iterable[_Hit]) -> Iterator[list[_Hit]]:
@@ -495,7 +497,9 @@ def _remedy_for_dropped(dropped: DroppedMessage, enclave: str, what: str, root: 
         return (
             "If it is an enclave of the keystore, `sros zenoh KEYSTORE --check` shows whether the "
             "files are up to date."
-        ).replace("KEYSTORE", quote(root) if root and has_authorities(Path(root)) else "KEYSTORE")
+        ).replace(
+            "KEYSTORE", quote(root) if root and is_original_keystore(Path(root)) else "KEYSTORE"
+        )
     verb, _, name = asked.partition(" ")
     who = quote(enclave) if enclave else "ENCLAVE"
     command = f"sros explain {quote(root) if root else 'KEYSTORE'} {who}"
@@ -599,7 +603,9 @@ class _Examiner:
     @cached_property
     def _is_export(self) -> bool:
         return (
-            bool(self._root) and is_keystore(root := Path(self._root)) and not has_authorities(root)
+            bool(self._root)
+            and is_keystore(root := Path(self._root))
+            and not is_original_keystore(root)
         )
 
     def _for_export(self, text: str) -> str:

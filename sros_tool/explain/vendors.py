@@ -27,9 +27,9 @@ from sros_tool.explain.explanation import explain, likely_names
 from sros_tool.keystore.layout import (
     SETTINGS,
     ZENOH_SIGNED,
-    has_authorities,
     has_zenoh_files,
     is_keystore,
+    is_original_keystore,
 )
 from sros_tool.keystore.participant import (
     JoinContext,
@@ -539,7 +539,7 @@ class VendorOfKeystore(NamedTuple):
             self._reason,
             self.asking.domain,
             outcomes,
-            not has_authorities(self.keystore.root),
+            not is_original_keystore(self.keystore.root),
         )
 
     def notes(self, outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:

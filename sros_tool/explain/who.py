@@ -12,7 +12,7 @@ from sros_tool.errors import KeystoreError, Note
 from sros_tool.explain.answer import Question, about_action, ask
 from sros_tool.explain.asking import taken_for_action
 from sros_tool.fleet.robots import Fleet
-from sros_tool.keystore.layout import enclave_names, has_authorities
+from sros_tool.keystore.layout import enclave_names, is_original_keystore
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import RightsSource, rights_by_domains
 from sros_tool.keystore.selection import likely_names, missing_enclave_error
@@ -96,7 +96,7 @@ class Everybody(NamedTuple):
 
 def note_on_export(root: Path) -> Iterator[Note]:
     """Yield a note if a folder is an export, which may lack enclaves of its keystore."""
-    if not has_authorities(root):
+    if not is_original_keystore(root):
         text = (
             f"'{root}' is an export, which may lack enclaves: enclaves that are elsewhere may have "
             "the right, too. Ask the keystore that it comes from."
@@ -258,7 +258,7 @@ def follow_reach(
         KeystoreError: the keystore does not have the enclave, or the enclave has no rights.
     """
     of_keystore = source.kind == "keystore"
-    if of_keystore and not has_authorities(source.path):
+    if of_keystore and not is_original_keystore(source.path):
         raise KeystoreError(
             f"'{source.path}' is an export, which may lack enclaves",
             "Information can also flow through enclaves that it does not have.",

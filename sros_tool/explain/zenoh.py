@@ -40,9 +40,9 @@ from sros_tool.keystore.layout import (
     ROUTER_FILE,
     SESSION_FILE,
     enclave_path,
-    has_authorities,
     has_zenoh_files,
     is_keystore,
+    is_original_keystore,
     remedy_in_keystore,
 )
 from sros_tool.keystore.participant import JoinContext
@@ -892,7 +892,7 @@ class ZenohOfKeystore:
             )
             for outcome in outcomes
         ]
-        is_export = not has_authorities(self._keystore.root)
+        is_export = not is_original_keystore(self._keystore.root)
         return WhoOnZenoh(str(question), "zenoh", self._reason_text, self._domain, shown, is_export)
 
     def notes(self, outcomes: Sequence[ZenohAnswer]) -> Iterator[Note]:

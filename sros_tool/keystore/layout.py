@@ -208,7 +208,7 @@ def is_keystore(root: Path) -> bool:
         ) from error
 
 
-def has_authorities(root: Path) -> bool:
+def is_original_keystore(root: Path) -> bool:
     """Return whether a folder is an original keystore, not an export or an enclave's folder."""
     if (root / LEDGER).is_file():
         return True
@@ -225,7 +225,7 @@ def remedy_in_keystore(root: Path, remedy: str) -> str:
 
     An export has no CA keys: its remedy says to run the commands in the original keystore.
     """
-    if has_authorities(root):
+    if is_original_keystore(root):
         return re.sub(r"\bKEYSTORE\b", lambda _: quote(str(root)), remedy)
     return remedy_in_original_keystore(remedy)
 
@@ -244,7 +244,7 @@ def how_to_add_domains(root: Path, domains: str) -> str:
     """
     robot = folder_of_closed_robot(root)
     candidates = (root, robot / "keystore") if robot else (root,)
-    keystore = next(filter(has_authorities, candidates), None)
+    keystore = next(filter(is_original_keystore, candidates), None)
     command = f"sros update_keystore {quote(str(keystore or 'KEYSTORE'))} --domain {domains}"
     if keystore == root:
         return f"add the domain with `{command} --allow-looser`"

@@ -429,7 +429,7 @@ class EvaluatedEnclave(NamedTuple):
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """Clauses on problems that keep a process from running, but not a key on the robot."""
+        """Clauses on problems that keep a process from running; a key on the robot is none."""
         named = tuple(map(str, self.state.problems_in_keystore))
         return named or tuple(filter(None, (self.stopped().removesuffix("."),)))
 

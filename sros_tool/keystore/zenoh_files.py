@@ -744,7 +744,7 @@ class _RightsReader:
         """Return the results of `read`, doing each step for all enclaves before the next step."""
         left_out: dict[str, str] = {}
 
-        def for_each(some: Iterable[str], step: Callable[[str], Result]) -> dict[str, Result]:
+        def results_of(some: Iterable[str], step: Callable[[str], Result]) -> dict[str, Result]:
             done = {}
             for name in some:
                 try:
@@ -754,15 +754,15 @@ class _RightsReader:
             return done
 
         issued = {name: rights for name in names if (rights := self._change.issued.get(name))}
-        certificates = for_each((e for e in names if e not in issued), self._certificate)
-        messages = for_each(certificates, self._message)
-        signed = for_each(messages, lambda name: self._keystore.files.signed(messages[name]))
-        verified = for_each(signed, lambda name: self._verify(name, messages[name], signed[name]))
-        grants = for_each(
+        certificates = results_of((e for e in names if e not in issued), self._certificate)
+        messages = results_of(certificates, self._message)
+        signed = results_of(messages, lambda name: self._keystore.files.signed(messages[name]))
+        verified = results_of(signed, lambda name: self._verify(name, messages[name], signed[name]))
+        grants = results_of(
             verified, lambda name: self._grant(name, signed[name].document, certificates[name])
         )
         grants |= {name: rights.grant for name, rights in issued.items()}
-        joined = for_each(grants, lambda name: self._domains_of_grant(grants[name]))
+        joined = results_of(grants, lambda name: self._domains_of_grant(grants[name]))
         stated = {
             name: {domain: rights_in_domain(name, grants[name], domain) for domain in domains}
             for name, domains in joined.items()

@@ -793,7 +793,7 @@ class _Flow:
         without those for which ``is_unused`` returns False; matches of wildcards follow.
         """
         written, around, exact = self._world.written_by(enclave, _IGNORED)
-        for topic in sorted(exact, key=_plain_first):
+        for topic in sorted(exact, key=_topics_before_services):
             if is_unused(topic):
                 for reader in self._world.readers_of(topic):
                     if reader == enclave or not is_new(reader):
@@ -812,6 +812,6 @@ class _Flow:
                     yield shared, reader
 
 
-def _plain_first(topic: str) -> tuple[bool, bool, int, str]:
+def _topics_before_services(topic: str) -> tuple[bool, bool, int, str]:
     """Return a sort key: topics before services, and /rosout last."""
     return topic == "rt/rosout", not topic.startswith("rt/"), len(topic), topic

@@ -32,9 +32,9 @@ from sros_tool.keystore.layout import (
     ROUTER_FILE,
     enclave_names,
     enclave_path,
-    has_authorities,
     has_zenoh_files,
     is_keystore,
+    is_original_keystore,
 )
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, deciding_enclave
 from sros_tool.keystore.protection import with_stated
@@ -463,7 +463,7 @@ def _keystore_system(
         Places(places),
         rights,
         fleet=partial(checked_fleet, keystore),
-        is_export=not has_authorities(root),
+        is_export=not is_original_keystore(root),
     )
 
 

@@ -182,8 +182,8 @@ def _planned_files(policy: Policy, *, moment: datetime, domain: int | None = Non
 class UpgradeFindings(NamedTuple):
     """The findings on an update, and numbers of enclaves.
 
-    ``compared`` is the number of enclaves on which both distributions decide; ``enclaves`` includes
-    enclaves that are for the later distribution already.
+    ``compared`` is the number of compared enclaves; ``enclaves`` also counts those that are for the
+    later distribution already.
     """
 
     findings: list[Finding]

@@ -18,7 +18,7 @@ from sros_tool.dds.decision.access import is_open_to_unauthenticated
 from sros_tool.dds.decision.vendors import TESTED
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule
-from sros_tool.keystore.layout import has_authorities
+from sros_tool.keystore.layout import is_original_keystore
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import compared_enclaves
 from sros_tool.names import ACTION_SEPARATOR, dds_names, is_expression
@@ -95,7 +95,7 @@ class PictureSource:
     @property
     def is_export(self) -> bool:
         """Whether the source is an export, which may lack enclaves of its keystore."""
-        return self.keystore is not None and not has_authorities(self.keystore.root)
+        return self.keystore is not None and not is_original_keystore(self.keystore.root)
 
     @property
     def is_partial(self) -> bool:

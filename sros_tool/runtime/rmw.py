@@ -176,7 +176,7 @@ def vendor_here(
     shipped = distribution.shipped_product(vendor.traits.product) if distribution else None
     if distribution is None or shipped is None:
         return vendor, why or "the default of ROS 2 Jazzy"
-    return shipped.vendor, ", ".join(filter(None, (why, distribution.why(shipped.vendor))))
+    return shipped.vendor, ", ".join(filter(None, (why, distribution.reason_for(shipped.vendor))))
 
 
 def chosen_vendor(
@@ -194,7 +194,7 @@ def chosen_vendor(
     if not distribution:
         return Vendor(named), "as asked"
     vendor = distribution.shipped_vendor_product(Vendor(named)).vendor
-    return vendor, distribution.why(vendor)
+    return vendor, distribution.reason_for(vendor)
 
 
 def shipped_vendor(rmw: str, environment: Mapping[str, str]) -> Vendor | None:

@@ -51,9 +51,9 @@ class LogText(NamedTuple):
     "" if the text alone does not show a cause.  ``faults`` are faults of an enclave that can cause
     the text, to look for in the enclave; ``unseen`` is the remedy if the enclave has none of them.
 
-    ``weak`` is 0 for a text that names a cause, and higher for less specific texts: of all texts of
-    a process, only those with the lowest value count.  ``refuses`` is None if the text alone does
-    not prove that DDS Security refused something.
+    ``vagueness`` is 0 for a text that names a cause, and higher for less specific texts: of all
+    texts of a process, only those with the lowest value count.  ``refuses`` is None if the text
+    alone does not prove that DDS Security refused something.
     """
 
     id: str
@@ -63,7 +63,7 @@ class LogText(NamedTuple):
     remedy: str = ""
     faults: tuple[Fault, ...] = ()
     unseen: str = ""
-    weak: int = 0
+    vagueness: int = 0
     refuses: Refused | None = None
 
 
@@ -76,11 +76,11 @@ def _log_text(
     faults: tuple[Fault, ...] = (),
     *,
     unseen: str = "",
-    weak: int = 0,
+    vagueness: int = 0,
     refuses: Refused | None = None,
 ) -> LogText:
     expression = re.compile(pattern, re.IGNORECASE)
-    return LogText(name, vendor, expression, cause, remedy, faults, unseen, weak, refuses)
+    return LogText(name, vendor, expression, cause, remedy, faults, unseen, vagueness, refuses)
 
 
 # ── the table ──────────────────────────────────────────────────────────────────────────────
@@ -380,13 +380,13 @@ LOG_TEXTS: tuple[LogText, ...] = (
         r"|Plugin does not allow remote participant|Could not authenticate_peer_credential_token"
         r"|Could not get remote participant \S+ permissions",
         "a PEER was refused, not this process; another line, of this process or of the peer, says "
-        "why", _PEERS, weak=1,
+        "why", _PEERS, vagueness=1,
     ),
     _log_text(
         "participant", _CYCLONE, r"rmw_create_node: failed to create (?:DomainParticipant|domain)",
         "the process could not join its domain, and this line does not say whether DDS Security, "
         "the network interface or the domain is the reason: Cyclone DDS says it in an earlier "
-        "line, on standard error", _CHECK, _ALL, weak=2,
+        "line, on standard error", _CHECK, _ALL, vagueness=2,
     ),
     # ── Fast DDS, meeting peers ────────────────────────────────────────────────────────────
     _log_text(
@@ -449,7 +449,7 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "the governance of the peer protects the topic differently: the processes have enclaves "
         "of different keystores, or one was started before the governance changed",
         "`sros check KEYSTORE OTHER`, with the keystore or export of the peer, names the topic. "
-        "Export the enclaves of both again from one keystore, and restart both.", weak=1,
+        "Export the enclaves of both again from one keystore, and restart both.", vagueness=1,
     ),
     # ── Fast DDS, starting ─────────────────────────────────────────────────────────────────
     _log_text(
@@ -547,7 +547,8 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "endpoint-gone", _FAST, r"Cannot find (?:local|remote) (?:reader|writer|participant)\b",
         "a message could not be protected, because its writer, its reader or the peer is not known "
         "yet or has just gone: seen when a process starts or ends",
-        "Do nothing if it stops. If this continues, restart the process and its peers.", weak=1,
+        "Do nothing if it stops. If this continues, restart the process and its peers.",
+        vagueness=1,
     ),
     # ── messages that follow others ────────────────────────────────────────────────────────
     _log_text(
@@ -561,7 +562,7 @@ LOG_TEXTS: tuple[LogText, ...] = (
         r"|SecurityManager::init :\s*\Z|Cryptography plugin not configured",
         "the process may not join; Fast DDS 2.14 gives the reason in another line, or in the file "
         "of ROS_SECURITY_LOG_FILE, and neither is in this log", _CHECK_OR_FILE, _ALL,
-        unseen=_FILE, weak=1,
+        unseen=_FILE, vagueness=1,
     ),
     _log_text(
         "participant", _FAST, r"Cannot create participant due to initialization error"
@@ -569,7 +570,7 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "the process may not join, and this log gives no reason: Fast DDS 2.6 and 2.9 log "
         "nothing about signatures, expired permissions and subjects, later releases log them on "
         "standard output or in the file of ROS_SECURITY_LOG_FILE", _CHECK_OR_FILE, _ALL,
-        unseen=_FILE, weak=2,
+        unseen=_FILE, vagueness=2,
     ),
     _log_text(
         "service", _ROS, r"(?:could not|failed to) create (?:service|client)"
@@ -578,18 +579,19 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "fails when it is created, a standard service of the node is denied: the node has another "
         "name or namespace than in the policy",
         "Compare the node's name and namespace with the policy's profile (ns, node); the line that "
-        "names the topic is on standard output or in the file of ROS_SECURITY_LOG_FILE.", weak=2,
+        "names the topic is on standard output or in the file of ROS_SECURITY_LOG_FILE.",
+        vagueness=2,
     ),
     _log_text(
         "endpoint", _ROS, r"Not Allowed By Security", _DENIED_ENDPOINT, _ASK_FOR_TOPIC,
-        weak=3,
+        vagueness=3,
         refuses=Refused.TOPIC,
     ),
     _log_text(
         "endpoint", _ROS, r"invalid allocator|Problem creating associated (?:Reader|Writer)"
         r"|(?:could not|failed to) create (?:publisher|subscription|topic)"
         r"|create_(?:publisher|subscription)\(\) could not create",
-        _DENIED_ENDPOINT, _ASK_FOR_TOPIC, weak=3,
+        _DENIED_ENDPOINT, _ASK_FOR_TOPIC, vagueness=3,
     ),
     # ── denied topics: nearby lines show the denied right and the node ─────────────────────
     _log_text(
@@ -689,7 +691,7 @@ RUNS_OPEN = _log_text(
     "no enclave is named for this process: unless the keystore has an enclave /, it RUNS UNSECURED "
     "if ROS_SECURITY_STRATEGY is not exactly Enforce, without any further message; with Enforce it "
     "does not start",
-    f"If it runs, stop it. Then {_NAMED}", weak=4,
+    f"If it runs, stop it. Then {_NAMED}", vagueness=4,
 )  # fmt: skip
 """The meaning of rcl's line about the enclave /, in a log without an error after it."""
 
@@ -867,8 +869,10 @@ ZENOH_LINE = re.compile(r"\A\s*(?:\S+Z\s+)?(?:TRACE|DEBUG|INFO|WARN|ERROR)\b.*?\
 """Pattern of a line of Zenoh's log; lines that match no text are no security problem."""
 
 
-def _zenoh_text(name: str, pattern: str, cause: str, remedy: str, weak: int = 0) -> LogText:
-    return LogText(f"{ZENOH_IDS}{name}", None, re.compile(pattern), cause, remedy, weak=weak)
+def _zenoh_text(name: str, pattern: str, cause: str, remedy: str, vagueness: int = 0) -> LogText:
+    return LogText(
+        f"{ZENOH_IDS}{name}", None, re.compile(pattern), cause, remedy, vagueness=vagueness
+    )
 
 
 _ZENOH_TEXTS: tuple[LogText, ...] = (
@@ -1015,7 +1019,7 @@ _ZENOH_TEXTS: tuple[LogText, ...] = (
         "no connection to the router: it does not run, or one side refused the other",
         "Read the log of the router, which says whom it refused; or start this process with "
         "RUST_LOG=zenoh=debug.",
-        weak=1,
+        vagueness=1,
     ),
 )  # fmt: skip
 

@@ -28,7 +28,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     enclave_path,
     folder_of_closed_robot,
-    has_authorities,
+    is_original_keystore,
 )
 from sros_tool.keystore.protection import less_protected
 from sros_tool.pki.certificates import fingerprints, load_certificates
@@ -276,7 +276,7 @@ def check_issued(
     if keystore.policies:
         wanted = {enclave.path for policy in keystore.policies for enclave in policy.enclaves}
         root, missing = str(keystore.root), sorted(wanted.difference(keystore.names))
-        if has_authorities(keystore.root):
+        if is_original_keystore(keystore.root):
             for name in missing:
                 yield NOT_IN_KEYSTORE.found(name, "the keystore does not have this enclave", root)
         elif missing:

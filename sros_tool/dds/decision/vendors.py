@@ -195,7 +195,7 @@ class VendorTraits:
     shares_open_topics: bool = False
     """A participant still exchanges data on unprotected topics with peers that refuse it.
 
-    Access control in the direction of the participant prevents this (tested).
+    Access control in the other direction of the topic prevents this (tested).
     """
     ignores_unauthenticated: bool = False
     """Participants without identity are refused even if governance allows them (2.9)."""

@@ -158,15 +158,17 @@ def read_rotation(keystore: Keystore) -> Rotation:
     return rotation
 
 
-def _replacement(read: dict[str, str]) -> Replacement:
-    """Return the replacement that the JSON object ``read`` describes.
+def _replacement(values: dict[str, str]) -> Replacement:
+    """Return the replacement that the JSON object ``values`` describes.
 
     Raises:
-        ValueError, TypeError: ``read`` does not describe a replacement.
+        ValueError, TypeError: ``values`` does not describe a replacement.
     """
-    if not all(isinstance(value, str) for value in read.values()) or "/" in read.get("file", ""):
+    if not all(isinstance(value, str) for value in values.values()) or "/" in values.get(
+        "file", ""
+    ):
         raise ValueError
-    return Replacement(**read)
+    return Replacement(**values)
 
 
 def render_rotation(rotation: Rotation) -> bytes:
