@@ -121,6 +121,8 @@ def create_permission(
 ) -> None:
     """Give ENCLAVE... the permissions that POLICY_FILE states for them: all or none.
 
+    Enclaves that --robot, --match or --all choose keep permissions that state the same rights.
+
     Anyone who has a copy of the replaced permissions, and of the certificate and key used with
     them, can use them until they expire. With --revoke-old, processes that load the new crl.pem
     refuse them.
@@ -149,6 +151,7 @@ def create_permission(
         now=now(),
         domain=ros_domain(),
         revoke_old=revoke_old,
+        keep_same=not given,
         keyring=keyring(),
         allow_refusal=allow_refusal,
         dry_run=dry_run,

@@ -24,7 +24,7 @@ def ks(tmp_path: Path) -> Path:
 VERBS = {
     "renew {}": "renewed enclave ",
     "revoke {}": "revoked enclave ",
-    "create_permission {} p.xml": "signed the permissions of enclave ",
+    "create_permission {} p.xml": "replaced the permissions of enclave ",
     "distribute_key {} robot": "exported enclave ",
 }
 CHOICES = {
@@ -41,11 +41,19 @@ CHOICES = {
 @pytest.mark.parametrize("verb", VERBS)
 def test_the_chosen_enclaves_and_no_others_are_meant(verb: str, choice: str, ks: Path) -> None:
     words = verb.replace("{}", f"ks {choice}").split()
+    (ks.parent / "p.xml").write_text(policy_text(dict.fromkeys(ENCLAVES, publish("other"))))
     ended = sros(*words, cwd=ks.parent).ok()
     said = [line for line in ended.out.splitlines() if line.startswith(VERBS[verb])]
     named = {line.removeprefix(VERBS[verb]).split()[0] for line in said}
     assert named == set(CHOICES[choice])
     assert len(said) == len(named)
+
+
+def test_permissions_that_are_the_same_are_kept_unless_the_enclave_is_named(ks: Path) -> None:
+    words = ("create_permission", "ks", "--match", "/arm/*", "p.xml")
+    assert "unchanged: 2 enclaves: /arm/" in sros(*words, cwd=ks.parent).ok().err
+    again = sros("create_permission", "ks", "/base", "p.xml", cwd=ks.parent).ok()
+    assert again.out.startswith("signed the permissions of enclave /base again")
 
 
 @pytest.mark.parametrize("verb", VERBS)

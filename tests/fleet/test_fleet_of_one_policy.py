@@ -189,7 +189,7 @@ def test_a_policy_with_placeholders_needs_a_fleet(made: Path) -> None:
     assert "robot.xml:2: '/{robot}/base' has a placeholder" in ended.err
     assert "--fleet FILE" in ended.err
     for line, said in (
-        ("create_permission ks --robot r7 robot.xml --dry-run", "would replace"),
+        ("create_permission ks --robot r7 robot.xml --dry-run", "nothing would change"),
         ("metrics ks --policy robot.xml --earliest", "sros_findings"),
     ):
         assert "has a placeholder" in sros(*line.split(), cwd=made).err

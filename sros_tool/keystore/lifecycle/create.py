@@ -233,6 +233,7 @@ def create_permission(
     now: datetime,
     domain: int | None = None,
     revoke_old: bool = False,
+    keep_same: bool = False,
     allow_refusal: Sequence[Vendor] = (),
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
@@ -241,7 +242,8 @@ def create_permission(
 
     Whoever kept the replaced permissions can use them until they expire.  ``revoke_old`` prevents
     that: the enclaves get new certificates for the same keys, and all earlier certificates are
-    revoked.  The nodes of the vendors in ``allow_refusal`` may stop working.
+    revoked.  With ``keep_same``, permissions that state the same rights are kept, as by
+    `generate_artifacts`.  The nodes of the vendors in ``allow_refusal`` may stop working.
     """
     for name in names:
         check_enclave_name(name)
@@ -256,7 +258,7 @@ def create_permission(
         stated = {enclave.path: enclave for enclave in policy.enclaves}
         wanted = {name: stated.get(name) or stated_enclave(policy, name) for name in names}
         _prepare_change(change, domain, protections=stated_protections(wanted.values()))
-        rights = write_enclaves(change, wanted, revoke_old=revoke_old)
+        rights = write_enclaves(change, wanted, revoke_old=revoke_old, keep_same=keep_same)
     return creation(change, rights)
 
 
