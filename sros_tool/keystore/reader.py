@@ -52,6 +52,7 @@ from sros_tool.keystore.layout import (
     check_keystore,
     enclave_names,
     enclave_path,
+    has_authorities,
     how_to_add_domains,
     key_on_robot,
 )
@@ -264,6 +265,14 @@ class Keystore:
     def is_original(self) -> bool:
         """Whether it is a keystore with CAs or settings, and not an export for a robot."""
         return any(map(self.has, (PUBLIC, PRIVATE, SETTINGS)))
+
+    @property
+    def has_all_enclaves(self) -> bool:
+        """Whether it has all enclaves of its CAs.
+
+        An export may lack some, and has the governance only in the folders of its enclaves.
+        """
+        return has_authorities(self.root) or self.has(GOVERNANCE_P7S)
 
     @_Part
     def is_of_ros2(self) -> bool:

@@ -435,7 +435,7 @@ def _keystore_rights(
         root,
         "keystore",
         frozenset(rights),
-        None if keystore.is_original else frozenset(enclaves),
+        None if keystore.has_all_enclaves else frozenset(enclaves),
         reader.sound,
         tuple(reader.unverified[:1] + reader.notes),
         load_fleet(keystore),

@@ -261,7 +261,7 @@ def _access_of_source(path: Path, source: RightsSource) -> AccessSource:
     trusting = {
         name: (folder / IDENTITY_CA_FILE, folder / CRL_FILE) for name, folder in folders.items()
     } | {KEYSTORE_ITSELF: (path / ca_certificate(IDENTITY), path / CRL)}
-    if keystore.is_original:
+    if keystore.has_all_enclaves:
         governance = _common_governance(path, folders.values())
     else:
         governance = _exported_governance(path, folders.values())
@@ -270,7 +270,7 @@ def _access_of_source(path: Path, source: RightsSource) -> AccessSource:
         governance=governance,
         authorities=_authorities(folders.values()),
         trusts=_trusts(trusting, _expiries(path)),
-        later=keystore.template if keystore.is_original else None,
+        later=keystore.template if keystore.has_all_enclaves else None,
         certified=_certified_enclaves(folders),
     )
     if not has_zenoh_files(path, hidden=True):

@@ -797,6 +797,7 @@ def test_an_export_is_compared_in_its_enclaves(keystore: Path, tmp_path: Path) -
     sros("distribute_key", keystore, "/a", robot).ok()
     readers = f"{publish('old_b')}{publish('old_a').replace('publish', 'subscribe')}"
     policy.write_text(policy_text({"/a": publish("old_a"), "/b": readers}))
+    (robot / "private").mkdir()  # without keys, it is still an export
     same = sros("diff_policy", policy, robot).ok()
     assert (same.out, same.err) == ("", "the rights of /a are the same\n")
     drawn = json.loads(sros("view", policy, robot, "--json").ok().out)
