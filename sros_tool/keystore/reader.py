@@ -52,8 +52,8 @@ from sros_tool.keystore.layout import (
     check_keystore,
     enclave_names,
     enclave_path,
-    has_authorities,
     how_to_add_domains,
+    is_original_keystore,
     key_on_robot,
 )
 from sros_tool.keystore.ledger import Ledger, LedgerFile
@@ -272,7 +272,7 @@ class Keystore:
 
         An export may lack some, and has the governance only in the folders of its enclaves.
         """
-        return has_authorities(self.root) or self.has(GOVERNANCE_P7S)
+        return is_original_keystore(self.root) or self.has(GOVERNANCE_P7S)
 
     @_Part
     def is_of_ros2(self) -> bool:
