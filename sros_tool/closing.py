@@ -559,7 +559,7 @@ def access_lines(policy: Policy, folder: Path) -> list[str]:
         (enclave.path, right.right, right.name)
         for enclave in policy.enclaves
         for profile in enclave.all_profiles()
-        for right in common.given(parts, profile.ns, profile.node)
+        for right in common.included_rights(parts, profile.ns, profile.node)
     }
     rights = policy_rights(policy)
     rules, enclaves = Rules(rights), sorted({right.enclave for right in rights})

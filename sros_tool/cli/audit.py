@@ -202,7 +202,9 @@ def audit(
         one_policy = enclaves.what == "policy" and len(sources) == 1
         policy = shlex.quote(str(sources[0])) if one_policy else "POLICY"
         command = f"add it: sros merge_policy {policy} {shlex.quote(str(patch))} --in-place"
-        by_hand = _added_by_hand(sources, read_fleet(fleet_file), audited) if fleet_file else ""
+        by_hand = (
+            _advice_to_add_by_hand(sources, read_fleet(fleet_file), audited) if fleet_file else ""
+        )
         echo(f"{written}; {by_hand or command}", err=True)
     elif patch is None and audited.missing.profiles:
         echo(_TO_ALLOW, err=True)
@@ -236,7 +238,7 @@ def _write_patch(audited: Audit, patch: Path | None, *, dry_run: bool) -> str:
     return save(patch, document)
 
 
-def _added_by_hand(sources: Sequence[Path], fleet: Fleet, audited: Audit) -> str:
+def _advice_to_add_by_hand(sources: Sequence[Path], fleet: Fleet, audited: Audit) -> str:
     """Return where to add the missing rights to policies with placeholders, "" without them."""
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.policy.document import join_policies, read_policy

@@ -300,7 +300,9 @@ def as_learned(
                 continue
             has = present.get(profile, frozenset())
             parts = _denied_common_part(denied, profile, has, common) if common else ()
-            node_rights = common.given(parts, *profile) if common else frozenset[NodeRight]()
+            node_rights = (
+                common.included_rights(parts, *profile) if common else frozenset[NodeRight]()
+            )
             if parts:
                 wholes[_full_name(profile)] = ", ".join(parts)
             groups = groups_of(denied - node_rights, *profile)
@@ -381,7 +383,7 @@ def _denied_common_part(
         return ()
     for part in _NODE_PARTS:
         if part in common.rights:
-            rights = common.given([part], *profile)
+            rights = common.included_rights([part], *profile)
             if rights & denied and not rights & node_rights:
                 return (part,)
     return ()

@@ -412,7 +412,7 @@ class CommonParts:
                 rest -= node_rights
         return tuple(chosen), rest
 
-    def given(self, parts: Iterable[str], ns: str, node: str) -> frozenset[NodeRight]:
+    def included_rights(self, parts: Iterable[str], ns: str, node: str) -> frozenset[NodeRight]:
         """Return the rights, with absolute names, that ``parts`` give to a node."""
         return frozenset().union(*(_expanded_rights(self.rights[part], ns, node) for part in parts))
 
@@ -822,7 +822,7 @@ def _rights_and_profiles(
     by_name, shown = [], []
     for own in learned.profiles:
         place = own.enclave, own.ns, own.node
-        node_rights = common.given(own.includes, own.ns, own.node)
+        node_rights = common.included_rights(own.includes, own.ns, own.node)
         if place not in known:
             shown.append(own)
         elif node_rights and not any(
@@ -976,8 +976,10 @@ def with_common_parts(path: Path, merged: bytes, others: Sequence[Policy]) -> by
             rights = frozenset(NodeRight(right.right, right.name) for right in own)
             # A merge leaves out what another profile of the enclave allows.
             chosen, _ = common.choose(allowed, ns, node)
-            includes = tuple(part for part in chosen if common.given((part,), ns, node) & rights)
-            groups = _groups_not_given(common.given(includes, ns, node), profile)
+            includes = tuple(
+                part for part in chosen if common.included_rights((part,), ns, node) & rights
+            )
+            groups = _groups_not_given(common.included_rights(includes, ns, node), profile)
             profiles.append(LearnedProfile(enclave.path, ns, node, rights, includes, groups))
     document, _ = _with_includes(path, before, merged, profiles)
     same = policy_rights(read_policy(path, document)) == policy_rights(policy)

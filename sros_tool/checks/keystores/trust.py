@@ -143,7 +143,7 @@ def _strangers(
     ``refused_pairs``.
     """
     read = {shown: dict(_parties(*target)) for shown, target in targets.items()}
-    # Most exports trust and present the same as others: only one of each kind is compared.
+    # Most exports trust and present the same CAs as others: only one of each kind is compared.
     alike: dict[frozenset[_Kind], list[str]] = defaultdict(list)
     for shown, of_target in read.items():
         alike[frozenset(of_target)].append(shown)
@@ -183,7 +183,7 @@ def _refused_roles(
 
 
 def _parties(keystore: Keystore, enclaves: Sequence[str]) -> Iterator[tuple[_Kind, _Party]]:
-    """Yield one enclave of all that trust and present the same CAs, and these CAs."""
+    """Yield one enclave of each group that trusts and presents the same CAs, with these CAs."""
     seen = set()
     for name in enclaves:
         folder = keystore.folder(name)
