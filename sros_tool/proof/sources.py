@@ -31,6 +31,7 @@ from sros_tool.keystore.layout import (
     IDENTITY_CA_FILE,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
+    ROUTER_FILE,
     ZENOH_SIGNED,
     ca_certificate,
     enclave_names,
@@ -275,6 +276,15 @@ def _access_of_source(path: Path, source: RightsSource) -> AccessSource:
     )
     if not has_zenoh_files(path, hidden=True):
         return side
+    with_router = any((folder / ROUTER_FILE).is_file() for folder in folders.values())
+    if not (with_router or keystore.has_all_enclaves):
+        folder = next(iter(folders.values()))
+        raise DocumentError(
+            f"'{path}' cannot be compared: it has Zenoh files, but not {ROUTER_FILE}",
+            "Only the file of the router shows which rights Zenoh enforces.",
+            "Compare the keystore that it comes from, or only the permissions of an enclave, such "
+            f"as '{folder}'.",
+        )
     rights_source = load_zenoh_rights(keystore, hidden=True)
     for note in rights_source.notes:
         if note.id in UNCERTAIN:

@@ -810,6 +810,10 @@ def test_an_export_is_compared_in_its_enclaves(keystore: Path, tmp_path: Path) -
     assert sros("diff_policy", "--no-new-access", robot, policy).out.startswith("+ /a publish")
     sros("distribute_key", keystore, "--all", tmp_path / "more").ok()
     assert sros("diff_policy", "--no-new-access", robot, tmp_path / "more").status == 1
+    (session := robot / "enclaves" / "a" / "session.json5").write_text("{}")
+    lacking = sros("diff_policy", "--no-new-access", robot, policy)
+    assert lacking.status == 2 and "it has Zenoh files, but not router.json5" in lacking.err
+    session.unlink()
     (robot / "enclaves" / "a" / "governance.p7s").unlink()
     lacking = sros("diff_policy", "--no-new-access", robot, policy)
     assert lacking.status == 2 and "governance.p7s' does not exist" in lacking.err
