@@ -102,13 +102,13 @@ def robot_findings(
     lacking: dict[str, list[str]] = {}
     for robot, dds in robots.items():
         if dds is None:
-            lacking.setdefault("not reported by", []).append(robot)
+            lacking.setdefault("not reported by {}", []).append(robot)
             continue
         for library in dds.libraries:
             where = seen.setdefault(_as_mapped(library), {})
             where.setdefault(library.seen, []).append(robot)
         if not dds.libraries:
-            lacking.setdefault("none seen on", []).append(robot)
+            lacking.setdefault("none seen on {}", []).append(robot)
         if dds.unseen:
             lacking.setdefault(_UNSEEN, []).append(robot)
     by = {
@@ -117,12 +117,12 @@ def robot_findings(
     }
     yield from _library_findings(by, advisories)
     if lacking:
-        parts = (f"{what} {names_text(names)}" for what, names in lacking.items())
+        parts = (what.format(names_text(names)) for what, names in lacking.items())
         remedy = _UNSEEN_REMEDY if lacking.keys() == {_UNSEEN} else ""
         yield ROBOTS_UNKNOWN.found("DDS of robots", "; ".join(parts), remedy=remedy)
 
 
-_UNSEEN = "processes that could not be looked at on"
+_UNSEEN = "some processes of {} could not be looked at"
 _SEEN = {Seen.PROCESS: "loaded by processes of", Seen.INSTALLED: "installed, but not loaded, on"}
 
 

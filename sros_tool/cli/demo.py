@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 from click.core import ParameterSource
 
+from sros_tool import __version__
 from sros_tool.cli.common import (
     PATH,
     advisories_of,
@@ -308,7 +309,8 @@ def _write_report(report: Path, result: dict[str, Any], keep: Path | None) -> No
 
     places = [Path.home(), Path.cwd(), Path(tempfile.gettempdir()), *([keep] if keep else [])]
     folders = [str(place.absolute()) for place in places]
-    replace_file(report, render_demo_page(without_folders(result, folders)).encode())
+    made = f"made by sros {__version__} on {now():%Y-%m-%d}"
+    replace_file(report, render_demo_page(without_folders(result, folders), made).encode())
 
 
 def _progress(line: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
@@ -634,8 +634,14 @@ def _status(
         from sros_tool.report.pages import render_fleet_page
         from sros_tool.values import as_plain
 
+        rows = list(_page_rows(compared, robots))
         text = render_fleet_page(
-            as_plain(compared), _WORDS, list(_facts(compared)), list(_page_rows(compared, robots))
+            as_plain(compared),
+            _WORDS,
+            list(_facts(compared)),
+            rows,
+            _remedies(root, {to_do for *_, to_do, _ in rows}),
+            _list_in_force(status),
         )
     else:
         lines = _lines(compared, robots, findings=advisories is not None)
@@ -715,18 +721,52 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     if status.stage != "complete":
         behind = counted(len(status.unconfirmed), "robot")
         yield f"CA rotation: {status.stage}; not confirmed by {behind} yet"
-    robots = [robot for robot in status.robots if robot.crl_in_force is not None]
-    if robots and status.is_any_revoked:
-        in_force = sum(bool(robot.crl_in_force) for robot in robots)
-        number = f"{in_force} of " if in_force < len(robots) else "all " if in_force > 1 else ""
-        text = f"the revocation list is in force on {number}{counted(len(robots), 'robot')}"
-        if waiting := sum(robot.has_list and not robot.crl_in_force for robot in robots):
+    if numbers := _list_in_force(status):
+        in_force, robots = numbers
+        number = f"{in_force} of " if in_force < robots else "all " if in_force > 1 else ""
+        text = f"the revocation list is in force on {number}{counted(robots, 'robot')}"
+        if waiting := sum(
+            robot.has_list and robot.crl_in_force is False for robot in status.robots
+        ):
             text += f"; {waiting} more have it, but may run processes that started before it"
         yield text
     yield from _expiry_facts(compared_fleet)
     if status.unassigned:
         number = counted(status.unassigned, "enclave")
         yield f"{number} of no robot, whose state no confirmation shows"
+
+
+def _list_in_force(status: FleetStatus) -> tuple[int, int] | None:
+    """Return on how many robots the revocation list is in force, and how many have to have it.
+
+    None if nothing is revoked, or no robot has to have the list.
+    """
+    robots = [robot for robot in status.robots if robot.crl_in_force is not None]
+    if not (robots and status.is_any_revoked):
+        return None
+    return sum(bool(robot.crl_in_force) for robot in robots), len(robots)
+
+
+def _remedies(root: Path, to_dos: Collection[str]) -> Mapping[str, str]:
+    """Return how to do what robots need, by what it is called in the column `to do`."""
+    from sros_tool.keystore.fleet import publish_command
+
+    where = quote(str(root))
+    by_hand = (
+        f"`sros distribute_key {where} --robot NAME FOLDER --force`, bring FOLDER to the robot, "
+        "and restart its processes; with Ansible, run the play `deliver`"
+    )
+    publish = publish_command(root)
+    known = {
+        "deliver": by_hand,
+        "publish": publish,
+        "renew": f"`sros renew {where} --all-expiring 30d`, then {publish or 'deliver'}",
+        "take it out of the fleet file": "remove the robot from the fleet file, and run "
+        f"`sros generate_artifacts -k {where} -p POLICY --fleet FILE`",
+    }
+    return {
+        name: known[name] for name in known if known[name] and any(name in text for text in to_dos)
+    }
 
 
 def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
@@ -840,12 +880,17 @@ def _page_rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator
         names = _robot_names(group.names, status.names, status.groups, most)
         received = group.oldest_confirmation(compared_fleet.at).received
         expiry = [moment for robot in group.robots for moment in robot.expiry.values()]
+        outdated = [name for name in group.names if name in compared_fleet.outdated_dds]
+        to_do = [group.to_do] if group.to_do else []
+        if outdated:
+            of = "" if len(outdated) == len(group.names) else f" of {first_few(outdated, most)}"
+            to_do.append(f"upgrade the DDS{of}")
         yield (
             group.state,
             names,
             iso(received) if received else "",
             iso(min(expiry)) if expiry else "",
-            group.to_do,
+            "; ".join(to_do),
             group.what,
         )
 

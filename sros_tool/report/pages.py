@@ -12,6 +12,7 @@ import base64
 import hashlib
 import html
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from itertools import groupby
@@ -210,9 +211,10 @@ _SKIPPED = "skipped"
 _MOST_NAMES = 4
 
 
-def render_demo_page(result: Json) -> str:
-    """Return the HTML page of a demo's result."""
-    body = "\n".join((_demo_head(result), *map(_demo_scenario, result["scenarios"])))
+def render_demo_page(result: Json, made: str) -> str:
+    """Return the HTML page of a demo's result; ``made`` says by which release of sros, and when."""
+    scenarios = map(_demo_scenario, result["scenarios"])
+    body = "\n".join((_demo_head(result, made), *scenarios, _demo_vulnerabilities(result)))
     title = f"sros demo on {result['dds']}"
     return _document(title, f"<main>{body}</main>", _asset("demo.css"))
 
@@ -231,11 +233,17 @@ def without_folders(value: Any, folders: Sequence[str]) -> Any:
 
 
 def _sentence(text: str) -> str:
-    """Return ``text`` as a sentence escaped for HTML, with a capital letter and a full stop."""
-    return escape(f"{text[:1].upper()}{text[1:].rstrip('.')}.") if text else ""
+    """Return ``text`` as a sentence in HTML, with a capital letter and a full stop."""
+    return _with_marks(f"{text[:1].upper()}{text[1:].rstrip('.')}.") if text else ""
 
 
-def _demo_head(result: Json) -> str:
+def _with_marks(text: str) -> str:
+    """Return ``text`` in HTML, in which backticks mark commands; CVE numbers stay whole."""
+    marked = re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
+    return re.sub(r"\bCVE-\d+-\d+", r'<span class="id">\g<0></span>', marked)
+
+
+def _demo_head(result: Json, made: str) -> str:
     rows = result["rows"]
     good, skipped = _number_as_expected(rows), sum(row["observed"] == _SKIPPED for row in rows)
     not_tried = sum(len(_untried_attempts(scenario)) for scenario in result["scenarios"])
@@ -256,7 +264,7 @@ def _demo_head(result: Json) -> str:
         (
             ("good" if good == len(rows) else "") if result["as_expected"] else "error",
             f"{good} of {len(rows)}",
-            "rows as expected",
+            "attempts ended as they should",
         ),
         ("", str(sum(bool(row.get("defence_removed")) for row in rows)), "with a defence removed"),
         ("warning" if opened else "", str(opened), "known to be open"),
@@ -270,16 +278,42 @@ def _demo_head(result: Json) -> str:
         for kind, number, text in tiles
         if number != "0"
     )
-    chosen = f"Why {escape(result['backend'])}: {escape(result['why'])}."
-    why = f'<p class="soft">{chosen}</p>' if result["why"] else ""
-    known = escape(result["vulnerabilities"])
-    number = sum(len(used["vulnerabilities"] or ()) for used in result.get("libraries") or ())
-    if number:
-        summary = counted(number, "known vulnerability", "known vulnerabilities")
-        known = f"<details><summary>{summary}</summary>{known}</details>"
+    why = f"Why {result['backend']}: {result['why']}" if result["why"] else ""
     return (
-        f"<header><h1>What was tried on a real middleware</h1><p>{', '.join(facts)}.</p>"
-        f'<ul class="tiles">{shown}</ul>{why}<div>{known}</div></header>'
+        f"<header><h1>sros demo: {good} of {len(rows)} attempts ended as they should</h1>"
+        f"<p>On a real middleware: {', '.join(facts)}. {_sentence(made)}</p>"
+        f'<ul class="tiles">{shown}</ul><p class="soft">{_sentence(why)}</p></header>'
+    )
+
+
+def _demo_vulnerabilities(result: Json) -> str:
+    """Return a section on the DDS under test, and on others that the processes had loaded."""
+    lines = []
+    libraries = result.get("libraries") or ()
+    for used in sorted(libraries, key=lambda used: not result["dds"].startswith(used["product"])):
+        name = f"{used['product']} {used['version'] or 'of unknown version'}"
+        if not result["dds"].startswith(used["product"]):
+            name += " (not the DDS under test, but processes had loaded it, too)"
+        ids, unclear = used["vulnerabilities"], used["unclear"]
+        if ids is None:
+            lines.append(
+                f"<p>{_sentence(f'{name} may have vulnerabilities: they are not known')}</p>"
+            )
+            continue
+        number = counted(len(ids), "known vulnerability", "known vulnerabilities")
+        fixed = " (its package may have the fixes)" if used["packaged"] and ids else ""
+        listed = ", ".join((*ids, *(f"{name} (not known for this release)" for name in unclear)))
+        lines.append(_fold(f"{name}: {number}{fixed}", listed))
+    shown = "".join(lines) or f"<p>{_with_marks(result['vulnerabilities'])}</p>"
+    return f"<section><h2>Known vulnerabilities</h2>{shown}</section>"
+
+
+def _fold(title: str, text: str) -> str:
+    """Return HTML of a text below a title that unfolds it."""
+    return (
+        f"<details><summary>{escape(title)}</summary>{_with_marks(text)}</details>"
+        if text
+        else f"<p>{escape(title)}.</p>"
     )
 
 
@@ -316,7 +350,7 @@ def _demo_scenario(scenario: Json) -> str:
         names = escape("; ".join(not_tried))
         parts.append(f"<p>Not tried, and needed for a proof: {names}.</p>")
     if rows:
-        count = f"{escape(scenario['name'])}: {good} of {len(rows)} rows as expected"
+        count = f"{escape(scenario['name'])}: {good} of {len(rows)} attempts ended as they should"
         parts += [f'<p class="soft">{count}</p>', _demo_table(rows)]
     return "\n".join((*parts, "</section>"))
 
@@ -378,7 +412,12 @@ _OUT_OF_DATE = ("restart", "unusable", "earlier", "different", "missing", "offli
 
 
 def render_fleet_page(
-    status: Json, words: Mapping[str, str], facts: Sequence[str], rows: Sequence[Sequence[str]]
+    status: Json,
+    words: Mapping[str, str],
+    facts: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    remedies: Mapping[str, str],
+    list_in_force: tuple[int, int] | None = None,
 ) -> str:
     """Return the HTML page of a fleet's status.
 
@@ -388,6 +427,9 @@ def render_fleet_page(
         facts: what is to be said of the fleet as a whole.
         rows: of robots with the same state: this state, their names, when they confirmed, their
             first expiry, what to do, and why.
+        remedies: what to do → how it is done.
+        list_in_force: the number of robots on which the revocation list is in force, and of all
+            that have to have it; None if nothing is revoked.
     """
     tiles = "".join(
         f'<li class="tile {_fleet_class(state)}"><b>{number}</b> {words.get(state, state)}</li>'
@@ -395,12 +437,24 @@ def render_fleet_page(
     )
     if outdated := len(status["outdated_dds"]):
         tiles += f'<li class="tile warning"><b>{outdated}</b> with a DDS to upgrade</li>'
+    trusted = ""
+    if list_in_force:
+        kind = "good" if list_in_force[0] == list_in_force[1] else "error"
+        number = "{} of {}".format(*list_in_force)
+        tiles = (
+            f'<li class="tile {kind}"><b>{number}</b> with the revocation list in force</li>{tiles}'
+        )
+        if kind == "error":
+            trusted = (
+                '<p class="wrong">Until the revocation list is in force on a robot, the robot '
+                "accepts whoever has a revoked key: deliver it, and restart the processes.</p>"
+            )
     said = "".join(f"<br>{_sentence(fact)}" for fact in facts)
     head = (
         f"<header><h1>Status of the fleet</h1>"
         f"<p>Keystore <code>{escape(status['keystore'])}</code>, {len(status['robots'])} robots, "
         f"as of {_minute(status['at'])} UTC.{said}</p>"
-        f'<ul class="tiles">{tiles}</ul></header>'
+        f'<ul class="tiles">{tiles}</ul>{trusted}</header>'
     )
     heads = "".join(f'<th scope="col">{name}</th>' for name in _FLEET_COLUMNS)
     worst_first = sorted(rows, key=lambda row: _FLEET_CLASSES.index(_fleet_class(row[0])))
@@ -408,13 +462,23 @@ def render_fleet_page(
     table = (
         f'<table class="rows fleet"><thead><tr>{heads}</tr></thead><tbody>{lines}</tbody></table>'
     )
-    findings = "".join(
-        f"<li>{escape(finding['subject'])}: {escape(finding['text'])}</li>"
-        for finding in status["findings"]
+    how = "".join(
+        f"<dt>{escape(to_do)}</dt><dd>{_sentence(remedy)}</dd>"
+        for to_do, remedy in remedies.items()
     )
-    listed = f"<h2>Vulnerabilities of the DDS</h2><ul>{findings}</ul>" if findings else ""
-    body = f"<main>{head}<section>{table}{listed}</section></main>"
+    how = f"<h2>How to do it</h2><dl>{how}</dl>" if how else ""
+    findings = "".join(map(_dds_finding, status["findings"]))
+    listed = f"<h2>Vulnerabilities of the DDS</h2>{findings}" if findings else ""
+    body = f"<main>{head}<section>{table}{how}{listed}</section></main>"
     return _document(f"Fleet of {status['keystore']}", body, _asset("demo.css"))
+
+
+def _dds_finding(finding: Json) -> str:
+    """Return a finding on the DDS of robots, of which the ids of vulnerabilities are folded."""
+    text, colon, ids = finding["text"].partition(": CVE-")
+    return _fold(
+        f"{finding['subject']}: {text}", f"CVE-{ids}. {finding['remedy']}" if colon else ""
+    )
 
 
 _FLEET_COLUMNS = ("State", "Robots", "To do", "Details", "Confirmed (UTC)", "First expiry")
@@ -430,7 +494,7 @@ def _fleet_row(row: Sequence[str], words: Mapping[str, str]) -> str:
     chip = f'<span class="chip {_fleet_class(state)}">{words.get(state, state)}</span>'
     texts = (to_do, why, confirmed and _minute(confirmed), expiry[:10])
     cells = "".join(
-        f'<td data-label="{label}">{escape(text)}</td>' if text else "<td></td>"
+        f'<td data-label="{label}">{_with_marks(text)}</td>' if text else "<td></td>"
         for label, text in zip(_FLEET_COLUMNS[2:], texts, strict=True)
     )
     return f'<tr><td>{chip}</td><th scope="row">{escape(robots)}</th>{cells}</tr>'

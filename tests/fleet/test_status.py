@@ -888,7 +888,7 @@ FOUND = frozenset({NOT_SEEN})
         ({**OLD, "path": "/usr/lib/libfastrtps.so.2.14.5"}, 0, [], "27 known vulnerabilities"),
         ({**OLD, "version": ""}, 0, [], "does not show its version, loaded by processes of r1"),
         (None, 0, [], "none seen on r1"),
-        (LIBRARY, 7, [], "processes that could not be looked at on r1"),
+        (LIBRARY, 7, [], "some processes of r1 could not be looked at"),
     ],
 )
 def test_the_dds_of_a_robot(
@@ -978,6 +978,6 @@ def test_metrics_and_the_page(field: Field) -> None:
     renamed = renamed.rename(field.root)
     field.confirm("r1", dds={"libraries": [OLD], "unseen": 0})
     page = field.run("fleet", "status", renamed, "--html", status=1).out
-    assert "<li>Fast DDS 2.14.5: &#x27;/a/libfastrtps.so.2.14.5&#x27;, loaded by" in page
+    assert "<summary>Fast DDS 2.14.5: &#x27;/a/libfastrtps.so.2.14.5&#x27;, loaded by" in page
     for words in ("--json --html", "--json -o x.json", "--prometheus -o x.txt"):
         field.run("fleet", "status", renamed, *words.split(), status=2)

@@ -65,9 +65,9 @@ def test_what_was_not_tried_is_said_and_nothing_of_it_is_green() -> None:
     keystore = {"enclaves": 7, "elsewhere": 1, "not_tried": ["a", HOSTILE[0]]}
     cast = [{"part": "guest", "enclave": "/a", "nodes": [], "why": f"why {HOSTILE[0]}"}]
     shown["scenarios"] = [{**shown["scenarios"][0], "keystore": keystore, "cast": cast}]
-    page = html.fromstring(render_demo_page(shown))
+    page = html.fromstring(render_demo_page(shown, ""))
     tiles = {each.text_content(): each.get("class", "") for each in page.cssselect("li.tile")}
-    assert "good" not in tiles["1 of 2 rows as expected"]
+    assert "good" not in tiles["1 of 2 attempts ended as they should"]
     assert {"1 skipped", "3 left out", "2 not tried, but needed for a proof"} <= set(tiles)
     text = page.text_content()
     assert f"Not tried, and needed for a proof: a; {HOSTILE[0]}." in text
@@ -90,8 +90,10 @@ def test_every_row_is_told_with_what_came_of_it() -> None:
             row("names read", attack="looking", open_because="names are in clear", remedy="none"),
             row("something else", observed="heard", as_expected=False),
             row("not here", observed="skipped"),
-        )
+        ),
+        "made by sros 1.2.3 on 2027-01-01",
     )
+    assert "Made by sros 1.2.3 on 2027-01-01." in page
     rows = html.fromstring(page).xpath("//table[@class='rows']//tr[td]")
     told = [" ".join(" ".join(each.itertext()).split()) for each in rows]
     assert len(told) == 5
@@ -128,12 +130,14 @@ def test_no_place_of_the_machine_is_written(tmp_path: Path) -> None:
 def fleet_page() -> str:
     """A fleet's status with long and hostile names, in a state of each class."""
     name = HOSTILE[0]
-    finding = {"subject": name, "text": "/opt/" + 60 * "library"}
+    finding = {"subject": name, "text": "/opt/" + 60 * "library: CVE-1-2, ", "remedy": name}
     states = ("revoked", "earlier", "current")
     status: dict[str, Any] = {"keystore": name, "at": "2027-01-01T00:00:00Z", "counts": {}}
     rows = [(state, name, "2027-01-01T00:00:00Z", "", "deliver", 60 * "file") for state in states]
     status |= {"robots": states, "outdated_dds": ["r1"], "findings": [finding]}
-    return render_fleet_page(status, {"earlier": "an earlier one"}, [name], rows)
+    return render_fleet_page(
+        status, {"earlier": "an earlier one"}, [name], rows, {"deliver": name}, (1, 2)
+    )
 
 
 @pytest.mark.browser
@@ -142,7 +146,7 @@ def test_it_opens_from_disk_and_runs_nothing(browser: Browser, built: Path, tmp_
     axe = (built / "node_modules/axe-core/axe.min.js").read_text()
     said: list[str] = []
     names = {"demo": HOSTILE, "fleet": 3 * HOSTILE[:1]}
-    for kind, text in {"demo": render_demo_page(result(*rows)), "fleet": fleet_page()}.items():
+    for kind, text in {"demo": render_demo_page(result(*rows), ""), "fleet": fleet_page()}.items():
         path = tmp_path / f"{kind}.html"
         path.write_text(text)
         page = new_page(browser)
