@@ -103,7 +103,7 @@ def merge_policy(
       note [merge.still-denied]: /talker DENY publish topic /cmd_vel stays ...
       replaced 'robot.xml'
       $ sros merge_policy robot.xml gripper.xml --namespace /left --in-place
-      $ sros merge_policy robot.xml camera.xml --enclave /pipeline \
+      $ sros merge_policy robot.xml camera.xml --enclave /pipeline \\
             --node driver --node rectify --in-place
     """
     from sros_tool.fleet.robots import namespace_problem
