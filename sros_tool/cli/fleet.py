@@ -317,6 +317,8 @@ def _collect(
     if problem:
         raise problem
     if collected.not_signed:
+        if not any(robot.requests for robot in collected.robots):  # which name the reason
+            echo(f"not signed: {collected.not_signed}", err=True)
         return NOT_DONE
     is_published = published is None or published.is_complete(moment)
     return 0 if collected.complete and is_published else 1

@@ -15,6 +15,7 @@ from functools import cached_property
 from cryptography import x509
 
 from sros_tool.errors import KeystoreError, Note, PkiError, SrosError
+from sros_tool.keystore.delivery.published import later_revoked_serials
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     KEY_FILE,
@@ -111,6 +112,11 @@ class KnownKeys:
         lists = (entry for crl in self._keystore.revocation_lists for entry in crl.revoked)
         return serials | {entry.serial for entry in lists if entry.reason != SUPERSEDED}
 
+    @cached_property
+    def _revoked_later(self) -> frozenset[int]:
+        """The serial numbers that only lists in the publishing folder have, as after a restore."""
+        return later_revoked_serials(self._keystore) - revoked_serials(self._keystore)
+
     def revoked_before(self, names: Collection[str]) -> set[str]:
         """Return those of ``names`` whose last certificate was revoked, and not superseded.
 
@@ -171,6 +177,10 @@ class KnownKeys:
                 enclaves_by_key[key].append(name)
         return enclaves_by_key
 
+    def is_revoked(self, key: str) -> bool:
+        """Return whether the key with the digest ``key`` was revoked."""
+        return key in self._revoked
+
     def refuse_revoked(
         self, key: PublicKey, holder: str, remedy: str, certificate: x509.Certificate | None = None
     ) -> None:
@@ -185,6 +195,13 @@ class KnownKeys:
         if revoked:
             raise KeystoreError(
                 f"the key of {holder} was revoked", f"It is the key of {revoked}.", remedy
+            )
+        if certificate and certificate.serial_number in self._revoked_later:
+            raise KeystoreError(
+                f"the certificate of {holder} was revoked after the backup that the keystore was "
+                "restored from",
+                "A revocation list in the folder of `sros fleet publish` names it.",
+                "First publish with --restored, which takes this list over.",
             )
 
     def refuse_shared_key(self, key: PublicKey, name: str, remedy: str) -> None:

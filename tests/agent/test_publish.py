@@ -585,6 +585,39 @@ def test_revoking_after_a_restore_covers_certificates_of_after_the_backup(
     assert "restored" not in publisher.run("revoke", "ks", "/r2/base").err
 
 
+@pytest.mark.parametrize("renewed_first", [True, False])
+def test_a_key_that_was_replaced_after_the_backup_is_not_certified_again(
+    publisher: Home, renewed_first: bool
+) -> None:
+    """The restored keystore has only this key; whose certificate alone was replaced keeps its."""
+    publisher.publish()  # the keystore records the folder
+    backup = copy_of(publisher.root, publisher.folder / "backup")
+    publisher.run("renew", "ks", "/r1/base", "--revoke-old")
+    publisher.run("renew", "ks", "/r2/base", "--new-key", "--revoke-old")
+    publisher.publish()
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    assert "First publish with --restored" in sros("renew", publisher.root, "/r2/base").err
+    if renewed_first:
+        publisher.pub.rename(publisher.folder / "server")
+        publisher.run("renew", "ks", "--all")
+        (publisher.folder / "server").rename(publisher.pub)
+    stolen = Keystore(publisher.root).certificate_of("/r2/base")
+    for dry_run in (True, False, False):
+        if renewed_first or dry_run:
+            what = "`sros renew .* /r2/base --new-key --revoke-old`"
+        else:
+            what = "`sros renew [^ ]* /r1/base` and `sros renew [^ ]* /r2/base --new-key --revoke"
+        with pytest.raises(KeystoreError, match=what):
+            publisher.publish(restored=True, dry_run=dry_run)
+    crl = Keystore(publisher.root).revocation_list
+    assert crl and crl.revokes(stolen.serial_number)
+    assert "key of enclave /r2/base was revoked" in sros("renew", publisher.root, "/r2/base").err
+    publisher.run("renew", "ks", "/r1/base")
+    publisher.run("renew", "ks", "/r2/base", "--new-key", "--revoke-old")
+    assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
+
+
 def test_a_publishing_folder_teaches_nothing_that_the_cas_did_not_sign(publisher: Home) -> None:
     """A certificate of another CA, one that is recorded already, and files that are no archives."""
     backup = copy_of(publisher.root, publisher.folder / "backup")

@@ -67,7 +67,11 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import RESTORED, Entry, clock_behind
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import Forgotten
-from sros_tool.keystore.lifecycle.revoke import restore_revocations, restored_note
+from sros_tool.keystore.lifecycle.revoke import (
+    REPLACED_AFTER_BACKUP,
+    restore_revocations,
+    restored_note,
+)
 from sros_tool.keystore.outcomes import changes_below
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.transaction.transaction import KeystoreLock
@@ -756,6 +760,13 @@ class _Run:
         if forgotten_lists.lists:
             whence = f"the last release in '{self._folder}' has"
             self._notes.append(restored_note(revocation, whence))
+        for note in revocation.notes:
+            if note.id == REPLACED_AFTER_BACKUP:
+                raise KeystoreError(
+                    f"'{self._folder}' cannot be published yet: {note.text[:-1]}",
+                    "Robots would refuse these enclaves.",
+                    "Then repeat this command, with --restored.",
+                )
         self._notes += revocation.notes
 
     def _sealed_certificates(self) -> Iterator[x509.Certificate]:

@@ -17,9 +17,10 @@ from typing import Any, NamedTuple
 
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT
-from sros_tool.keystore.delivery.release import release_target
-from sros_tool.keystore.layout import PUBLISHED
+from sros_tool.keystore.delivery.release import read_release, release_target
+from sros_tool.keystore.layout import CRL_FILE, IDENTITY, PUBLISHED
 from sros_tool.keystore.reader import Keystore
+from sros_tool.pki.crl import load_crl, signed_by
 from sros_tool.validity import iso, parse_iso
 from sros_tool.values import parse_json
 from sros_tool.xml import read_bytes
@@ -171,6 +172,24 @@ def may_have_later_releases(keystore: Keystore) -> bool:
             ]
             return bool(version > known.versions.get("timestamp", 0))
     return False
+
+
+def later_revoked_serials(keystore: Keystore) -> frozenset[int]:
+    """Return what lists of the keystore in a publishing folder with later releases revoke."""
+    serials: set[int] = set()
+    seen: set[bytes] = set()
+    if may_have_later_releases(keystore):
+        authorities = keystore.authority(IDENTITY)
+        for path in Path(read_published(keystore).folder).glob("targets/robots/*.tar.gz"):
+            with suppress(SrosError, OSError):
+                release = read_release(read_bytes(path, "archive", max_bytes=OF_ONE_ROBOT.packed))
+                lists = {data for file, data in release.files.items() if file.endswith(CRL_FILE)}
+                for data in lists - seen:
+                    seen.add(data)
+                    crl = load_crl(data, f"'{path}'")
+                    if any(signed_by(crl.list, authority) for authority in authorities):
+                        serials.update(entry.serial for entry in crl.revoked)
+    return frozenset(serials)
 
 
 def damaged_list_error(keystore: Keystore, why: str = "") -> DocumentError:

@@ -110,6 +110,7 @@ def refuse_stopping(
     *,
     keystore: Keystore | None = None,
     allowed: Collection[Vendor] = (),
+    revoked_before: Collection[int] = (),
     remedy: Callable[[], str] = str,
 ) -> tuple[Note, ...]:
     """Refuse a transaction after which vendors refuse enclaves that they accept today.
@@ -122,6 +123,7 @@ def refuse_stopping(
         now: the time at which the enclaves are evaluated.
         keystore: the keystore as it was opened for the change.
         allowed: vendors whose nodes may stop, because the user named them.
+        revoked_before: serial numbers that were revoked before, though the keystore lacks it.
         remedy: function that returns a remedy, as sentences; by default the error names the changed
             files.
 
@@ -132,7 +134,7 @@ def refuse_stopping(
     Raises:
         KeystoreError: nodes of a vendor that is not ``allowed`` would stop.
     """
-    files = _FilesOfChange(transaction, keystore or Keystore(transaction.root))
+    files = _FilesOfChange(transaction, keystore or Keystore(transaction.root), revoked_before)
     stopped, revoked = _stopped_enclaves(files, now)
     if refused := {vendor: why for vendor, why in stopped.items() if vendor not in allowed}:
         raise _refused_change_error(transaction.root, refused, remedy())
@@ -399,7 +401,10 @@ def _example(
 class _FilesOfChange:
     """The files of enclaves before and after a transaction; shared files are read once."""
 
-    def __init__(self, transaction: Transaction, keystore: Keystore) -> None:
+    def __init__(
+        self, transaction: Transaction, keystore: Keystore, revoked_before: Collection[int]
+    ) -> None:
+        self._revoked_before = revoked_before
         self.transaction = transaction
         self.changed = transaction.changed_folders()
         self._keystore = keystore
@@ -415,10 +420,9 @@ class _FilesOfChange:
         entries = self._keystore.ledger_with("what", "revocation").entries
         of_ledger = {int(entry.serial, 16) for entry in entries if entry.what == "revocation"}
         has_list = self._keystore.has(CRL)
-        return (
-            _listed_serials(self._keystore.read(CRL, "revocation list") if has_list else b"")
-            | of_ledger
-        )
+        return _listed_serials(
+            self._keystore.read(CRL, "revocation list") if has_list else b""
+        ) | of_ledger.union(self._revoked_before)
 
     def with_a_newer_list(self) -> set[str] | None:
         """Return the enclaves to evaluate if a newer revocation list is the only change.

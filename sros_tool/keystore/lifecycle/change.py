@@ -527,11 +527,11 @@ class KeystoreChange:
             )
             self.notes.append(Note("service.expires-early", text))
 
-    def finish(self, *, command: str = "") -> None:
+    def finish(self, *, command: str = "", revoked_before: Collection[int] = ()) -> None:
         """Commit the change, unless vendors would refuse enclaves that they accept today.
 
         ``command`` says for error messages why the change needs a revocation list, such as
-        ``revoke``.
+        ``revoke``; ``revoked_before`` are serial numbers that an earlier list revoked already.
 
         Raises:
             KeystoreError: nodes of a vendor would stop working.
@@ -548,6 +548,7 @@ class KeystoreChange:
                 self.moment,
                 keystore=self.keystore,
                 allowed=self._allowed,
+                revoked_before=revoked_before,
                 remedy=lambda: self._another_ca(command) if command else "",
             )
         self.transaction.commit()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import count
@@ -11,7 +12,7 @@ from pathlib import Path
 from shlex import quote
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.errors import KeystoreError, Note, UsageError
+from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.known_keys import revoked_serials
 from sros_tool.keystore.layout import (
@@ -30,7 +31,7 @@ from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import Forgotten
 from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.names import check_enclave_name
-from sros_tool.pki.certificates import issued_by
+from sros_tool.pki.certificates import issued_by, key_digest
 from sros_tool.pki.crl import REASONS, SUPERSEDED
 from sros_tool.validity import iso
 from sros_tool.wording import counted, first_few
@@ -47,6 +48,8 @@ _PRIVATE = "key.pem"
 _SHOWN = 5
 REVOKED_AGAIN = "fleet.revocations-restored"
 """The kind of note of `restored_note`."""
+REPLACED_AFTER_BACKUP = "fleet.replaced-after-backup"
+"""The kind of note on enclaves of which a restored keystore has only revoked certificates."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,12 +143,13 @@ def restore_revocations(
 
     The next list has a higher number than these.  Enclaves that they revoke are moved to
     ``revoked``, as they were before, also if they were renewed since; enclaves of which only an
-    earlier certificate was replaced stay.  Certificates that the ledger lacks are recorded, so that
-    they can be revoked, and are revoked at once if their enclaves were.  The ledger records that
-    the keystore was restored, with a number that it did not give before: the seconds since 1970.
+    earlier certificate was replaced stay.  Their key is revoked, too, unless a certificate that the
+    ledger lacked has the same key.  Certificates that the ledger lacks are recorded, so that they
+    can be revoked, and are revoked at once if their enclaves were.  The ledger records that the
+    keystore was restored, with a number that it did not give before: the seconds since 1970.
 
     Raises:
-        KeystoreError: as `revoke`; or a present certificate was replaced after the backup.
+        KeystoreError: as `revoke`.
     """
     change = KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run)
     with change:
@@ -172,19 +176,13 @@ def restore_revocations(
             for serial, entry in sorted(issued.items())
             if reasons[serial] != SUPERSEDED and has_enclave(root, entry.enclave)
         }
-        replaced = [
-            entry.enclave
-            for serial, entry in issued.items()
-            if reasons[serial] == SUPERSEDED
-            and has_enclave(root, entry.enclave)
-            and f"{change.keystore.certificate_of(entry.enclave).serial_number:x}" == serial
-        ]
-        if replaced:
-            names = " ".join(sorted(replaced))
-            raise KeystoreError(
-                "certificates were revoked because they were replaced after the backup: first give "
-                f"their enclaves new certificates, with `sros renew {quote(str(root))} {names}`"
-            )
+        replaced_keys = _replaced_keys(issued, unknown, reasons)
+        names = {enclave for enclave, _ in replaced_keys}
+        # A restored keystore may have certified them again since.
+        for entry in change.keystore.ledger_file.with_values("enclave", names).entries:
+            is_known = entry.serial in reasons or int(entry.serial or "0", 16) in known
+            if (entry.enclave, entry.key) in replaced_keys and not is_known:
+                reasons[entry.serial], issued[entry.serial] = SUPERSEDED, entry
         _check_names(change, tuple(again))
         revocations = []
         for name, reason in again.items():
@@ -194,7 +192,8 @@ def restore_revocations(
             if serial not in done:
                 # Without the enclave, which may be there with another certificate.
                 entry = Entry(iso(now), "revocation", serial=serial, reason=reason)
-                if (of := issued.get(serial)) and reason != SUPERSEDED:
+                of = issued.get(serial)
+                if of and (reason != SUPERSEDED or (of.enclave, of.key) in replaced_keys):
                     entry = entry._replace(subject=of.subject, key=of.key)
                     if serial in unknown:
                         entry = entry._replace(enclave=of.enclave, not_after=of.not_after)
@@ -215,10 +214,56 @@ def restore_revocations(
         _drop_routers(change, gone)
         change.keep_zenoh({}, gone_enclaves=gone)
         change.record()
-        change.finish(command="revoke")
+        revoked = known | {int(serial, 16) for serial in reasons}
+        change.finish(command="revoke", revoked_before=revoked)
     if unknown:
         change.notes.append(_unknown_note(change, unknown))
-    return change.result(Changed, outcomes=dict.fromkeys(again, "revoked"))
+    replaced = _replaced_enclaves(change, revoked, {key for _, key in replaced_keys}, gone)
+    change.notes += _replaced_notes(root, replaced)
+    outcomes = dict.fromkeys(again, "revoked") | dict.fromkeys(replaced, "replaced")
+    return change.result(Changed, outcomes=outcomes)
+
+
+def _replaced_keys(
+    issued: Mapping[str, Entry], unknown: Mapping[str, Entry], reasons: Mapping[str, str]
+) -> set[tuple[str, str]]:
+    """Return the enclaves and keys of ``issued`` certificates that were replaced with their key.
+
+    ``unknown`` are certificates of after the backup; those without one in ``reasons`` are valid.
+    """
+    kept = {(of.enclave, of.key) for serial, of in unknown.items() if serial not in reasons}
+    replaced = {(of.enclave, of.key) for s, of in issued.items() if reasons[s] == SUPERSEDED}
+    return {of for of in replaced - kept if of[1]}
+
+
+def _replaced_enclaves(
+    change: KeystoreChange, revoked: Container[int], keys: Container[str], gone: Container[str]
+) -> dict[str, bool]:
+    """Map enclaves whose certificates are ``revoked`` to whether their keys are, too."""
+    replaced = {}
+    for name in change.names:
+        with suppress(SrosError):  # of an enclave without a certificate
+            certificate = change.keystore.certificate_of(name)
+            if name not in gone and certificate.serial_number in revoked:
+                key = key_digest(certificate.public_key())  # type: ignore[arg-type]
+                replaced[name] = key in keys or change.known.is_revoked(key)
+    return replaced
+
+
+def _replaced_notes(root: Path, replaced: Mapping[str, bool]) -> Iterator[Note]:
+    """Yield a note on enclaves whose certificates, and perhaps keys, were replaced."""
+    commands = [
+        f"`sros renew {quote(str(root))} {' '.join(map(quote, names))}{options}`"
+        for is_key_revoked, options in ((False, ""), (True, " --new-key --revoke-old"))
+        if (names := [name for name, is_key in replaced.items() if is_key is is_key_revoked])
+    ]
+    if commands:
+        yield Note(
+            REPLACED_AFTER_BACKUP,
+            f"after the backup, the certificates of {first_few(tuple(replaced), _SHOWN)} were "
+            "replaced and revoked, and the keystore has only the revoked ones: give these enclaves "
+            f"new ones with {' and '.join(commands)}.",
+        )
 
 
 def _reasons_of_revoked(change: KeystoreChange, unknown: Mapping[str, Entry]) -> dict[str, str]:
@@ -262,8 +307,8 @@ def restored_note(restored: Changed, lists_from: str) -> Note:
         f"{lists_from} a revocation list that the keystore signed but does not know: the keystore "
         f"was restored from a backup, or is a copy. Everything on the list {again}"
     )
-    if restored.outcomes:
-        text += f", with {first_few(tuple(restored.outcomes), _SHOWN)}"
+    if again_revoked := restored.names("revoked"):
+        text += f", with {first_few(again_revoked, _SHOWN)}"
     return Note(REVOKED_AGAIN, f"{text}.")
 
 
