@@ -96,7 +96,7 @@ from sros_tool.runtime.processes import (
 )
 from sros_tool.runtime.rmw import RMW, chosen_vendor
 from sros_tool.runtime.units import unit_changes, unit_instance, unit_words, write_units
-from sros_tool.runtime.variables import ENCLAVE, KEYSTORE, domain_of
+from sros_tool.runtime.variables import DOMAIN, ENCLAVE, KEYSTORE, STRATEGY, domain_of
 from sros_tool.values import DryRun, FileChange, FileChanges, Words, as_plain, shows
 from sros_tool.wording import counted, enumerated, first_few
 from sros_tool.xml import read_bytes
@@ -187,12 +187,20 @@ class ClosedProcess(NamedTuple):
             return self
         return self._replace(pid=pids[0] if pids else 0)
 
-    @property
-    def open_command(self) -> str:
-        """The shell command that starts the process as it was started."""
+    def open_command(self, domain: int, running: Process | None = None) -> str:
+        """Return the shell command that starts the process open, in its ROS domain.
+
+        That is the command with which it was started, or, if it is known, that of the process that
+        is ``running`` now.
+        """
         if self.container:
             return "docker compose up -d"
-        return f"cd {shlex.quote(self.folder)} && {shlex.join(self.launch or self.command)}"
+        command = running.program[1] if running else self.command
+        if command[-3:] == (ROS_ARGS, "--enclave", self.enclave):  # of `sros run`
+            command = command[:-3]
+        set_domain = ("env", f"{DOMAIN}={domain}") if domain else ()
+        words = (*set_domain, *(self.launch or command))
+        return f"cd {shlex.quote(self.folder)} && {shlex.join(words)}"
 
     def secured_command(self, folder: Path, of_launch: str = "") -> str:
         """Return the shell command that starts the process, its launch or containers with security.
@@ -967,6 +975,13 @@ class OpenRobot:
         kept = [process for process in earlier if process.enclave in present - not_here]
         observed = observed._replace(processes=[*observed.processes, *kept])
         self._write_processes(observed.belonging_elsewhere(not_here))
+        for process in running:
+            own = process.environment.keys() - {*self._shell.environment, *_OF_EVERY_SHELL}
+            if process.pid in {each.pid for each in processes} and own:
+                self._shell.say(
+                    f"{process.label} has variables that this shell does not have, and that its "
+                    f"command below does not set: {first_few(sorted(own), _MOST_NAMES)}"
+                )
         number = counted(len(processes), "process", "processes")
         self._shell.say(f"saw {counted(len(nodes), 'node')} in {number} of this machine")
         if os.path.lexists(self.seen_again):  # of an earlier watch
@@ -1240,6 +1255,14 @@ class OpenRobot:
                 f"otherwise {silent}"
             )
         if observed.elsewhere:
+            here = {process.enclave: process.pid for process in observed.processes}
+            if twice := sorted(here.keys() & {*observed.elsewhere}):
+                yield (
+                    f"nodes of {twice[0]} are in process {here[twice[0]]} and in another one that "
+                    "sros does not see: if another robot is in this ROS domain, switch it off, or "
+                    "give it a domain of its own, remove the rights that it added to "
+                    f"'{self.policy}', and watch again: sros close {folder} --for 1m"
+                )
             named = first_few(observed.elsewhere, _MOST_NAMES)
             options = " ".join(f"--elsewhere {name}" for name in observed.elsewhere)
             yield (
@@ -1342,11 +1365,18 @@ class OpenRobot:
             observed = observed.within(read_policy(self.policy))
         by_hand = [*chain.from_iterable(observed.commands_by_hand(self.folder).values())]
         closed = [process for process in by_hand if process.enclave in secured]
-        for command in dict.fromkeys(process.open_command for process in closed):
+        processes_of = Counter(process.enclave for process in closed)
+        for command in dict.fromkeys(
+            process.open_command(
+                self.domain,
+                secured[process.enclave] if processes_of[process.enclave] == 1 else None,
+            )
+            for process in closed
+        ):
             yield f"restart it open: {command}"
         for process in by_hand:
             if process.enclave not in secured and tuple(process.command) not in are_open:
-                how = f"start it open: {process.open_command}"
+                how = f"start it open: {process.open_command(self.domain)}"
                 self._shell.say(f"{process.enclave} does not run; {how}")
         for name in sorted(secured.keys() - {process.enclave for process in observed.processes}):
             yield f"{name} runs in an enclave, too; restart it open: {_process_text(secured[name])}"
@@ -1422,7 +1452,7 @@ class OpenRobot:
         before = make_observation(node for node in nodes if node.enclaves[0] not in away)
         proof = self._proof_of_processes(len(expected) - len(missing), running)
         state = "not seen" if running.unseen or running.hidden else "not running"
-        for what, names in ((state, missing), ("not on this machine", sorted(not_here))):
+        for what, names in ((state, missing), ("of other machines", sorted(not_here))):
             if names:
                 proof = proof._replace(reason=f"{proof.reason}; {what}: {', '.join(names)}")
         talk = self._proof_of_talk(before, away)
@@ -1464,12 +1494,13 @@ class OpenRobot:
     def _proof_of_requirements(self) -> Iterator[Proof]:
         """Decide the requirements for the enclaves that the processes use.
 
-        With processes on other machines, for the enclaves of the keystore, or of the policy.
+        With processes on other machines, also for the enclaves of the keystore, or of the policy.
         """
         if not self.requirements.exists():
             return
         needed = ("--requirements", str(self.requirements), "--include", "requirement.*")
-        status = self._check(str(self._rights if self._not_here else self.export), *needed)
+        places = [self.export, *[self._rights] * bool(self._not_here)]
+        status = max(self._check(str(place), *needed) for place in places)
         reasons = {0: "all of them", 1: "one is violated", 2: "they could not be decided"}
         holds = {0: True, 1: False}.get(status)
         yield Proof("the requirements hold", holds, f"{reasons[status]}: {self.requirements}")
@@ -1505,15 +1536,27 @@ class OpenRobot:
             options = " ".join(f"--without {name}" for name in may_end)
             reasons.append(f"if it does not always run, add {options}")
         if old:
-            reasons.append(f"earlier files in the processes of {', '.join(old)}; restart them")
+            no_strategy = [
+                name
+                for process, enclave in self._secured(running)
+                if (name := enclave.name) in missing
+                and process.environment.get(STRATEGY) != "Enforce"
+            ]
+            what = f"no {STRATEGY}=Enforce" if no_strategy else "earlier files"
+            reasons.append(f"{what} in the processes of {', '.join(old)}; restart them")
         return "; ".join(reasons)
 
     def _enclaves_with_process(self, running: RunningProcesses) -> set[str]:
-        """Return the enclaves in which a process runs with the current files of the export."""
+        """Return the enclaves in which a process runs with the current files of the export.
+
+        Without the strategy Enforce, a process runs open if its files were not there at its start.
+        """
         return {
             enclave.name
             for process, enclave in self._secured(running)
-            if enclave.is_there and not [*newer_files(process, enclave)]
+            if enclave.is_there
+            and process.environment.get(STRATEGY) == "Enforce"
+            and not [*newer_files(process, enclave)]
         }
 
     def _secured(
@@ -1536,6 +1579,7 @@ class OpenRobot:
         # This shell starts no node.
         here = {**self._shell.environment, **self._variables(_OBSERVER), ENCLAVE: ""}
         near = tuple(filter(self._is_neighbour, running.processes))
+        others = [process for process in running.processes if process not in near]
         running, now = replace(running, processes=near), self._shell.now()
         found = process_findings(here, running, now=now, zone=self._shell.zone)
         findings = [finding for finding in found if finding.severity > NOTE]
@@ -1558,12 +1602,18 @@ class OpenRobot:
             return Proof(_CLAIM, False if wrong else None, f"{first.subject}: {first.text}")
         known_pids = {process.pid for process, _ in self._secured(running)}
         guests = [
-            f"; {process.label} has the files of '{_keystore_of(process.enclave)}'"
+            f"; {process.label} runs in {process.enclave.name} with the files of "
+            f"'{_keystore_of(process.enclave)}'"
             for process in near
             if process.enclave and process.pid not in known_pids and not process.is_daemon
         ]
-        said = f"{counted(number, 'enclave')}, and no open process{''.join(guests)}"
-        return Proof(_CLAIM, True, said)
+        guests += [
+            f"; {process.label} runs open in domain {process.domain}"
+            for process in others
+            if process.enclave is None and not process.is_daemon
+        ]
+        said = f"{counted(number, 'enclave')}, and no open process in domain {self.domain}"
+        return Proof(_CLAIM, True, f"{said}{''.join(guests)}")
 
     def _proof_of_talk(self, before: Observation, missing: Sequence[str]) -> Proof:
         """Compare what an observer in an enclave sees now with what was seen before.
@@ -1670,6 +1720,8 @@ def _keystore_of(enclave: ProcessEnclave) -> str:
 
 
 _CLAIM = "every process was started in its enclave"
+_OF_EVERY_SHELL = ("_", "SHLVL", "PWD", "OLDPWD", "COLUMNS", "LINES")
+"""Variables that differ between shells, and that no program is meant to read."""
 _TALK = "everything that talked still talks"
 _SILENCE = "an open listener finds nothing"
 

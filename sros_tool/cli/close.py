@@ -310,14 +310,14 @@ def _state(closed: Closing, *, apply: bool) -> str:
         for name in closed.left
     }
     but = ", ".join(f"{name} ({word})" for name, word in words.items())
-    return f"the robot runs closed{', except for ' if but else ''}{but}"
+    return f"the processes run in their enclaves{', except for ' if but else ''}{but}"
 
 
 def _until(closed: Closing) -> str:
     """Return until when the files of closed processes are valid."""
     if not (closed.secured and closed.valid_until):
         return ""
-    return f", its files are valid until {iso(closed.valid_until)}"
+    return f"; the files are valid until {iso(closed.valid_until)}"
 
 
 def _started_together(processes: Sequence[ClosedProcess]) -> str:

@@ -324,14 +324,15 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     closed = robot.close("--apply")
     assert robot.restarts == ["daemon-reload", "restart listener.service talker.service"]
     assert closed.out.splitlines()[-5:] == [
-        "yes: every process was started in its enclave: 2 enclaves, and no open process",
+        "yes: every process was started in its enclave: 2 enclaves, and no open process in "
+        "domain 0",
         "yes: the files have no error: sros check finds none: robot/export",
         "yes: the requirements hold: all of them: robot/requirements.toml",
         "yes: everything that talked still talks: 2 nodes with 36 endpoints as before",
         "yes: an open listener finds nothing: the observer that saw 2 nodes before sees none",
     ]
     assert "; next: bring robot/keystore to another machine: it has the CA keys\n" in closed.err
-    assert "the robot is closed, its files are valid until 20" in closed.err
+    assert "the robot is closed; the files are valid until 20" in closed.err
     robot.close("--apply")
     assert len(robot.restarts) == 2  # they run in their enclaves already
     (robot.folder / "robot/keystore").rename(robot.folder / "home")
@@ -376,7 +377,10 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     robot.by_hand = {"/talker"}
     ended = robot.close()
     assert "/talker: process 4711: closed\n" in ended.out
-    assert "the robot runs closed, except for /listener (open), its files are valid" in ended.err
+    assert (
+        "the processes run in their enclaves, except for /listener (open); the files are valid"
+        in ended.err
+    )
     assert "; next: stop them, start them by the first commands in robot/start/c" in ended.err
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert re.search(r"\A# Stop .*\n\n# /listener\n.*\n\n# These .*\n\n# /talker\n", commands)
@@ -386,7 +390,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     ended = robot.close()
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert "\nros2 launch --secured " in commands
-    assert "except for /listener (not running), its files" in ended.err
+    assert "except for /listener (not running); the files" in ended.err
     assert "; next: start them by the first commands in robot/start/commands.txt" in ended.err
     assert ended.err.endswith("--proof; what does not always run: --without /listener\n")
     robot.absent = set()
@@ -396,7 +400,8 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     ended = robot.close()
     assert "  /talker: started by another command than observed: closed\n" in ended.out
     assert re.fullmatch(
-        "the robot runs closed, its files are valid until 20.*Z; next: sros close robot --proof",
+        "the processes run in their enclaves; the files are valid until 20.*Z; "
+        "next: sros close robot --proof",
         ended.err.splitlines()[-1],
     )
     robot.named = False
@@ -467,7 +472,7 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     assert "  /late: new, start it with: sros run " in ended.out
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert commands.startswith("# /late is new: COMMAND is what starts it\nsros run ")
-    assert "closed, except for /late (not running), its files" in ended.err
+    assert "enclaves, except for /late (not running); the files" in ended.err
     export = robot.folder / "robot/export"
     environment = secured_environment(export, "/late", 0)
     late = robot.with_its_files(replace(late, environment=environment))
@@ -476,9 +481,9 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert "/opt/late" not in commands, "another user cannot propose what is run"
     robot.more = (replace(late, started=datetime.now(UTC) - timedelta(days=1)),)
-    assert "closed, except for /late (with earlier files), its files" in robot.close().err
+    assert "enclaves, except for /late (with earlier files); the files" in robot.close().err
     robot.more = (replace(late, started=datetime.now(UTC) + timedelta(days=1)),)
-    assert "the robot runs closed, its files are valid until" in robot.close().err
+    assert "the processes run in their enclaves; the files are valid until" in robot.close().err
     watching = robot.close("--for", "1s", status=2).err
     assert "the robot runs closed: process 4711 (run), process 4712 (run), process 7" in watching
     commands = (robot.folder / "robot/start/commands.txt").read_text()
@@ -506,11 +511,12 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     assert robot.close("--apply", *without[1:]).err.endswith("it has the CA keys\n")
     ended = robot.close(*without)
     assert (
-        "yes: every process was started in its enclave: 1 enclave, and no open process; "
+        "yes: every process was started in its enclave: 1 enclave, and no open process in "
+        "domain 0; "
         "not running: /listener\n"
     ) in ended.out
     assert "talks: 1 node with 18 endpoints as before, without /listener\n" in ended.out
-    assert "the robot is closed, without a process of /listener, its files are" in ended.err
+    assert "the robot is closed, without a process of /listener; the files are" in ended.err
     robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
     assert "; not seen: /listener\n" in robot.close(*without, "--partial").out
     robot.unseen = ()
@@ -1013,7 +1019,8 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     assert not (robot.folder / left).exists() and "/listener: process" not in ended.out
     robot.by_hand = {"/talker"}
     ended = robot.close("--proof")
-    assert "1 enclave, and no open process; not on this machine: /listener\n" in ended.out
+    said = "1 enclave, and no open process in domain 0; of other machines: /listener\n"
+    assert said in ended.out
     assert "differs from the signed permissions" not in ended.err
     assert "talks: 2 nodes with 36 endpoints as before\n" in ended.out
     robot.remaining = (TALKER,)
