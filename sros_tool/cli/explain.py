@@ -1052,7 +1052,8 @@ def _show_log(
         echo(
             f"none of {counted(lines, 'line')} {nothing}: {_text_without_findings(text)}"
             if lines
-            else "the log is empty",
+            else "the log is empty: it says nothing about its node. `sros check runtime` on that "
+            "machine says how its processes run",
             err=True,
         )
         if _ZENOH_TESTS in text:
