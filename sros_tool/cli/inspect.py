@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from datetime import datetime
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -100,7 +101,7 @@ def inspect(
       ...
       $ sros inspect keystore --history --policy robot.xml
       2026-11-20T05:59:44Z  permissions  current     /talker  until 2027-05-20...
-      permissions of 1 enclave were signed from 'robot.xml', as it is now
+      permissions of 1 enclave were signed from 'robot.xml', as it is now; ...
     """
     from sros_tool.errors import DocumentError, UsageError
     from sros_tool.keystore.describe import describe, problems_of
@@ -179,7 +180,12 @@ def _show_history(root: Path, policy: Path | None, as_json: bool) -> int:
             echo(f"LEDGER DAMAGED  {gap}")
         if policy:
             number = counted(len({item.entry.enclave for item in found.entries}), "enclave")
-            echo(f"permissions of {number} were signed from '{policy}', as it is now", err=True)
+            echo(
+                f"permissions of {number} were signed from '{policy}', as it is now; others can "
+                f"have the same rights from an earlier version: `sros diff_policy "
+                f"{quote(str(policy))} {quote(str(root))}` compares the rights",
+                err=True,
+            )
     nothing = policy is not None and not found.entries
     return 1 if found.unexplained or found.gaps or nothing else 0
 

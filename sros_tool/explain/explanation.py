@@ -187,8 +187,9 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
     keystore = Path(root) if root and Path(root).is_dir() else None
     if keystore and not is_original_keystore(keystore):
         if "`" not in text or fault is Fault.GOVERNANCE_DOMAIN:
-            text = text.replace("update_keystore {root}", "update_keystore KEYSTORE")
-            return _filled_remedy(text, root, enclave, file)
+            here, and_then, there = text.partition(" To add a domain")
+            there = _filled_remedy(there, "KEYSTORE", enclave, file)
+            return f"{_filled_remedy(here, root, enclave, file)}{and_then}{there}"
         if fault:
             return _filled_remedy(fault.remedy_in_export(file), "KEYSTORE", enclave, file)
         return remedy_in_original_keystore(_filled_remedy(text, "KEYSTORE", enclave, file))

@@ -116,7 +116,9 @@ def test_the_history_names_what_was_signed_from_a_policy(keystore: Path, tmp_pat
     found = sros(*listed).ok()
     words = [line.split() for line in found.out.splitlines()]
     assert [(line[1], line[3]) for line in words] == [("permissions", "/a"), ("permissions", "/b")]
-    assert found.err == f"permissions of 2 enclaves were signed from '{policy}', as it is now\n"
+    assert found.err.startswith(
+        f"permissions of 2 enclaves were signed from '{policy}', as it is now;"
+    )
     assert len(json.loads(sros(*listed, "--json").out)["entries"]) == 2
     policy.write_text(f"{policy.read_text()}<!-- changed -->")
     assert (sros(*listed).status, sros(*listed).out) == (1, "")
