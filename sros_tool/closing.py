@@ -1722,7 +1722,7 @@ def _keystore_of(enclave: ProcessEnclave) -> str:
 _CLAIM = "every process was started in its enclave"
 _OF_EVERY_SHELL = ("_", "SHLVL", "PWD", "OLDPWD", "COLUMNS", "LINES")
 """Variables that differ between shells, and that no program is meant to read."""
-_TALK = "everything that talked still talks"
+_TALK = "everything that talked can still talk"
 _SILENCE = "an open listener finds nothing"
 
 

@@ -106,7 +106,7 @@ def close(
 
     Nothing is closed before --apply, which restarts the processes that are systemd units, and
     shows the commands for all others. --proof checks that every process was started in its enclave,
-    that the files of the enclaves have no error, that everything that talked still talks, and that
+    that the files of the enclaves have no error, that everything that talked can still talk, and that
     an open listener finds nothing; --apply does it too, if nothing is left to do by hand. --undo
     goes back.
 

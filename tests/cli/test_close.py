@@ -295,7 +295,7 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     assert (
         "no: every process was started in its enclave: process 4712 (run): in domain 0" in ended.out
     )
-    assert "yes: everything that talked still talks: 1 node with 18 endpoints" in ended.out
+    assert "yes: everything that talked can still talk: 1 node with 18 endpoints" in ended.out
 
 
 def refuse_undo_of_others(robot: Robot) -> None:
@@ -328,7 +328,7 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
         "domain 0",
         "yes: the files have no error: sros check finds none: robot/export",
         "yes: the requirements hold: all of them: robot/requirements.toml",
-        "yes: everything that talked still talks: 2 nodes with 36 endpoints as before",
+        "yes: everything that talked can still talk: 2 nodes with 36 endpoints as before",
         "yes: an open listener finds nothing: the observer that saw 2 nodes before sees none",
     ]
     assert "; next: bring robot/keystore to another machine: it has the CA keys\n" in closed.err
@@ -336,7 +336,7 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     robot.close("--apply")
     assert len(robot.restarts) == 2  # they run in their enclaves already
     (robot.folder / "robot/keystore").rename(robot.folder / "home")
-    assert "yes: everything that talked still talks: 2 nodes" in robot.close("--proof").out
+    assert "yes: everything that talked can still talk: 2 nodes" in robot.close("--proof").out
     assert "A new keystore would have other CAs." in robot.close("--apply", status=2).err
     (robot.folder / "home").rename(robot.folder / "robot/keystore")
     refuse_undo_of_others(robot)
@@ -547,12 +547,12 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
     robot.outdated = set()
     robot.remaining = (TALKER,)
     assert (
-        "no: everything that talked still talks: gone: /listener "
+        "no: everything that talked can still talk: gone: /listener "
         in robot.close("--proof", status=1).out
     )
     robot.remaining = (TALKER, LISTENER, ros_node("guest", "05"))
     assert (
-        "no: everything that talked still talks: denied: /guest "
+        "no: everything that talked can still talk: denied: /guest "
         in robot.close("--proof", status=1).out
     )
     robot.remaining = (TALKER, LISTENER)
@@ -578,7 +578,9 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
     needed.write_text(kept)
     robot.remaining = ()
     ended = robot.close("--proof", "--partial", status=1)
-    assert "not asked: everything that talked still talks: there is nothing to audit" in ended.out
+    assert (
+        "not asked: everything that talked can still talk: there is nothing to audit" in ended.out
+    )
     assert "not asked: an open listener finds nothing: nor does the observer in its" in ended.out
     assert "accept with --partial" not in ended.err
     robot.remaining = (TALKER, LISTENER)
@@ -687,12 +689,14 @@ def test_a_renamed_node_is_accepted_and_a_new_one_is_named(robot: Robot) -> None
         ("/", "/", "ghost_node", of, ["publish rt/rosout"]),
     )
     said = robot.close("--apply").out
-    assert "yes: everything that talked still talks: 2 nodes with 36 endpoints as before" in said
+    assert "yes: everything that talked can still talk: 2 nodes with 36 endpoints as before" in said
     assert "not compared, as the policy has no profile for them any more: /rear_camera\n" in said
     assert "; new, without a profile: /ghost_node in /listener; not" in said
     robot.remaining = (TALKER, LISTENER)
     said = robot.close("--proof", status=1).out
-    assert "no: everything that talked still talks: not seen: /stern_camera (if it is gone" in said
+    assert (
+        "no: everything that talked can still talk: not seen: /stern_camera (if it is gone" in said
+    )
 
 
 def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None:
@@ -761,7 +765,7 @@ def test_a_program_that_starts_its_nodes_has_one_enclave(
     assert "talks: 2 nodes with 36 endpoints as before\n" in robot.close("--proof").out
     robot.remaining = (LISTENER,)
     said = robot.close("--proof", status=1).out
-    assert "no: everything that talked still talks: gone: /talker publish r" in said
+    assert "no: everything that talked can still talk: gone: /talker publish r" in said
 
 
 def test_a_program_that_gives_its_processes_their_enclaves(
