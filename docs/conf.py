@@ -54,7 +54,7 @@ def _keep_options_whole(
 ) -> None:
     """Mark the options in commands, within which a browser would break the line."""
     context["body"] = re.sub(
-        r"<pre>.*?</pre>",
+        r"<pre>.*?</pre>|<code .*?</code>",
         lambda pre: re.sub(
             r"(?<=[\s>])--?[a-z][\w-]*", r'<span class="option">\g<0></span>', pre[0]
         ),

@@ -319,7 +319,7 @@ class _Draft:
         """Return the only node, apart from onlookers, with a right to these names, or ""."""
         looking = {tie.node for tie in bundle.ties if self._is_onlooker(tie)}
         drawn = {tie.node for tie in bundle.ties if not self._is_onlooker(tie)}
-        if not all(map(is_plain, bundle.ties)) or bundle.protection.open_text:
+        if not all(map(is_plain, bundle.ties)) or bundle.protection.open_text(bundle.kind):
             return ""
         nodes = {node for name in bundle.names for node in self._everybody[bundle.kind, name]}
         nodes -= looking - drawn
@@ -515,8 +515,8 @@ def names_card(card: str, bundle: Bundle, column: int, more: tuple[str, ...] = (
     titles, notes = _names_title(bundle)
     lines = tuple(line for title in titles for line in wrapped_name(title, _NAMES_LETTERS))
     notes += more
-    if bundle.protection.open_text:
-        notes += (bundle.protection.open_text,)
+    if is_open := bundle.protection.open_text(bundle.kind):
+        notes += (is_open,)
     if bundle.lacks:
         notes += (lack_text(bundle.kind, bundle.lacks),)
     return Card(

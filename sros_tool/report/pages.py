@@ -163,7 +163,7 @@ def _bundle_json(bundle: Bundle) -> dict[str, Any]:
         "kind": bundle.kind,
         "names": bundle.names,
         "asks": bundle.asks,
-        "open": bundle.protection.open_text,
+        "open": bundle.protection.open_text(bundle.kind),
         "everybody": bundle.protection.everybody,
         "lacks": lack_text(bundle.kind, bundle.lacks) if bundle.lacks else "",
         "protection": as_plain(bundle.protection),

@@ -79,10 +79,10 @@ class Protection:
             else "everybody with an identity"
         )
 
-    @property
-    def open_text(self) -> str:
-        """What permissions do not control: "everybody may send and receive" and such, or ""."""
-        sides = ["send"] * (not self.write_control) + ["receive"] * (not self.read_control)
+    def open_text(self, kind: str) -> str:
+        """Return what permissions do not control, such as "everybody may publish", or ""."""
+        sends, receives = _VERBS[kind]
+        sides = [sends] * (not self.write_control) + [receives] * (not self.read_control)
         even = ", even without an identity" if self.strangers else ""
         return f"everybody may {' and '.join(sides)}{even}" if sides else ""
 
@@ -169,7 +169,7 @@ class Name:
     """
 
 
-_LACKING = {
+_VERBS = {
     "topics": ("publish", "subscribe"),
     "dds": ("publish", "subscribe"),
     "services": ("call", "serve"),
@@ -179,7 +179,7 @@ _LACKING = {
 
 def lack_text(kind: str, lacks: Lack) -> str:
     """Return what no enclave may do with a name, such as ``nobody may publish``."""
-    sends, receives = _LACKING[kind]
+    sends, receives = _VERBS[kind]
     return f"nobody may {sends if lacks is Lack.SENDER else receives}"
 
 

@@ -371,6 +371,10 @@ def test_everything_can_be_done_with_the_keyboard(browser: Browser, robot_page: 
         page.keyboard.press("/")
         page.keyboard.type("teleop")
         page.keyboard.press("ArrowDown")
+        page.keyboard.press("Escape")
+        assert page.evaluate("document.activeElement.id") == "search"
+        page.keyboard.type(" ")
+        page.keyboard.press("ArrowDown")
         page.keyboard.press("Enter")
         assert page.evaluate("document.activeElement.textContent") == "/mobile_robot/teleop"
         page.keyboard.press("Escape")
@@ -618,8 +622,8 @@ def test_a_phone_shows_first_who_may_drive_and_what_everybody_may_do(
             *("/scan", "/mobile_robot/lidar", "everybody", "with", "an", "identity"),
         ]
         page.click("#names .link-button >> nth=0")
-        assert "everybody may send" in details(page)
-        assert "everybody may send" in " ".join(texts(page, "#map .card.names"))
+        assert "everybody may publish" in details(page)
+        assert "everybody may publish" in " ".join(texts(page, "#map .card.names"))
 
 
 def test_it_prints_every_part(browser: Browser, robot_page: Path) -> None:
