@@ -64,7 +64,7 @@ function showMap() {
   byId("summary").textContent = scene.cards.length ? summary : "Nothing fits.";
   byId("back").hidden = !(state.flow || filtering());
   byId("hops").hidden = !state.flow;
-  if (state.flow) byId("hops-number").textContent = Math.min(state.flow.hops, scene.most);
+  if (state.flow) byId("hops-number").textContent = counted(Math.min(state.flow.hops, scene.most), "hop");
   zoom(0);
   light();
   showFocus();
