@@ -106,9 +106,9 @@ def close(
 
     Nothing is closed before --apply, which restarts the processes that are systemd units, and
     shows the commands for all others. --proof checks that every process was started in its enclave,
-    that the files of the enclaves have no error, that everything that talked can still talk, and that
-    an open listener finds nothing; --apply does it too, if nothing is left to do by hand. --undo
-    goes back.
+    that the files of the enclaves have no error, that everything that talked can still talk, and
+    that an open listener finds nothing; --apply does it too, if nothing is left to do by hand.
+    --undo goes back.
 
     Example:
       $ sros close robot --for 5m

@@ -762,7 +762,7 @@ def test_a_program_that_starts_its_nodes_has_one_enclave(
     robot.by_hand, in_one = {"/listener"}, lambda *nodes: [("/listener", *of[1:]) for of in nodes]
     robot.absent = {"/talker"}
     monkeypatch.setattr("tests.cli.test_close.secured", in_one)
-    assert "talks: 2 nodes with 36 endpoints as before\n" in robot.close("--proof").out
+    assert "talk: 2 nodes with 36 endpoints as before\n" in robot.close("--proof").out
     robot.remaining = (LISTENER,)
     said = robot.close("--proof", status=1).out
     assert "no: everything that talked can still talk: gone: /talker publish r" in said
@@ -1026,7 +1026,7 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     said = "1 enclave, and no open process in domain 0; of other machines: /listener\n"
     assert said in ended.out
     assert "differs from the signed permissions" not in ended.err
-    assert "talks: 2 nodes with 36 endpoints as before\n" in ended.out
+    assert "talk: 2 nodes with 36 endpoints as before\n" in ended.out
     robot.remaining = (TALKER,)
     said = robot.close("--proof", status=1).out
     assert "gone: /listener" in said and "; if they may be away, add --without /listener\n" in said
