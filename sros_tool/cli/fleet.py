@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
@@ -182,6 +183,7 @@ def _confirm(arguments: tuple[str, ...], robot: str, dry_run: bool, as_json: boo
         keep_confirmation,
         locked_confirmations,
         receive,
+        refuse_older,
     )
     from sros_tool.keystore.fleet import recorded_fleet
     from sros_tool.keystore.layout import confirmation_file
@@ -194,8 +196,9 @@ def _confirm(arguments: tuple[str, ...], robot: str, dry_run: bool, as_json: boo
     received = receive(data, robot, what, now=now())
     path = confirmation_file(robot)
     changes = file_change(root / path, existed=(root / path).exists())
-    if not dry_run:
-        with locked_confirmations(root):
+    with nullcontext() if dry_run else locked_confirmations(root):
+        refuse_older(root, received)
+        if not dry_run:
             keep_confirmation(root, received)
     confirmation = received.confirmation
     enclaves = confirmation.enclaves()
@@ -700,6 +703,7 @@ def _lines(
 
 def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     """Yield sentences about the fleet as a whole."""
+    from sros_tool.keystore.fleet import FLEET_REMEDY
     from sros_tool.validity import elapsed
 
     status = compared_fleet.status
@@ -709,6 +713,9 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     root_end = publication.root_expires if publication else None
     publish += " --root-key FILE" if root_end and root_end <= compared_fleet.at else ""
     restored = f"`{publish} --restored`; docs/howto/keystore_is_lost.md says what else"
+    if status.edited:
+        remedy = FLEET_REMEDY.replace("KEYSTORE", quote(str(status.keystore)))
+        yield f"these are perhaps not all robots: the fleet file {status.edited}. {remedy}"
     if status.clock:
         yield f"{status.clock}: how old the confirmations are is not known. Set the clock"
     if status.older:

@@ -442,6 +442,25 @@ def receive(data: bytes, robot: str, label: str, *, now: datetime) -> Received:
     return Received(confirmation, now.replace(microsecond=0))
 
 
+def refuse_older(root: Path, received: Received) -> None:
+    """Raise `DocumentError` if a report was made before the last confirmation of its robot.
+
+    If the last confirmation came before its own time, the clock of the robot was ahead then.
+    """
+    before = None
+    with suppress(DocumentError):  # a damaged file
+        before = last_confirmation(root, received.confirmation.robot)
+    if before and received.confirmation.time < min(before.confirmation.time, before.time):
+        robot, time = received.confirmation.robot, iso(received.confirmation.time)
+        raise DocumentError(
+            f"the report of {robot}, made at {time}, is older than its last confirmation, made at "
+            f"{iso(before.confirmation.time)}",
+            "It does not show what the robot has now.",
+            f"Make it again: `sros fleet report FOLDER --robot {robot}`. If the clock of the robot "
+            "is behind, set it first.",
+        )
+
+
 @contextmanager
 def locked_confirmations(root: Path) -> Iterator[None]:
     """Lock the confirmations of a keystore: nobody else keeps one until the body ends.

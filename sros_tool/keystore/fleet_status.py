@@ -46,7 +46,7 @@ from sros_tool.keystore.confirmation import (
     refusals,
 )
 from sros_tool.keystore.delivery.published import read_published
-from sros_tool.keystore.fleet import enclaves_of_robot, recorded_fleet
+from sros_tool.keystore.fleet import edited_fleet, enclaves_of_robot, recorded_fleet
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL,
@@ -384,8 +384,8 @@ class PublishedMetadata:
 
 @shows(
     *("keystore", "complete", "stage", "counts", "unassigned", "overdue", "older", "clock"),
-    *("publication", "robots"),
-    null_if_empty=("older", "clock"),
+    *("edited", "publication", "robots"),
+    null_if_empty=("older", "clock", "edited"),
 )
 @dataclass(frozen=True, slots=True)
 class FleetStatus:
@@ -409,6 +409,9 @@ class FleetStatus:
     clock: str = ""
     """How far the clock of this machine is behind the last entry of the ledger, or behind the last
     confirmation, as a clause: ages and expiry are then not known. Null if it is not behind."""
+    edited: str = ""
+    """How the keystore's fleet file differs from the file that sros wrote, as a clause: the robots
+    are then perhaps not all. Null if it does not differ."""
     publication: PublishedMetadata | None = None
     """What robots fetch; null if nothing was published for a robot."""
     is_any_revoked: bool = False
@@ -454,14 +457,15 @@ class FleetStatus:
     @property
     def complete(self) -> bool:
         """Whether every robot that has enclaves confirmed the current files in time, says that no
-        restart is due and that its agent has no problem, and robots still accept what was
-        published; if not, the exit status is 1. Robots of which all enclaves were revoked do not
-        count.
+        restart is due and that its agent has no problem, robots still accept what was published,
+        and nothing else casts doubt on it; if not, the exit status is 1. Robots of which all
+        enclaves were revoked do not count.
         """
         if (
             self.overdue
             or self.older
             or self.clock
+            or self.edited
             or (self.publication and not self.publication.accepted)
         ):
             return False
@@ -522,6 +526,7 @@ def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
         statuses,
         unassigned,
         older=older,
+        edited=edited_fleet(keystore, keystore.ledger_with("what", "fleet")),
         publication=known.publication,
         is_any_revoked=known.is_any_revoked(),
         groups=fleet.groups,
@@ -783,8 +788,22 @@ class _Known:
                 self._revoked_serials.add(entry.serial)
                 if entry.enclave and entry.reason != SUPERSEDED:
                     self._revoked.add(entry.enclave)
+        self._add_listed()
         robots = {robot.robot.name for robot in compared_robots}
         self._unrecorded = unrecorded_enclaves(fleet, self._revoked, robots)
+
+    def _add_listed(self) -> None:
+        """Add what only a revocation list revokes, such as a list that was copied from a robot."""
+        listed = {
+            f"{entry.serial:x}": entry.reason
+            for crl in self._keystore.revocation_lists
+            for entry in crl.revoked
+            if f"{entry.serial:x}" not in self._revoked_serials
+        }
+        self._revoked_serials.update(listed)
+        for entry in self._keystore.ledger_file.with_values("serial", listed).entries:
+            if entry.what == "certificate" and listed.get(entry.serial, SUPERSEDED) != SUPERSEDED:
+                self._revoked.add(entry.enclave)
 
     def is_later(self, robot: str, release: int) -> bool:
         """Return whether no release with so high a number was ever published for a robot."""

@@ -15,7 +15,7 @@ from functools import cached_property
 from cryptography import x509
 
 from sros_tool.errors import KeystoreError, Note, PkiError, SrosError
-from sros_tool.keystore.delivery.published import later_revoked_serials
+from sros_tool.keystore.delivery.published import later_revoked_serials, may_have_later_releases
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     KEY_FILE,
@@ -113,9 +113,11 @@ class KnownKeys:
         return serials | {entry.serial for entry in lists if entry.reason != SUPERSEDED}
 
     @cached_property
-    def _revoked_later(self) -> frozenset[int]:
-        """The serial numbers that only lists in the publishing folder have, as after a restore."""
-        return later_revoked_serials(self._keystore) - revoked_serials(self._keystore)
+    def _unrecorded(self) -> frozenset[int]:
+        """The serial numbers that only lists have, as after a restore: copied, or published."""
+        recorded = {int(entry.serial, 16) for entry in self._revocations}
+        listed = {entry.serial for crl in self._keystore.revocation_lists for entry in crl.revoked}
+        return (later_revoked_serials(self._keystore) | listed) - recorded
 
     def revoked_before(self, names: Collection[str]) -> set[str]:
         """Return those of ``names`` whose last certificate was revoked, and not superseded.
@@ -196,12 +198,14 @@ class KnownKeys:
             raise KeystoreError(
                 f"the key of {holder} was revoked", f"It is the key of {revoked}.", remedy
             )
-        if certificate and certificate.serial_number in self._revoked_later:
+        if certificate and certificate.serial_number in self._unrecorded:
+            if may_have_later_releases(self._keystore):
+                remedy = "First publish with --restored, which takes this list over."
             raise KeystoreError(
                 f"the certificate of {holder} was revoked after the backup that the keystore was "
                 "restored from",
-                "A revocation list in the folder of `sros fleet publish` names it.",
-                "First publish with --restored, which takes this list over.",
+                "A revocation list names it, and the ledger does not.",
+                remedy,
             )
 
     def refuse_shared_key(self, key: PublicKey, name: str, remedy: str) -> None:

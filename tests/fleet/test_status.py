@@ -102,7 +102,7 @@ class Field:
             or (each["state"], each["enclaves"]) == ("revoked", 0)
             for each in found["robots"]
         )
-        assert found["complete"] == (all(good) and not found["older"])
+        assert found["complete"] == (all(good) and not (found["older"] or found["edited"]))
         assert ended.status == (0 if found["complete"] and not found["outdated_dds"] else 1)
         found["robots"] = {each["robot"]: each for each in found["robots"]}
         return found
@@ -455,9 +455,49 @@ def test_messages_that_were_held_back_are_as_old_as_they_say(field: Field) -> No
     found = field.status()
     assert (found["overdue"], found["robots"]["r1"]["state"]) == (["r1"], "offline")
     field.run("fleet", "status", "ks", "--max-age", "7d")
+    (field.root / "confirmed/r2.json").unlink()
     field.confirm("r2", time=iso(now - 25 * hours))
     field.send("r1", time=now + 25 * hours)
     assert field.states() == dict.fromkeys(ROBOTS, "current")
+
+
+def test_a_report_does_not_replace_a_later_confirmation(field: Field) -> None:
+    earlier = field.folder / "earlier.json"
+    earlier.write_text(field.run("fleet", "report", "r1", "--robot", "r1").out)
+    said, hour = json.loads(earlier.read_text()), timedelta(hours=1)
+    before = {"time": iso(parse_iso(said["time"]) - hour)}
+    earlier.write_text(json.dumps(said | before))
+    refused = field.run("fleet", "confirm", "ks", "earlier.json", "--robot", "r1", status=2).err
+    assert "is older than its last confirmation" in refused
+    # The clock of the robot was ahead when it confirmed last.
+    field.confirm("r2", time=iso(parse_iso(said["time"]) + 9 * hour))
+    field.confirm("r2")
+
+
+def test_a_fleet_file_that_was_edited_is_not_believed(field: Field) -> None:
+    path = field.root / "fleet.toml"
+    path.write_text(path.read_text().replace("[robots.r3]", "").replace("r3 = {}", ""))
+    found = field.status()
+    assert len(found["robots"]) == 2 and "is not the file that sros wrote" in found["edited"]
+    told = field.run("fleet", "status", "ks", status=1).out
+    assert "2 robots: 2 current\nthese are perhaps not all robots: the fleet file is not" in told
+
+
+def test_a_revoked_robot_of_which_only_a_copied_list_knows(field: Field) -> None:
+    """A list that was taken from a robot, as after a backup was restored."""
+    backup, crl = copy_of(field.root, field.folder / "backup"), "public/identity_ca.crl.pem"
+    field.run("revoke", "ks", "--robot", "r3")
+    field.run("renew", "ks", "/r2/base", "--new-key", "--revoke-old")
+    copy_of(field.root, field.folder / "later")
+    shutil.rmtree(field.root)
+    backup.rename(field.root)
+    shutil.copy(field.folder / "later" / crl, field.root / crl)
+    assert "/r2/base --new-key`" in field.run("renew", "ks", "/r2/base", status=2).err
+    field.run("revoke", "ks", "--robot", "r3")
+    robot = field.status()["robots"]["r3"]
+    assert (robot["state"], robot["revoked"]) == ("revoked", ["/r3/base"])
+    entries = (field.root / "ledger.jsonl").read_text().splitlines()
+    assert sum('"revocation"' in entry for entry in entries) == 1, "without /r2/base"
 
 
 def test_a_rotation_waits_for_robots_that_are_offline(field: Field) -> None:
@@ -601,6 +641,7 @@ def test_a_clock_that_is_wrong(field: Field, hours: int, text: str) -> None:
     assert field.confirm("r1", time=iso(moment + timedelta(seconds=20))).err == ""
     # A second may pass between the report and its receipt.
     wrong = moment + timedelta(hours=hours, seconds=30 if hours > 0 else 0)
+    (field.root / "confirmed/r1.json").unlink()
     assert text in field.confirm("r1", time=iso(wrong)).err
     found = field.status()["robots"]["r1"]
     assert found["state"] == "current"

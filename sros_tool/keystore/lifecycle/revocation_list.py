@@ -283,6 +283,9 @@ class RevocationListSigner:
                 not.
         """
         listed = {entry.serial for entry in self.present.revoked} if self.present else set()
+        # Not those that only the list has: somebody may have copied it from a robot.
+        ledger = self._keystore.ledger_with("what", "revocation").entries
+        recorded = {int(e.serial, 16) for e in ledger if e.what == "revocation"}
         revocations = []
         moment = iso(self._now)
         present = last
@@ -290,8 +293,8 @@ class RevocationListSigner:
             present = {name: entry for name, entry in last.items() if entry.not_after >= moment}
         for name, valid in self._still_valid(last, present, listed).items():
             for serial, entry in valid.items():
-                if serial not in listed:
-                    listed.add(serial)
+                if serial not in recorded:
+                    recorded.add(serial)
                     key = "" if keep and entry.key == keep[name] else entry.key
                     revocations.append(
                         Entry(

@@ -112,7 +112,8 @@ def check_lists(before: Files, after: Files, spare: str) -> list[str]:
                 f" number {present.number}; the keystore has {number}. Revoked enclaves would be"
                 " trusted again. The keystore may come from a backup: copy crl.pem of"
                 f" {name} on this robot to public/identity_ca.crl.pem there, run `sros revoke` for"
-                " each enclave that `sros crl` then shows, and deliver again. If the older list is"
+                " each enclave that `sros crl` then shows (`sros renew --new-key --revoke-old` if"
+                " it shows superseded), and deliver again. If the older list is"
                 " right, set allow_older_lists (sros_allow_older_lists)."
             )
         lost = present.serials - new.serials
