@@ -515,7 +515,7 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
         "domain 0; "
         "not running: /listener\n"
     ) in ended.out
-    assert "talks: 1 node with 18 endpoints as before, without /listener\n" in ended.out
+    assert "talk: 1 node with 18 endpoints as before, without /listener\n" in ended.out
     assert "the robot is closed, without a process of /listener; the files are" in ended.err
     robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
     assert "; not seen: /listener\n" in robot.close(*without, "--partial").out
@@ -1031,7 +1031,7 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     said = robot.close("--proof", status=1).out
     assert "gone: /listener" in said and "; if they may be away, add --without /listener\n" in said
     ended = robot.close("--proof", "--without", "/listener")
-    assert "talks: 1 node with 18 endpoints as before, without /listener\n" in ended.out
+    assert "talk: 1 node with 18 endpoints as before, without /listener\n" in ended.out
     sros("create_enclave", "robot/keystore", "/operator/look", cwd=robot.folder).ok()
     robot.close("--elsewhere", "/operator/look")
     assert list_enclaves(robot.folder / "robot/export") == ("/sros_observer", "/talker")
