@@ -24,7 +24,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 
 from sros_tool.agent.connection import REFUSALS, GuardedConnection, ended_tls
 from sros_tool.agent.fetch import ClientCertificate, FetchError, FetchProblem, fetch_release
-from sros_tool.agent.install import Installation, install_release, newest_list, release_time
+from sros_tool.agent.install import Installation, install_release, release_time
 from sros_tool.agent.running import (
     EnclaveProcesses,
     Systemd,
@@ -78,7 +78,7 @@ from sros_tool.keystore.reader import read_certificate
 from sros_tool.keystore.transaction.transaction import recover_keystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import make_request, validity_of
-from sros_tool.pki.crl import list_number, load_crl
+from sros_tool.pki.crl import list_number, load_crl, newest_list
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 from sros_tool.pki.token import Secrets, open_enclave_key
 from sros_tool.runtime.processes import RunningProcesses, boot_id

@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
-from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -56,7 +55,7 @@ from sros_tool.pki.certificates import (
     make_request,
     validity_of,
 )
-from sros_tool.pki.crl import last_update, list_number, next_update, read_lists, signed_by
+from sros_tool.pki.crl import last_update, list_number, newest_list, next_update, read_lists
 from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem, load_key
 from sros_tool.validity import iso
 from sros_tool.wording import enumerated
@@ -269,7 +268,7 @@ def _check_lists(folder: Folder, enclaves: Mapping[str, Mapping[str, bytes]]) ->
             continue
         number = list_number(present)
         if sent is None or list_number(sent) <= number:
-            has = f"the number {list_number(sent)}" if sent else "none"
+            has = "none" if sent is None else f"the number {list_number(sent)}"
             raise KeystoreError(
                 f"the revocation list for {name} in the release is older than the one here",
                 f"The current list has the number {number}, the release has {has}: revoked "
@@ -278,21 +277,6 @@ def _check_lists(folder: Folder, enclaves: Mapping[str, Mapping[str, bytes]]) ->
                 "Where the keystore is, run `sros fleet collect KEYSTORE INBOX`, which takes the "
                 "list from the message of this robot, then publish again.",
             )
-
-
-@lru_cache(maxsize=8)
-def newest_list(data: bytes, authorities: bytes) -> x509.CertificateRevocationList | None:
-    """Return the newest revocation list in ``data``, of those that one of ``authorities`` signed.
-
-    The list number decides; None if there is none, or a file cannot be read.
-    """
-    try:
-        signers = load_certificates(authorities, IDENTITY_CA_FILE)
-        lists = read_lists(data, CRL_FILE) if data else ()
-    except SrosError:
-        return None
-    signed = [crl for crl in lists if any(signed_by(crl, signer) for signer in signers)]
-    return max(signed, key=list_number, default=None)
 
 
 def release_time(release: Release) -> datetime | None:

@@ -24,6 +24,7 @@ from sros_tool.pki.certificates import (
     authority_identifier,
     extension,
     is_signed,
+    load_certificates,
     subject_text,
 )
 from sros_tool.pki.distinguished_names import (
@@ -297,6 +298,21 @@ def may_sign_lists(authority: x509.Certificate) -> bool:
     """Return whether a CA's keyUsage permits signing CRLs; True if it has no keyUsage."""
     usage = extension(authority, x509.KeyUsage)
     return usage is None or usage.crl_sign
+
+
+@lru_cache(maxsize=8)
+def newest_list(data: bytes, authorities: bytes) -> x509.CertificateRevocationList | None:
+    """Return the newest revocation list in ``data``, of those that one of ``authorities`` signed.
+
+    The list number decides; None if there is none, or a file cannot be read.
+    """
+    try:
+        signers = load_certificates(authorities, "the identity CAs")
+        lists = read_lists(data, "the list") if data else ()
+    except PkiError:
+        return None
+    signed = [crl for crl in lists if any(signed_by(crl, signer) for signer in signers)]
+    return max(signed, key=list_number, default=None)
 
 
 def list_number(crl: x509.CertificateRevocationList) -> int:

@@ -23,7 +23,7 @@ from sros_tool.keystore.delivery.robot import create_request
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
-from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
@@ -56,6 +56,20 @@ def fleet(made_fleet: Path, tmp_path: Path) -> Path:
 def arrived(made_fleet: Path, tmp_path: Path) -> Path:
     distribute(made_fleet, ["/arm/camera", "/base"], tmp_path / "robot", now=NOW)
     return tmp_path / "robot"
+
+
+def test_an_older_list_does_not_replace_a_newer_one(fleet: Path, tmp_path: Path) -> None:
+    """Also not with --force: the keystore may come from a backup."""
+    refresh_crl(fleet, now=NOW)
+    backup, robot = copy_of(fleet, tmp_path / "backup"), tmp_path / "robot"
+    revoke(fleet, ["/armada"], now=NOW)
+    distribute(fleet, ["/base"], robot, now=NOW)
+    with pytest.raises(
+        KeystoreError, match=r"is a newer .* number 2, the keystore has the number 1"
+    ):
+        distribute(backup, ["/base"], robot, now=NOW, force=True)
+    (robot / "enclaves/base/crl.pem").unlink()
+    assert distribute(backup, ["/base"], robot, now=NOW, force=True).changes
 
 
 # ── selection ──────────────────────────────────────────────────────────────────────────────

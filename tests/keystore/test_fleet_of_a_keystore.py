@@ -58,6 +58,14 @@ def test_a_forged_record_does_not_hide_an_edit(made: Path, tmp_path: Path) -> No
     assert (ended.status, "is missing" in ended.err) == (2, True), ended
 
 
+def test_the_folder_of_a_robot_gets_no_enclave_of_another_one(made: Path, tmp_path: Path) -> None:
+    (tmp_path / ".agent").mkdir()
+    (tmp_path / ".agent/agent.toml").write_text('robot = "a"\n')
+    refused = sros("distribute_key", made / "ks", "--robot", "a_arm", tmp_path, "--force")
+    assert "is the folder of robot a, and /a_arm belongs to a_arm" in refused.err
+    sros("distribute_key", made / "ks", "--robot", "a", tmp_path, "--force").ok()
+
+
 def test_no_enclave_belongs_to_two_robots(made: Path) -> None:
     """Paths of two policies can give one enclave to two robots; one would get the other's key."""
     before = snapshot(made / "ks")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -12,13 +13,18 @@ from pathlib import Path
 from shlex import quote
 from typing import Annotated, NamedTuple
 
-from sros_tool.errors import KeystoreError, Note
+from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.faults import Fault
 from sros_tool.files import staged_file
+from sros_tool.fleet.robots import robot_of
 from sros_tool.folders import Folder
+from sros_tool.keystore.confirmation import enclave_of
 from sros_tool.keystore.delivery.archive import SUFFIXES, file_mode, pack
 from sros_tool.keystore.delivery.robot import check_same_authority
+from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.layout import (
+    AGENT,
+    CRL_FILE,
     ENCLAVES,
     IDENTITY_CA_FILE,
     KEY_FILE,
@@ -48,6 +54,7 @@ from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.keystore.zenoh_files import open_zenoh
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import load_certificates, validity_of
+from sros_tool.pki.crl import list_number, newest_list
 from sros_tool.pki.keys import holds_private_key
 from sros_tool.pki.token import read_token_file
 from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes, Words
@@ -399,6 +406,8 @@ def _write_folder(
             "Choose another folder.",
         )
     check_same_authority(target, files)
+    _check_robot(root, target, files)
+    _check_lists(target, files)
     stale = _stale_paths(target, files)
     different = {
         path: data
@@ -419,6 +428,49 @@ def _write_folder(
             transaction.remove(path)
         transaction.commit()
     return transaction.changes
+
+
+def _check_robot(root: Path, target: Path, files: Mapping[str, bytes]) -> None:
+    """Raise `KeystoreError` if the agent in ``target`` is of another robot than an enclave."""
+    settings = target / AGENT / "agent.toml"
+    if not settings.is_file() or not (fleet := load_fleet(Keystore(root))):
+        return
+    here = None
+    with suppress(SrosError, ValueError):  # the agent refuses these settings itself
+        here = tomllib.loads(read_bytes(settings, "settings").decode()).get("robot")
+    for name in sorted({enclave_of(path) for path in files}):
+        robot = robot_of(fleet, name)
+        if robot and here and robot.name != here:
+            raise KeystoreError(
+                f"'{target}' is the folder of robot {here}, and {name} belongs to {robot.name}",
+                f"'{settings}' names {here}. Nothing was changed.",
+                f"Choose the folder of {robot.name}.",
+            )
+
+
+def _check_lists(target: Path, files: Mapping[str, bytes]) -> None:
+    """Raise `KeystoreError` if ``target`` has a newer revocation list than an enclave in ``files``.
+
+    Only lists count that a CA in ``files`` signed.
+    """
+    for path, authorities in files.items():
+        folder, _, file = path.rpartition("/")
+        place = target / folder / CRL_FILE
+        if file != IDENTITY_CA_FILE or not place.is_file():
+            continue
+        present = newest_list(read_bytes(place, "revocation list"), authorities)
+        sent = newest_list(files.get(f"{folder}/{CRL_FILE}", b""), authorities)
+        if present is None:
+            continue
+        if sent is None or list_number(sent) < list_number(present):
+            has = "none" if sent is None else f"the number {list_number(sent)}"
+            raise KeystoreError(
+                f"'{place}' is a newer revocation list than the keystore's",
+                f"It has the number {list_number(present)}, the keystore has {has}: revoked "
+                "enclaves would be trusted again. Nothing was changed.",
+                "The keystore may come from a backup: docs/howto/keystore_is_lost.md says how it "
+                f"takes over the list. If the older list is right, remove '{place}' first.",
+            )
 
 
 def _stale_paths(target: Path, files: dict[str, bytes]) -> list[str]:
