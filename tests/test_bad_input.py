@@ -104,8 +104,9 @@ def test_file(what: str, kind: str, keystore: Path, tmp_path: Path) -> None:
         "inspect": ["inspect", path],
         "authority": ["inspect", keystore / "enclaves/a/permissions.p7s", "--ca", path],
     }
-    if what == "inspect" and kind == "a folder":
-        why = "neither a keystore nor an enclave"
+    if kind == "a folder":
+        others = {"inspect": "neither a keystore nor an enclave", "policy": "holds no policy"}
+        why = others.get(what, why)
     before = snapshot(tmp_path)
     check_refused(sros(*words[what]), why)
     check_unchanged(tmp_path, before)
