@@ -447,7 +447,9 @@ def render_fleet_page(
         if kind == "error":
             trusted = (
                 '<p class="wrong">Until the revocation list is in force on a robot, the robot '
-                "accepts whoever has a revoked key: deliver it, and restart the processes.</p>"
+                "accepts whoever has a revoked key. Deliver the list, restart the processes, and "
+                "confirm by Ansible or <code>sros agent</code>; <code>sros fleet report</code> "
+                "does not tell what runs.</p>"
             )
     said = "".join(f"<br>{_sentence(fact)}" for fact in facts)
     head = (

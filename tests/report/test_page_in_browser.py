@@ -300,7 +300,7 @@ def test_hops_can_be_added_up_to_all(browser: Browser, robot_page: Path) -> None
         page.fill("#search", "/cmd_vel")
         page.keyboard.press("Enter")
         page.click("text=Who can influence it")
-        assert "3 enclaves can reach /cmd_vel within 2 hops" in page.inner_text("#summary")
+        assert "3 enclaves can influence /cmd_vel within 2 hops" in page.inner_text("#summary")
         assert page.locator("#map .card.enclave").count() == 3
         page.click("#hops-less")
         assert page.locator("#map .card.enclave").count() == 1

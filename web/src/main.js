@@ -35,7 +35,7 @@ function currentScene() {
     const most = Math.max(1, ...flow.hops.values());
     const scene = flowScene(flow, upstream, Math.min(hops, most));
     const within = [...flow.hops.values()].filter((hop) => hop <= hops).length;
-    const verb = upstream ? "can reach" : "can be reached from";
+    const verb = upstream ? "can influence" : "can be influenced by";
     scene.title = `${counted(within, "enclave")} ${verb} ${name} within ${counted(hops, "hop")}`;
     if (within < flow.hops.size) scene.title += `, ${flow.hops.size} over any number`;
     scene.most = most;
