@@ -34,7 +34,7 @@ from sros_tool.agent.running import (
     restart_units,
 )
 from sros_tool.agent.settings import AgentSettings, agent_folder
-from sros_tool.agent.state import read_seal, read_state, write_seal, write_state
+from sros_tool.agent.state import mark_outdated, read_seal, read_state, write_seal, write_state
 from sros_tool.checks.keystores.installed import (
     InstalledEnclave,
     exposed_sentences,
@@ -247,7 +247,8 @@ class _Round:
         return text
 
     def _save(self) -> None:
-        self._attempt(lambda: write_state(self._folder, self._state))
+        if not self._attempt(lambda: write_state(self._folder, self._state)):
+            mark_outdated(self._folder)
 
     def _clock(self, proven_time: datetime | None) -> RobotClock:
         now = self._machine.now

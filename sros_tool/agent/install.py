@@ -272,10 +272,11 @@ def _check_lists(folder: Folder, enclaves: Mapping[str, Mapping[str, bytes]]) ->
             raise KeystoreError(
                 f"the revocation list for {name} in the release is older than the one here",
                 f"The current list has the number {number}, the release has {has}: revoked "
-                "enclaves would be trusted again. The keystore may come from a backup. "
-                "Nothing was changed.",
-                "Where the keystore is, run `sros fleet collect KEYSTORE INBOX`, which takes the "
-                "list from the message of this robot, then publish again.",
+                "enclaves would be trusted again. Either the server has an old copy, or the "
+                "keystore comes from a backup. Nothing was changed.",
+                "Look at what the server serves, and publish there again. Only if the keystore "
+                "comes from a backup, first run `sros fleet collect KEYSTORE INBOX`, which takes "
+                "the list from the message of this robot.",
             )
 
 

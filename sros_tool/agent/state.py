@@ -129,6 +129,25 @@ def write_state(folder: Path, state: AgentState) -> None:
         put_in_place()
 
 
+def mark_outdated(folder: Path) -> None:
+    """Note by the time of the file, which a full disk lets change, that the state is not the last.
+
+    `write_state` ends that.
+    """
+    with suppress(OSError):
+        os.utime(agent_folder(folder) / _STATE, (0, 0))
+
+
+def _outdated_sentences(folder: Path) -> Iterator[str]:
+    """Yield a sentence if the last round could not write what it did."""
+    with suppress(OSError):
+        if (agent_folder(folder) / _STATE).stat().st_mtime == 0:
+            yield (
+                f"The last round could not write to '{agent_folder(folder)}', so it is not known "
+                "what it did. Make room on the disk."
+            )
+
+
 def read_seal(folder: Path) -> bytes:
     """Return the seal of the release that was accepted last; b"" if there is none."""
     with suppress(SrosError, OSError):
@@ -230,7 +249,7 @@ def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStat
         moment is not None and abs(now - moment) <= oldest for moment in (state.fetched, state.sent)
     )
     whole = 0 < state.release == state.accepted
-    problems = (*state.problems, *_expired_since(folder, state, now))
+    problems = (*_outdated_sentences(folder), *state.problems, *_expired_since(folder, state, now))
     return AgentStatus(
         folder,
         settings.robot,

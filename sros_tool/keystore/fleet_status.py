@@ -358,7 +358,10 @@ class RobotStatus:
         is_silent = self.received is None or now - self.received > _SILENCE
         if self.is_locked_out:
             return "deliver" if is_silent else "wait, else deliver"
-        return "check whether it is on" if is_silent else "wait: it fetches"
+        if is_silent:
+            return "check whether it is on"
+        mended = (is_unusable(text) or EXPIRED_METADATA in text for text in self.problems or ())
+        return "wait: it fetches" if all(mended) else "look into it"
 
 
 @shows("folder", "expires", "root_expires", "accepted", null_if_empty=("folder",))

@@ -773,6 +773,23 @@ def test_a_round_that_ends_anywhere_is_ended_by_the_next(
     assert earlier or (instead and not LONG)
 
 
+def test_the_status_after_a_round_that_could_not_write_it(r1: Robot) -> None:
+    def is_well() -> tuple[bool, str]:
+        status = agent_status(r1.folder, now=moment(), oldest=timedelta(days=1))
+        return status.well, " ".join(status.problems)
+
+    r1.round()
+    r1.round()
+    assert is_well() == (True, "")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("sros_tool.agent.agent.write_state", run_out_of_space)
+        r1.round()
+    well, why = is_well()
+    assert not well and "The last round could not write" in why
+    r1.round()
+    assert is_well() == (True, "")
+
+
 # ── settings ───────────────────────────────────────────────────────────────────────────────
 
 

@@ -754,6 +754,13 @@ def test_what_is_to_be_done_for_robots_that_do_not_fetch_what_is_published(field
     refused = "all its certificates are revoked: a web server with the current list refuses it"
     assert rows["r3"][0] == "wait, else deliver" and refused in rows["r3"][1]
     assert rows["r2"][0] == "wait: it fetches"
+    kept = field.root / "confirmed/r2.json"
+    value = json.loads(kept.read_text())
+    value["confirmation"]["problems"] = ["Make room on the disk."]
+    kept.write_text(json.dumps(value))
+    assert said()["r2"][0] == "look into it"
+    value["confirmation"]["problems"] = []
+    kept.write_text(json.dumps(value))
     for robot in ("r2", "r3"):
         field.age(robot, timedelta(minutes=31))
     page = field.run("fleet", "status", "ks", "--html", status=1).out
