@@ -130,12 +130,12 @@ def write_state(folder: Path, state: AgentState) -> None:
 
 
 def mark_outdated(folder: Path) -> None:
-    """Note by the time of the file, which a full disk lets change, that the state is not the last.
+    """Note by the time of the file that the state is not the last one.
 
     `write_state` ends that.
     """
-    with suppress(OSError):
-        os.utime(agent_folder(folder) / _STATE, (0, 0))
+    with suppress(OSError), Folder(agent_folder(folder)) as opened:
+        opened.set_time(_STATE, 0)
 
 
 def _outdated_sentences(folder: Path) -> Iterator[str]:
