@@ -93,13 +93,14 @@ function zoom(step) {
   else state.zoom = Math.min(2.5, Math.max(0.05, state.zoom * (step > 0 ? 1.2 : 1 / 1.2)));
   byId("map").setAttribute("width", Math.round(width * state.zoom));
   byId("map").setAttribute("height", Math.round(state.shown.height * state.zoom));
-  fadeEdge();
+  fadeEdges();
 }
 
-// What goes on to the right fades, so that one moves the map.
-function fadeEdge() {
+// A side on which the map goes on fades, so that one moves it.
+function fadeEdges() {
   const canvas = byId("canvas");
-  canvas.classList.toggle("more", canvas.scrollLeft + canvas.clientWidth < canvas.scrollWidth - 4);
+  canvas.classList.toggle("more-left", canvas.scrollLeft > 4);
+  canvas.classList.toggle("more-right", canvas.scrollLeft + canvas.clientWidth < canvas.scrollWidth - 4);
 }
 
 // The whole drawing, however small; what opens first is as wide as the window, and readable.
@@ -110,7 +111,7 @@ function fit() {
   state.zoom = Math.max(0.05, Math.min(1.15, (canvas.clientWidth - 2) / width, tall / height));
   byId("map").setAttribute("width", Math.floor(width * state.zoom));
   byId("map").setAttribute("height", Math.floor(height * state.zoom));
-  fadeEdge();
+  fadeEdges();
   canvas.scrollIntoView({ block: "nearest" });
 }
 
@@ -337,7 +338,7 @@ function start() {
   byId("back").addEventListener("click", () => setScene(state.scene));
   byId("close").addEventListener("click", close);
   byId("sheet").addEventListener("click", () => unfoldSheet(document.body.classList.contains("with-title-only")));
-  byId("canvas").addEventListener("scroll", fadeEdge);
+  byId("canvas").addEventListener("scroll", fadeEdges);
   byId("zoom-in").addEventListener("click", () => zoom(1));
   byId("zoom-out").addEventListener("click", () => zoom(-1));
   byId("zoom-fit").addEventListener("click", fit);
