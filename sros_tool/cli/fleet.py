@@ -849,13 +849,13 @@ def _groups(compared_fleet: ComparedFleet, robots: Sequence[str]) -> list[_Group
     current: list[RobotStatus] = []
     whats: dict[str, str] = {}
     for robot in sorted(status.robots, key=lambda robot: places[robot.robot]):
-        if robots or robot.state not in ("current", "none") or robot.notes or robot.problems:
+        if robots or robot.state != "current" or robot.notes or robot.problems:
             clauses = (*_expiry_clauses(robot, compared_fleet.at), *_summary(robot, status.stage))
             what = _CLOCK.sub("", _without_robot_name("; ".join(clauses), robot.robot))
             whats[robot.robot] = what
             row = (robot.state.value, robot.to_do, _DURATION.sub("", what))
             alike.setdefault((*row, robot.robot if robots else ""), []).append(robot)
-        elif robot.state == "current":
+        else:
             current.append(robot)
     groups = []
     for (state, to_do, *_), group in alike.items():

@@ -47,6 +47,7 @@ from sros_tool.keystore.confirmation import (
 )
 from sros_tool.keystore.delivery.published import read_published
 from sros_tool.keystore.fleet import edited_fleet, enclaves_of_robot, recorded_fleet
+from sros_tool.keystore.known_keys import restored_at
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL,
@@ -203,7 +204,8 @@ class RobotStatus:
     which a file expires soon or has expired.  ``has_list`` says whether it has the current
     revocation list, in force or not, and ``renew_from`` from when a file of it expires soon.
     ``lacks_key`` are enclaves whose key the keystore has and the robot does not, which no release
-    brings.  ``reads_copy`` says that it fetched after the publication and got an earlier release,
+    brings.  ``is_ahead`` says that its files are from after the backup that the keystore is from.
+    ``reads_copy`` says that it fetched after the publication and got an earlier release,
     and ``is_locked_out`` that all its certificates are revoked.
     """
 
@@ -273,6 +275,7 @@ class RobotStatus:
     renew_from: datetime | None = None
     lacks_key: tuple[str, ...] = ()
     reads_copy: bool = False
+    is_ahead: bool = False
     is_locked_out: bool = False
 
     @property
@@ -341,7 +344,9 @@ class RobotStatus:
         if self.state in (State.CURRENT, State.NONE):
             look = "look at its `from`" if self.reads_copy else "look into it"
             return look if self.problems else ""
-        if self.state in _TO_DO:
+        if self.is_ahead and (self.release or 0) > (self.published or 0):
+            return "publish"
+        if self.state in _TO_DO and not self.is_ahead:
             return _TO_DO[self.state]
         if self.state is State.UNUSABLE:
             return "deliver" if self.lacks_key else "look into it"
@@ -521,7 +526,7 @@ def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
     statuses = tuple(
         _status(robot, known, stages, unrecorded[robot.robot.name]) for robot in compared
     )
-    if older := known.age_clause():  # there may be a later list, which it does not have
+    if older := known.age_clause:  # there may be a later list, which it does not have
         statuses = tuple(status.without_list() for status in statuses)
     return FleetStatus(
         root,
@@ -822,8 +827,9 @@ class _Known:
 
         return is_all_published(self._root, published, compared_robot.enclaves)
 
+    @cached_property
     def age_clause(self) -> str:
-        """Return why the keystore is older than its robots, as a clause; "" if nothing shows it."""
+        """Why the keystore is older than its robots, as a clause; "" if nothing shows it."""
         entries = self._keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
         marks = [entry for entry in entries if entry.what in (RESTORED, "release")]
         if marks and marks[-1].what == RESTORED:
@@ -831,6 +837,13 @@ class _Known:
         from sros_tool.keystore.delivery.publish import later_in_folder  # few folders are later
 
         return later_in_folder(self._keystore)
+
+    def is_ahead(self, confirmed: Confirmation) -> bool:
+        """Return whether a robot has a release of after the backup that the keystore is from."""
+        is_from_backup = bool(self.age_clause or restored_at(self._keystore))
+        return bool(
+            confirmed.release and is_from_backup and confirmed.release not in self._releases
+        )
 
     def lacks_key(self, compared_robot: _ComparedRobot) -> tuple[str, ...]:
         """Return the enclaves whose certificate is for a key that the robot does not have.
@@ -1006,6 +1019,18 @@ def _status(
         state = max(state, State.REFUSED, key=_BADNESS.__getitem__)
         text = f"its last message was refused since {iso(refusal.time)}: {refusal.why}"
         compared_robot = compared_robot._replace(notes=(*compared_robot.notes, text))
+    is_ahead = bool(
+        state is State.UNKNOWN
+        and received
+        and received.message
+        and known.is_ahead(received.confirmation)
+    )
+    if is_ahead and confirmed:
+        text = (
+            f"release {confirmed.release} is from after the backup of the keystore: its files are "
+            "newer than the keystore, which replaces them by its next release"
+        )
+        compared_robot = compared_robot._replace(notes=(*compared_robot.notes, text))
     has_list = (
         known.has_list
         and bool(compared_robot.enclaves)
@@ -1043,6 +1068,7 @@ def _status(
             (file.window.expires_soon_from() for file in validity.values()), default=None
         ),
         lacks_key=known.lacks_key(compared_robot) if different or state is State.UNUSABLE else (),
+        is_ahead=is_ahead,
         is_locked_out=bool(compared_robot.enclaves) and certificates == {State.REVOKED},
     )
     if not (status.fetches and known.reads_copy(compared_robot, status.last_heard)):

@@ -202,9 +202,9 @@ class KnownKeys:
             if may_have_later_releases(self._keystore):
                 remedy = "First publish with --restored, which takes this list over."
             raise KeystoreError(
-                f"the certificate of {holder} was revoked after the backup that the keystore was "
-                "restored from",
-                "A revocation list names it, and the ledger does not.",
+                f"the certificate of {holder} was revoked",
+                "A revocation list names it, and the ledger does not: the keystore may come from a "
+                "backup.",
                 remedy,
             )
 

@@ -279,6 +279,13 @@ def test_an_older_message_in_a_second_inbox(home: Home) -> None:
     assert home.of("r1").outcome == "older" and "r1" in refusals(home.root), "as before"
 
 
+def test_two_computers_with_the_keys_of_a_robot_are_noted(home: Home) -> None:
+    for release, is_noted in ((3, False), (2, True), (3, False)):
+        home.send("r1", release=release)
+        remarks = "".join(home.of("r1").remarks)
+        assert ("two computers have its keys" in remarks) == is_noted
+
+
 def test_a_message_that_was_replayed(home: Home) -> None:
     first = home.send("r1").read_bytes()
     home.send("r1")

@@ -474,6 +474,25 @@ def test_a_report_does_not_replace_a_later_confirmation(field: Field) -> None:
     field.confirm("r2")
 
 
+def test_a_robot_that_is_ahead_of_a_restored_keystore(field: Field) -> None:
+    field.run("crl", "ks", "--refresh")
+    field.run("fleet", "publish", "ks", "pub")
+    field.deliver(*ROBOTS)
+    backup = copy_of(field.root, field.folder / "backup")
+    field.run("crl", "ks", "--refresh")
+    field.run("fleet", "publish", "ks", "pub")
+    release = field.status()["robots"]["r1"]["published"]
+    field.run("distribute_key", "ks", "--robot", "r1", "r1", "--force")
+    shutil.rmtree(field.root)
+    backup.rename(field.root)
+    field.send("r1", release=release)
+    for to_do in ("publish", "wait: it fetches"):
+        robot = field.status()["robots"]["r1"]
+        assert (robot["state"], robot["to_do"]) == ("unknown", to_do)
+        assert "is from after the backup of the keystore" in robot["notes"][0]
+        field.run("fleet", "publish", "ks", "pub", *(["--restored"] if to_do == "publish" else []))
+
+
 def test_a_fleet_file_that_was_edited_is_not_believed(field: Field) -> None:
     path = field.root / "fleet.toml"
     path.write_text(path.read_text().replace("[robots.r3]", "").replace("r3 = {}", ""))

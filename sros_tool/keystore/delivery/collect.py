@@ -487,6 +487,12 @@ class _Verifier:
         )
         if note := received.clock_note():
             remarks.append(note)
+        installed, before_it = verified.confirmation.release, last and last.confirmation.release
+        if installed is not None and installed < (before_it or 0) and not is_restored:
+            remarks.append(
+                f"it has release {installed or 'none'}, and had {before_it} before: its disk was "
+                "restored, or two computers have its keys"
+            )
         return _ReceivedMessage(
             robot, "kept", verified=verified, received=received, remarks=remarks
         )
