@@ -452,7 +452,7 @@ CASES: dict[str, tuple[Case, ...]] = {
     ),
     "fleet status": (
         Case("fleet", 1),
-        Case("fleet --robot a", before=("fleet confirm fleet a.json --robot a",)),
+        Case("fleet --robot a", 1, before=("fleet confirm fleet a.json --robot a",)),
         Case("fleet", 1, before=("fleet confirm fleet b.json --robot b",)),
         Case("fresh", 1, before=("fleet publish fresh pub",)),
     ),
