@@ -123,6 +123,7 @@ NOT_OF_DOCUMENTS = {
     "verifies_policies",
     "reads_trusted_certificates",
     "ignores_unauthenticated",
+    "controls_unauthenticated",
     "reads_files_as_text",
     "hashes",
     "keys",
