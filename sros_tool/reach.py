@@ -198,7 +198,7 @@ def _starting(ordered: list[str], prefix: str) -> Iterator[str]:
         yield ordered[index]
 
 
-_Used = set[tuple[str, tuple[str, ...], str, DomainSet | None]]
+_Followed = set[tuple[str, tuple[str, ...], str, DomainSet | None]]
 
 
 class Network:
@@ -275,11 +275,11 @@ class Network:
 
     def _search(self, start_enclaves: Collection[str], forward: bool) -> dict[str, HopPath]:
         paths: dict[str, HopPath] = dict.fromkeys(sorted(start_enclaves), ())
-        used: _Used = set()
+        followed: _Followed = set()
         queue = deque(paths)
         while queue:
             here = queue.popleft()
-            for hop in self._steps(here, forward, used, paths):
+            for hop in self._steps(here, forward, followed, paths):
                 there = hop.target if forward else hop.source
                 if there not in paths:
                     paths[there] = (*paths[here], hop) if forward else (hop, *paths[here])
@@ -287,19 +287,20 @@ class Network:
         return {enclave: path for enclave, path in paths.items() if path}
 
     def _steps(
-        self, enclave: str, forward: bool, used_hops: _Used, known: Container[str]
+        self, enclave: str, forward: bool, followed: _Followed, known: Container[str]
     ) -> Iterator[Hop]:
-        """Yield the hops from an enclave (``forward``) or to it, except with ``known`` enclaves.
+        """Yield the hops from an enclave (``forward``) or to an enclave, except ``known`` enclaves.
 
-        Topics that were ``used_hops`` before cannot lead to other enclaves, and are left out, too.
+        ``followed`` are the topics whose hops were yielded earlier, and so lead to ``known``
+        enclaves only.  The topics of this enclave are added to them.
         """
         directions = ("publish", "subscribe") if forward else ("subscribe", "publish")
         own, others = (self._sides[direction] for direction in directions)
         for end in own.of.get(enclave, ()):
             like = (end.topic, end.without, self._router_of.get(enclave, ""), end.domains)
-            if like in used_hops:
+            if like in followed:
                 continue
-            used_hops.add(like)
+            followed.add(like)
             for other in others.possibly_overlapping(end.topic):
                 if other.enclave in known:
                     continue

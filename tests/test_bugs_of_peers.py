@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.files import policies_dir
-from sros_tool.policy.document import read_policy, write_policy
+from sros_tool.policy.document import policy_xml, read_policy
 from sros_tool.policy.merge import merge_into
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, policy_rights
@@ -200,7 +200,7 @@ def test_bug_8_a_policy_with_metadata_survives(tmp_path: Path) -> None:
     file = written(tmp_path / "file.xml", text)
     before = read_policy(file)
     assert "me" in before.enclaves[0].profiles[0].metadata
-    file.write_bytes(write_policy(before))
+    file.write_bytes(policy_xml(before))
     assert read_policy(file) == before
     seen = read_policy(written(tmp_path / "seen.xml", policy_text({"/a": publish("x")})))
     file.write_bytes(merge_into(file, seen).document)
@@ -264,7 +264,7 @@ def test_bug_11_included_parts_outlive_their_documents(tmp_path: Path) -> None:
     child = os.fork()
     if child == 0:
         policy = read_policy(written(tmp_path / "p.xml", text))
-        written(tmp_path / "out.xml", write_policy(policy).decode())
+        written(tmp_path / "out.xml", policy_xml(policy).decode())
         os._exit(len(read_policy(tmp_path / "out.xml").enclaves[49].profiles[0].profiles[0].groups))
     _, status = os.waitpid(child, 0)
     assert os.waitstatus_to_exitcode(status) == 20

@@ -12,7 +12,7 @@ import pytest
 
 from sros_tool.errors import DocumentError, PolicyError
 from sros_tool.files import policies_dir
-from sros_tool.policy.document import read_policy, write_policy
+from sros_tool.policy.document import policy_xml, read_policy
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Rules, folded, policy_rights
@@ -144,7 +144,7 @@ def test_the_shipped_policies_come_back(policy: Path, tmp_path: Path) -> None:
     found = rights_behind(parse_configuration(written, "router.json5"))
     assert not [one for each in found for one in each.rights if one.lacks]
     back = policy_of(found)
-    (tmp_path / "back.xml").write_bytes(write_policy(back))
+    (tmp_path / "back.xml").write_bytes(policy_xml(back))
     assert read_policy(tmp_path / "back.xml") == back
     allowed = {each for each in policy_rights(stated) if each.qualifier is ALLOW}
     whole, came = Rules(allowed), policy_rights(back)

@@ -37,7 +37,7 @@ def json_form(result: Changed, form: str, **more: object) -> tuple[object, ...]:
 
 def print_changed(
     result: Changed,
-    form: tuple[object, ...] | None = None,
+    json_data: tuple[object, ...] | None = None,
     lines: Iterable[str] = (),
     *,
     first: Iterable[str] = (),
@@ -50,16 +50,16 @@ def print_changed(
 
     Args:
         result: the change.
-        form: what ``--json`` prints of it; None without ``--json``.
-        lines: what was done; in place of it, a dry run prints the files that it would change.
+        json_data: what ``--json`` prints of the change; None without ``--json``.
+        lines: what was done; a dry run prints the files that it would change instead.
         first: messages that come first on standard error.
         after: messages that follow the rights that change.
         rights: say what enclaves lose and gain.
         exported: also say that exports are out of date.
         restart: say which processes have to be restarted.
     """
-    if form is not None:
-        print_json(form)
+    if json_data is not None:
+        print_json(json_data)
     elif result.dry_run:
         print_plan(result.root, result.changes)
     else:

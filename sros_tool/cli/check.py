@@ -328,7 +328,7 @@ def check(
     if suggest:
         if form != "text" or requirements or earlier:
             raise UsageError("--suggest prints TOML", "", "Give it alone.")
-        one_robot = _one_robot(family, paths, "--suggest")
+        one_robot = _paths_of_one_system(family, paths, "--suggest")
         with progress("deciding"):
             text = _suggested(_system(one_robot, at, template))
         echo_document(text)
@@ -382,7 +382,7 @@ def _requirements(
     from sros_tool.proof.findings import requirement_findings
     from sros_tool.proof.requirements import dropped_findings, read_all_requirements
 
-    one_robot = _one_robot(family, paths, "--requirements")
+    one_robot = _paths_of_one_system(family, paths, "--requirements")
 
     def decide(load: Callable[[Sequence[Path]], System]) -> list[Finding]:
         system = load(one_robot)
@@ -431,7 +431,7 @@ def _one_path(family: str, paths: tuple[Path, ...], option: str) -> Path:
     )
 
 
-def _one_robot(family: str, paths: tuple[Path, ...], option: str) -> tuple[Path, ...]:
+def _paths_of_one_system(family: str, paths: tuple[Path, ...], option: str) -> tuple[Path, ...]:
     """Return the paths, which have to be a keystore, or policies of one robot or fleet."""
     from sros_tool.keystore.layout import is_keystore
 

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from sros_tool.explain.asking import AskedEnclave, AskingContext
     from sros_tool.explain.log import LogFinding
     from sros_tool.explain.vendors import Comparison, DdsExplanation, ZenohNextToDds
-    from sros_tool.explain.who import Decider, Everybody, FollowedReach
+    from sros_tool.explain.who import AnswerForAll, Decider, FollowedReach
     from sros_tool.explain.zenoh import CheckedLink, ZenohAnswer, ZenohExplanation
     from sros_tool.fleet.robots import Fleet
     from sros_tool.keystore.reader import Keystore
@@ -837,7 +837,7 @@ def _show_who(
     domains = None if is_export else keystore.domains
     asked_in = " in this export" if is_export else ""
     where = (fleet, asking.domain, domains, asked_in)
-    return _print_everybody(decider, question, kind, where, as_json)
+    return _print_answer_for_all(decider, question, kind, where, as_json)
 
 
 def _show_who_in_policy(
@@ -869,7 +869,7 @@ def _show_who_in_policy(
     fleet = fleet_of(asking.fleet_file, None)
     _, stated = policy_to_ask(policy, fleet)
     decider = VendorOfPolicy(stated, *chosen_vendor, asking, patterns or ("*",))
-    return _print_everybody(decider, question, kind, (fleet, asking.domain, None, ""), as_json)
+    return _print_answer_for_all(decider, question, kind, (fleet, asking.domain, None, ""), as_json)
 
 
 def _question_to_all(other_arguments: tuple[str, ...], kind: str | None) -> Question:
@@ -883,7 +883,7 @@ def _question_to_all(other_arguments: tuple[str, ...], kind: str | None) -> Ques
     return ask(other_arguments[0], other_arguments[1] if len(other_arguments) > 1 else "", kind)
 
 
-def _print_everybody(
+def _print_answer_for_all(
     decider: Decider,
     question: Question,
     kind: str | None,
@@ -892,29 +892,29 @@ def _print_everybody(
 ) -> int:
     """Print the decisions on all enclaves; return 0 if any enclave may do it, else 1.
 
-    ``where`` has the arguments of `_who_lines` after ``everybody``.
+    ``where`` has the arguments of `_who_lines` after ``answer``.
     """
-    from sros_tool.explain.who import ask_everybody, callable_action, names_meant
+    from sros_tool.explain.who import answer_for_all, callable_action, names_meant
 
     with progress("asking"):
-        everybody = ask_everybody(decider, question, kind)
+        answer = answer_for_all(decider, question, kind)
     if as_json:
-        print_json(decider.printed(everybody.question, everybody.outcomes))
+        print_json(decider.printed(answer.question, answer.outcomes))
     else:
-        _echo(_who_lines(everybody, *where))
+        _echo(_who_lines(answer, *where))
         echo(f"decided by {decider.title}", err=True)
-        if not kind and not everybody.allowed:
-            enclaves = {outcome.enclave for outcome in everybody.outcomes}
-            hint = callable_action(decider, everybody.question) or names_meant(
-                decider, everybody.question, enclaves
+        if not kind and not answer.allowed:
+            enclaves = {outcome.enclave for outcome in answer.outcomes}
+            hint = callable_action(decider, answer.question) or names_meant(
+                decider, answer.question, enclaves
             )
             print_notes([hint] if hint else [])
-    print_notes(everybody.notes)
-    return 0 if everybody.allowed else 1
+    print_notes(answer.notes)
+    return 0 if answer.allowed else 1
 
 
 def _who_lines(
-    everybody: Everybody,
+    answer: AnswerForAll,
     fleet: Fleet | None,
     domain: int | None,
     domains: DomainSet | None,
@@ -928,7 +928,7 @@ def _who_lines(
     """
     from sros_tool.fleet.robots import folded
 
-    able = [outcome for outcome in everybody.outcomes if outcome.allowed]
+    able = [outcome for outcome in answer.outcomes if outcome.allowed]
     lines = []
     by_domains = Counter(outcome.domains for outcome in able)
     everywhere = str(domains) if domains else next(iter(by_domains), "")
@@ -938,17 +938,17 @@ def _who_lines(
         wildcard = f"  by the wildcard {outcome.wildcard}" if outcome.wildcard else ""
         where = f"  in domain {outcome.domains}" if by_domains else ""
         lines.append((outcome.enclave, f"{outcome.enclave}{wildcard}{where}"))
-    stopped = [outcome for outcome in everybody.outcomes if outcome.stopped]
+    stopped = [outcome for outcome in answer.outcomes if outcome.stopped]
     for outcome in stopped[:_MOST_SHOWN]:
         lines.append((outcome.enclave, f"  cannot start: {outcome.enclave}  {outcome.stopped}"))
     yield from folded(fleet, lines)
     if more := stopped[_MOST_SHOWN:]:
         yield f"  cannot start: {counted(len(more), 'more enclave')}"
-    count = counted(len(everybody.outcomes), "enclave")
+    count = counted(len(answer.outcomes), "enclave")
     where = "" if domain is None else f" in domain {domain}"
     if by_domains:
         where = f": {', '.join(f'{n} in domain {text}' for text, n in by_domains.items())}"
-    yield f"{len(able)} of {count}{asked_in} may {everybody.question}{where}"
+    yield f"{len(able)} of {count}{asked_in} may {answer.question}{where}"
 
 
 # ── --reach ────────────────────────────────────────────────────────────────────────────────

@@ -301,7 +301,7 @@ def _show_from(
     """
     from sros_tool.checks.kind import ERROR, WARNING
     from sros_tool.checks.zenoh import ReadConfiguration, document_findings, subject_rights
-    from sros_tool.policy.document import write_policy
+    from sros_tool.policy.document import policy_xml
     from sros_tool.translate_zenoh.rights import policy_of, rights_behind
     from sros_tool.xml import read_bytes
     from sros_tool.zenoh.document import parse_configuration
@@ -329,7 +329,7 @@ def _show_from(
             )
         notes = tuple(_untranslatable_notes(rights))
         changes = file_change(output, existed=output.exists())
-        saved = "" if dry_run else save(output, write_policy(policy))
+        saved = "" if dry_run else save(output, policy_xml(policy))
     if as_json:
         print_json(
             ReadConfiguration(

@@ -341,9 +341,9 @@ def _added_xml(right: Right, places: Iterable[tuple[str, str]]) -> str:
     ns, node = max(fitting or known, key=lambda pair: len(pair[0]), default=_ANY_NODE)
     group = Group(right.kind, ((right.right, right.qualifier),), (right.name,))
     enclave = Enclave(right.enclave, (Profiles((Profile(ns, node, (group,)),)),))
-    from sros_tool.policy.document import write_policy  # an allowed question needs none
+    from sros_tool.policy.document import policy_xml  # an allowed question needs none
 
-    return write_policy(Policy((enclave,))).decode().rstrip()
+    return policy_xml(Policy((enclave,))).decode().rstrip()
 
 
 def _node_names(policy: Enclave | None, answer: Answer) -> Iterator[tuple[str, str]]:

@@ -79,7 +79,7 @@ class Decider(Protocol):
         """Yield notes on the outcomes."""
 
 
-class Everybody(NamedTuple):
+class AnswerForAll(NamedTuple):
     """The question that was answered, the decision for each enclave, and notes."""
 
     question: Question
@@ -104,7 +104,7 @@ def note_on_export(root: Path) -> Iterator[Note]:
         yield Note("explain.export", text)
 
 
-def ask_everybody(decider: Decider, question: Question, kind: str | None) -> Everybody:
+def answer_for_all(decider: Decider, question: Question, kind: str | None) -> AnswerForAll:
     """Return the decisions on all enclaves; the name of an action is taken for the action.
 
     ``kind`` is the kind of the name (topic, service or action) if the user gave it.
@@ -118,7 +118,7 @@ def ask_everybody(decider: Decider, question: Question, kind: str | None) -> Eve
         if action := about_action(question, rights):
             taken = taken_for_action(question, action)
             question, outcomes = action, decider.outcomes(action)
-    return Everybody(question, outcomes, (*taken, *decider.notes(outcomes)))
+    return AnswerForAll(question, outcomes, (*taken, *decider.notes(outcomes)))
 
 
 def callable_action(decider: Decider, question: Question) -> Note | None:

@@ -700,7 +700,7 @@ class LedgerFile:
         recorded = [_Fault(entry.number, entry.reason) for entry in entries if entry.what == GAP]
         gaps = (at for at, entry in zip(numbers, entries, strict=True) if entry.what == GAP)
         last_recorded = max(gaps, default=0)
-        start = _first_certificate_of(self._authorities(), zip(numbers, entries, strict=True))
+        start = _first_ca_line(self._authorities(), zip(numbers, entries, strict=True))
         every = [*recorded, *faults]
         last_fault = max((fault.line for fault in every), default=0)
         ledger = Ledger(
@@ -1005,10 +1005,12 @@ def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _first_certificate_of(
+def _first_ca_line(
     authorities: Iterable[x509.Certificate], entries: Iterable[tuple[int, Entry]]
 ) -> int:
-    """Return the number of the first line about the trusted CAs; 0 if a CA has no line."""
+    """Return the number of the first ledger line about any of these CAs.
+
+    It is 0 if one of the CAs has no line, or was renewed with the same key."""
     wanted = {digest(authority) for authority in authorities}
     lines: dict[str, int] = {}
     for number, entry in entries:

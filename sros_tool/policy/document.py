@@ -473,7 +473,7 @@ class _Reader:
         blocks = [self._expect(child, at, "enclaves") for child, at in blocks]
         if len(blocks) != 1:
             raise PolicyError(f"{where}: <policy> must contain exactly one <enclaves>")
-        return self._with_enclaves(*blocks[0], version)
+        return self._read_policy(*blocks[0], version)
 
     def _root(self) -> tuple[etree._Element, IncludedFile]:
         root = self._includer.load(self._file)
@@ -496,7 +496,7 @@ class _Reader:
         new = self._shown.with_name(f"{self._shown.stem}.policy.xml")
         return f"Convert it with `sros policies --convert {quote(shown)} -o {quote(str(new))}`."
 
-    def _with_enclaves(
+    def _read_policy(
         self, element: etree._Element, place: IncludedFile, version: str, tag: str = "enclave"
     ) -> Policy:
         """Return the policy whose enclaves are the children of ``element``, named ``tag``."""
@@ -1020,7 +1020,7 @@ class _EarlierReader(_Reader):
         if tags == ["profiles"]:
             policy = self._policy_of(self._enclaves_of_nodes(*blocks[0], left_out), VERSION)
         else:
-            policy = self._with_enclaves(*blocks[0], VERSION, tags[0].removesuffix("s"))
+            policy = self._read_policy(*blocks[0], VERSION, tags[0].removesuffix("s"))
         return ConvertedPolicy(policy, tuple(self._notes(policy)), tuple(left_out))
 
     def _enclaves_of_nodes(
@@ -1082,7 +1082,7 @@ def instruction_text(protect: Level | None) -> str:
     return f'<?{_INSTRUCTION} protect="{_WORDS[protect]}"?>' if protect else ""
 
 
-def write_policy(policy: Policy) -> bytes:
+def policy_xml(policy: Policy) -> bytes:
     """Return the policy as XML (UTF-8 bytes) that `read_policy` reads as an equal policy."""
     root = etree.Element("policy", version=policy.version)
     enclaves = etree.SubElement(root, "enclaves")
@@ -1123,7 +1123,7 @@ def checked_text(
     Raises:
         PolicyError: the XML would be read as a different policy.
     """
-    document = write_policy(policy)
+    document = policy_xml(policy)
     if output and read_policy(output, document, placeholders=placeholders) != policy:
         raise PolicyError(
             f"the {label} policy changes when it is written and read again",

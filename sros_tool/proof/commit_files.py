@@ -98,7 +98,7 @@ class Revision:
             DocumentError: the file is too large, or is no file but for instance a link, which is
                 not followed.
         """
-        path, shown = str(file.relative_to(_NOWHERE)), self.shown(str(file))
+        path, shown = str(file.relative_to(_NOWHERE)), self.with_git_paths(str(file))
         entry = self.repository.find(self.commit, path)
         if entry is None:
             raise MissingFileError(f"'{shown}' does not exist")
@@ -108,7 +108,7 @@ class Revision:
             )
         return self.repository.content(entry.id)
 
-    def shown(self, text: str) -> str:
+    def with_git_paths(self, text: str) -> str:
         """Return a text in which ``git:REVISION:PATH`` replaces paths below `place`."""
         return text.replace(f"{_NOWHERE}/", f"{PREFIX}{self.name}:").replace(
             str(_NOWHERE), f"{PREFIX}{self.name}:"
@@ -116,7 +116,7 @@ class Revision:
 
     def source(self, source: Source) -> Source:
         """Return a source whose path reads ``git:REVISION:PATH``."""
-        return Source(self.shown(source.file), source.line)
+        return Source(self.with_git_paths(source.file), source.line)
 
 
 def find_revision(text: str) -> Revision:
@@ -229,7 +229,7 @@ class CommitFiles:
         try:
             return [self._policy(policy.path, placeholders) for policy in folder.policies()]
         except SrosError as error:
-            texts = (folder.shown(part) for part in (error.what, error.why, error.remedy))
+            texts = (folder.with_git_paths(part) for part in (error.what, error.why, error.remedy))
             raise DocumentError(*texts) from error
 
     def tree(self, path: str) -> Path | None:
@@ -316,7 +316,9 @@ class CommitFiles:
                 if where not in self.files:  # so that no reader takes it for missing
                     with Folder(self.folder) as folder:
                         _make_folders(folder, where)
-                texts = (revision.shown(part) for part in (error.what, error.why, error.remedy))
+                texts = (
+                    revision.with_git_paths(part) for part in (error.what, error.why, error.remedy)
+                )
                 self.refused.append(DocumentError(*texts))
                 raise
             entry = self.entry(where)

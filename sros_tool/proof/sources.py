@@ -493,7 +493,7 @@ def _access_at_revision(revision: Revision, fleet: Fleet | None) -> AccessSource
         policies = [_read(policy.place, fleet, policy.read) for policy in revision.policies()]
         side = _access_of_policies(str(revision), policies)
     except SrosError as error:
-        texts = (revision.shown(part) for part in (error.what, error.why, error.remedy))
+        texts = (revision.with_git_paths(part) for part in (error.what, error.why, error.remedy))
         raise DocumentError(*texts) from error
     return replace(side, revision=revision)
 

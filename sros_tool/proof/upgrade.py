@@ -17,10 +17,10 @@ from sros_tool.checks.keystores.keystore import with_joined_findings
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.keystores.topic_names import names_without_wildcards
 from sros_tool.checks.keystores.vendors import (
-    check_starting,
     evaluate,
     example_domains,
     refusal_clause,
+    with_start_finding,
 )
 from sros_tool.checks.kind import Finding, FindingKind
 from sros_tool.checks.targets import Circumstances, policy_findings
@@ -525,7 +525,7 @@ def _nodes(files: DecidedFiles, before: Distribution, after: Distribution) -> It
                 files.keystore, now=files.at, zone=files.zone, distribution=distribution.name
             )
             checked = CheckedEnclave(view, name, enclave.state)
-            starting.append(check_starting(evaluate(checked, after.vendors, files.domain), ()))
+            starting.append(with_start_finding(evaluate(checked, after.vendors, files.domain), ()))
         if not starting[0]:
             for finding in starting[1]:
                 text = f"in ROS 2 {after.title}, {finding.text}"

@@ -70,7 +70,7 @@ class Folding(NamedTuple):
 
     @classmethod
     def of(cls, picture: Picture, robots: Mapping[str, Robot] | None = None) -> Folding:
-        """Return the folding of a picture.
+        """Return a picture with equal units drawn as one.
 
         Args:
             picture: any picture, also with a focus or of two sources.
@@ -358,8 +358,8 @@ class _Draft:
         those that most of the family names, such as a leader.
         """
         self._symbols = [unit.family for unit in self._units]
-        views = self._views()
-        classes = _classes(views, [0] * len(views))
+        parts = self._parts_by_unit()
+        classes = _classes(parts, [0] * len(parts))
         usual: dict[int, int] = {}
         for members in sorted(classes.values(), key=lambda members: (-len(members), members)):
             if len(members) > 1:
@@ -368,14 +368,14 @@ class _Draft:
         named = self._named_by(usual)
         for unit, *others in classes.values():
             family = self._units[unit].family
-            near = family in usual and _are_alike(views[unit], views[usual[family]])
+            near = family in usual and _are_alike(parts[unit], parts[usual[family]])
             if not others and not (near and 2 * named[unit] <= sizes[family]):
                 self._symbols[unit] = -unit - 2
-        before = [0] * len(views)
+        before = [0] * len(parts)
         for number, members in classes.items():
             for unit in members:
                 before[unit] = number
-        classes = _classes(self._views(), before)
+        classes = _classes(self._parts_by_unit(), before)
         return {
             number: sorted(found, key=self._unit_name_order)
             for number, found in classes.items()
@@ -391,13 +391,13 @@ class _Draft:
         unread = (self._unread.get(name, ()) for name in names)
         return tuple(sorted([*names, *chain.from_iterable(unread)], key=name_order))
 
-    def _views(self) -> list[Counter[object]]:
-        """Return the drawing of each unit, with equal names for other units of its family."""
-        views: list[Counter[object]] = [Counter() for _ in self._units]
+    def _parts_by_unit(self) -> list[Counter[object]]:
+        """Return the parts of the picture that name each unit, with symbols in place of units."""
+        parts: list[Counter[object]] = [Counter() for _ in self._units]
         for kind, units, _what in self._seen:
             for unit in set(units):
-                views[unit][kind, self._symbols_around(units, unit)] += 1
-        return views
+                parts[unit][kind, self._symbols_around(units, unit)] += 1
+        return parts
 
     def _symbols_around(self, units: Sequence[int], unit: int) -> tuple[int, ...]:
         return tuple(_SELF if other == unit else self._symbols[other] for other in units)

@@ -22,7 +22,7 @@ from sros_tool.fleet.robots import (
     robot_of,
 )
 from sros_tool.names import is_expression
-from sros_tool.policy.document import read_policy, write_policy
+from sros_tool.policy.document import policy_xml, read_policy
 from sros_tool.policy.model import Policy
 from tests.support.children import LONG
 
@@ -242,7 +242,7 @@ def test_a_value_is_refused_or_gives_the_structure_that_was_written(
             wanted += list(dict.fromkeys(several))
             assert all(is_expression(one) == is_expression(name) for one in several)
         assert list(group.names) == wanted
-    assert read_policy(Path("p.xml"), write_policy(policy)) == policy
+    assert read_policy(Path("p.xml"), policy_xml(policy)) == policy
 
 
 def quoted(text: str) -> str:

@@ -54,7 +54,7 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.chains import Checks, chain_fault
 from sros_tool.pki.crl import load_crl, signed_by
 from sros_tool.pki.keys import load_key
-from sros_tool.policy.document import convert_policy, read_policy, write_policy
+from sros_tool.policy.document import convert_policy, policy_xml, read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.prometheus import render_metrics
 from sros_tool.report.sources import read_source
@@ -201,13 +201,13 @@ def _governance(data: bytes, place: Place) -> None:
 def _policy(data: bytes, place: Place) -> None:
     policy = read_policy(place.put("drawn.xml", data))
     policy_rights(policy)
-    write_policy(policy)
+    policy_xml(policy)
     load_rights(place.folder / "drawn.xml")
 
 
 def _earlier_policy(data: bytes, place: Place) -> None:
     converted = convert_policy(place.put("drawn.xml", data)).policy
-    written = place.put("converted.xml", write_policy(converted))
+    written = place.put("converted.xml", policy_xml(converted))
     assert policy_rights(read_policy(written)) == policy_rights(converted)
 
 
@@ -243,7 +243,7 @@ def _zenoh(data: bytes, place: Place) -> None:
     document = parse_configuration(data, "drawn", [("scouting/multicast", "{enabled:true}")])
     for each in document_findings(document):
         str(each)
-    write_policy(policy_of(rights_behind(document)))
+    policy_xml(policy_of(rights_behind(document)))
 
 
 def _rotation(data: bytes, place: Place) -> None:

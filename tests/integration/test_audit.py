@@ -17,7 +17,7 @@ from sros_tool.files import policies_dir
 from sros_tool.graph.observation import observation_from_json
 from sros_tool.keystore.participant import JoinContext
 from sros_tool.keystore.template import load_template
-from sros_tool.policy.document import read_policy, write_policy
+from sros_tool.policy.document import policy_xml, read_policy
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.translate import governance_for
@@ -60,8 +60,8 @@ def poorer(policy: Policy) -> Policy:
 @sometimes("missing rights of a live robot")
 def test_ten_missing_rights_of_a_live_robot_are_found_and_added(tmp_path: Path) -> None:
     full = read_policy(policies_dir() / "mobile_robot.xml")
-    (tmp_path / "full.xml").write_bytes(write_policy(full))
-    (tmp_path / "robot.xml").write_bytes(write_policy(poorer(full)))
+    (tmp_path / "full.xml").write_bytes(policy_xml(full))
+    (tmp_path / "robot.xml").write_bytes(policy_xml(poorer(full)))
     robot = [process(UNSHOWN, *nodes_of(each)) for each in full.enclaves]
     denied = [f"denied: {path} {right} " for path, right, _ in TEN]
     command = "audit robot.xml --watch --vendor fastdds --patch add.xml --json"

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 
-from sros_tool.policy.document import read_policy, write_policy
+from sros_tool.policy.document import policy_xml, read_policy
 from sros_tool.policy.merge import merge_all, merge_into, merge_notes, plan_merge
 from sros_tool.policy.model import (
     ALLOW,
@@ -36,7 +36,7 @@ def group(kind: str, names: str, **rights: str) -> Group:
 def merged(first: Policy, second: Policy) -> Policy:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "a.xml")
-        path.write_bytes(write_policy(first))
+        path.write_bytes(policy_xml(first))
         result = merge_into(path, second)
         path.write_bytes(result.document)
         again = merge_into(path, second)
@@ -151,6 +151,6 @@ def test_a_denied_action_is_told_as_one() -> None:
 
 def test_several_policies_one_after_the_other(tmp_path: Path) -> None:
     path = tmp_path / "a.xml"
-    path.write_bytes(write_policy(one(TOPICS)))
+    path.write_bytes(policy_xml(one(TOPICS)))
     more = [one(group("topics", name, publish="ALLOW")) for name in ("/y", "/z", "/y")]
     assert [right.name for right in merge_all(path, more).added] == ["/y", "/z"]

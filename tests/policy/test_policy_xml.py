@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from lxml import etree
 
 from sros_tool.errors import DocumentError, PolicyError
-from sros_tool.policy.document import read_policy, write_policy
+from sros_tool.policy.document import policy_xml, read_policy
 from sros_tool.policy.model import RIGHTS, Enclave, Group, Policy, Profile, Profiles, Qualifier
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import policy_rights
@@ -81,13 +81,13 @@ SCHEMA = etree.XMLSchema(
 
 @given(policies)
 def test_a_policy_reads_back(policy: Policy) -> None:
-    document = write_policy(policy)
+    document = policy_xml(policy)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "policy.xml")
         path.write_bytes(document)
         again = read_policy(path)
     assert again == policy
-    assert write_policy(again) == document
+    assert policy_xml(again) == document
     SCHEMA.assertValid(etree.fromstring(document))
 
 

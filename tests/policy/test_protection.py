@@ -11,7 +11,7 @@ from lxml import etree
 from sros_tool.errors import PolicyError
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet, Robot
-from sros_tool.policy.document import read_policy, write_policy
+from sros_tool.policy.document import policy_xml, read_policy
 from sros_tool.policy.merge import merge_into
 from sros_tool.policy.minimize import minimize
 from sros_tool.policy.model import ALLOW, Policy, stated_protections
@@ -59,14 +59,14 @@ def test_it_is_read_with_its_line_and_written_again() -> None:
     lines = WRITTEN.splitlines()
     for each in stated_protections(given.enclaves):
         assert each.name.removeprefix("/").removeprefix("n/") in lines[each.source.line - 1]
-    assert read(write_policy(given).decode()) == given
+    assert read(policy_xml(given).decode()) == given
     assert given != read(WRITTEN.replace(SIGN, ENCRYPT)) != read(WRITTEN.replace(SIGN, ""))
 
 
 def test_the_schema_and_readers_of_ros2_are_not_disturbed() -> None:
     root = Path(__file__).parents[1] / "schemas"
     schema = etree.XMLSchema(etree.parse(root / "policy.xsd"))
-    for text in (WRITTEN.encode(), write_policy(read(WRITTEN))):
+    for text in (WRITTEN.encode(), policy_xml(read(WRITTEN))):
         document = etree.fromstring(text)
         assert schema.validate(document), schema.error_log
         # The string value of an element, which XSLT uses, has no processing instructions in it.
@@ -172,7 +172,7 @@ def test_a_narrowed_policy_demands_the_same_of_the_names_that_are_left() -> None
         Right("/b", ALLOW, "subscribe", "/camera/front"),
     ]
     narrow = minimize(given, observed).policy
-    assert read(write_policy(narrow).decode()) == narrow
+    assert read(policy_xml(narrow).decode()) == narrow
     assert sorted(said(narrow)) == [
         "/a topic /camera/front encrypt",
         "/b topic /camera/front encrypt",

@@ -38,7 +38,7 @@ from sros_tool.errors import PolicyError
 from sros_tool.keystore.template import load_template, render_template
 from sros_tool.names import SERVICE_ENDS, dds_names
 from sros_tool.pki import smime
-from sros_tool.policy.document import write_policy
+from sros_tool.policy.document import policy_xml
 from sros_tool.policy.model import (
     ALLOW,
     RIGHTS,
@@ -311,7 +311,7 @@ def write(drawn: Drawn, folder: Path) -> tuple[Path, Path | None]:
     folder.mkdir()
     if drawn.kind == "policy":
         path = folder / "policy.xml"
-        path.write_bytes(write_policy(drawn.policy))
+        path.write_bytes(policy_xml(drawn.policy))
         if drawn.robots is None:
             return path, None
         (folder / "fleet.toml").write_text(_fleet(drawn.robots))

@@ -47,10 +47,10 @@ from sros_tool.checks.keystores.vendors import (
     REFUSED,
     SOME_REFUSE,
     asked_vendors,
-    check_starting,
     check_vendors,
     evaluate,
     with_causes,
+    with_start_finding,
 )
 from sros_tool.checks.kind import WARNING, Cause, Finding, names_text
 from sros_tool.dds.decision.vendors import TESTED, ZENOH, Vendor
@@ -167,7 +167,7 @@ def keystore_findings(
                 shared = [] if any(finding.kind is DIFFERS for finding in own) else about_governance
                 own += check_vendors(evaluation, [*about_authorities, *shared, *own])
             if not on_robot and name not in wanted:  # a policy knows more exactly of its nodes
-                own = check_starting(evaluation, own)
+                own = with_start_finding(evaluation, own)
             found += own
             if each := summary_of(enclave):
                 issued.append(each)

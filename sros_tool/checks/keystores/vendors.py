@@ -438,7 +438,7 @@ class _Denial(NamedTuple):
         return finding.kind is PARTITIONS and bool(self.partition)
 
 
-def check_starting(
+def with_start_finding(
     evaluation: EnclaveEvaluation, known_findings: Sequence[Finding]
 ) -> list[Finding]:
     """Return the findings, plus an error if no vendor lets an ordinary node start in the enclave.

@@ -434,7 +434,11 @@ class _FilesOfChange:
         before, after = self.content(CRL), self.content_after(CRL)
         ledger = self._keystore.ledger_file
         recorded = ledger.recorded_enclaves()
-        if recorded is None or not before or _form_of_list(before) != _form_of_list(after):
+        if (
+            recorded is None
+            or not before
+            or _refusable_parts_of_crl(before) != _refusable_parts_of_crl(after)
+        ):
             return None
         added = [f"{serial:x}" for serial in _listed_serials(after) - _listed_serials(before)]
         entries = ledger.with_values("serial", added).entries
@@ -444,7 +448,7 @@ class _FilesOfChange:
         return listed | ({kept} if kept else set())
 
     def was_revoked(self, name: str) -> bool:
-        """Return whether the enclave's old and new certificate were both revoked before."""
+        """Return whether the enclave keeps a certificate that was revoked before this change."""
         path = f"{enclave_folder(name)}/{CERTIFICATE_FILE}"
         if not self._revoked_serials or self.transaction.is_staged(path):
             return False
@@ -562,7 +566,7 @@ def _listed_serials(crl: bytes) -> frozenset[int]:
         return frozenset()
 
 
-def _form_of_list(crl: bytes) -> tuple[object, ...] | None:
+def _refusable_parts_of_crl(crl: bytes) -> tuple[object, ...] | None:
     """Return the parts of a revocation list that a vendor could refuse; None if unreadable."""
     try:
         read = read_list(crl, "")

@@ -218,7 +218,7 @@ def restore_revocations(
         change.finish(command="revoke", revoked_before=revoked)
     if unknown:
         change.notes.append(_unknown_note(change, unknown))
-    replaced = _replaced_enclaves(change, revoked, {key for _, key in replaced_keys}, gone)
+    replaced = _key_revoked_by_enclave(change, revoked, {key for _, key in replaced_keys}, gone)
     change.notes += _replaced_notes(root, replaced)
     outcomes = dict.fromkeys(again, "revoked") | dict.fromkeys(replaced, "replaced")
     return change.result(Changed, outcomes=outcomes)
@@ -236,15 +236,15 @@ def _replaced_keys(
     return {of for of in replaced - kept if of[1]}
 
 
-def _replaced_enclaves(
-    change: KeystoreChange, revoked: Container[int], keys: Container[str], gone: Container[str]
+def _key_revoked_by_enclave(
+    change: KeystoreChange, revoked: Container[int], keys: Container[str], removed: Container[str]
 ) -> dict[str, bool]:
-    """Map enclaves whose certificates are ``revoked`` to whether their keys are, too."""
+    """Map the other enclaves with a ``revoked`` certificate to whether their key is revoked."""
     replaced = {}
     for name in change.names:
         with suppress(SrosError):  # of an enclave without a certificate
             certificate = change.keystore.certificate_of(name)
-            if name not in gone and certificate.serial_number in revoked:
+            if name not in removed and certificate.serial_number in revoked:
                 key = key_digest(certificate.public_key())  # type: ignore[arg-type]
                 replaced[name] = key in keys or change.known.is_revoked(key)
     return replaced

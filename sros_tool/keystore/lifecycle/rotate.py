@@ -465,15 +465,15 @@ class _Rotator:
         )
         for successor in successors:
             if validity is None:
-                self._note_earlier(successor.old[0], successor.new.certificate)
+                self._note_earlier_expiry(successor.old[0], successor.new.certificate)
             self._change.entries.append(
                 certificate_entry(self._change.now, "ca", successor.new.certificate)
             )
         self.replacements = [successor.replacement() for successor in successors]
         return successors
 
-    def _note_earlier(self, old: x509.Certificate, new: x509.Certificate) -> None:
-        """Add a note if a new CA expires before the old CA because the settings say so.
+    def _note_earlier_expiry(self, old: x509.Certificate, new: x509.Certificate) -> None:
+        """Add a note if the settings make a new CA expire before the old CA.
 
         Raises:
             UsageError: it expires earlier, and the keystore has no settings, so nobody chose that.
