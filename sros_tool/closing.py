@@ -236,7 +236,7 @@ class ObservedProcesses(NamedTuple):
     domain: int
     """The ROS domain."""
     processes: Sequence[ClosedProcess] = ()
-    """The processes with an enclave each."""
+    """The processes, each with the enclave that it will run in."""
     unknown: Sequence[str] = ()
     """Processes on this machine whose nodes are not known; they are not closed."""
     elsewhere: Sequence[str] = ()
@@ -756,9 +756,11 @@ class OpenRobot:
         """
         if self.export.exists() and not self.keystore.exists():
             raise UsageError(
-                f"the keystore '{self.keystore}' is not there, and '{self.export}' comes from it",
+                f"the keystore '{self.keystore}' is not there, and '{self.export}' was exported "
+                "from it",
                 "A new keystore would have other CAs.",
-                "Bring it back to change the robot; --proof and --undo need only the export.",
+                "Bring the keystore back to change the robot; --proof and --undo need only the "
+                "export.",
             )
         own = (self.seen, self.policy, self.keystore, self.export)
         if self.folder.is_dir() and [*self.folder.iterdir()] and not any(map(Path.exists, own)):
@@ -924,7 +926,7 @@ class OpenRobot:
                 f"{' and '.join(secured)}, so this shell does not see an open robot",
                 "sros looks for open nodes with an observer that is open itself.",
                 "Unset the variables in this message, for example with `env -u NAME sros close "
-                "...`; if it names a file in this folder, run sros in another folder.",
+                "...`; if the message names a file in this folder, run sros in another folder.",
             )
 
     def _check_open(self) -> None:
@@ -1007,7 +1009,7 @@ class OpenRobot:
         write(draft(self.seen_again, learn(make_observation(nodes), common), common))
 
     def _shared_program_texts(self) -> Iterator[str]:
-        """Yield which programs start processes of several enclaves, and so would put all in one."""
+        """Yield a text for each program whose processes would all run in one enclave."""
         observed = (self.observed or ObservedProcesses(self.domain)).within(
             read_policy(self.policy)
         )
@@ -1028,7 +1030,7 @@ class OpenRobot:
                 )
 
     def _shared_node_texts(self) -> Iterator[str]:
-        """Yield which processes share names of nodes, and so would share one enclave."""
+        """Yield a text for processes with nodes of the same name, which would share an enclave."""
         by_enclave: dict[str, list[ClosedProcess]] = {}
         for process in self.observed.processes if self.observed else ():
             by_enclave.setdefault(process.enclave, []).append(process)

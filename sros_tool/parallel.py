@@ -202,6 +202,13 @@ def _die_with(parent: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets SIGINT, too, and kills workers
 
 
+def _end_text(exit_code: int) -> str:
+    """Return how a worker ended; an ``exit_code`` below 0 is a signal."""
+    if exit_code >= 0:
+        return f"It exited with status {exit_code}."
+    return f"It was killed by signal {-exit_code}; perhaps there was too little memory."
+
+
 def _collect(worker: int, pipe: int) -> Result:  # type: ignore[type-var]
     """Wait for a worker, and return its result or raise its error."""
     with open(pipe, "rb") as stream:
@@ -210,7 +217,7 @@ def _collect(worker: int, pipe: int) -> Result:  # type: ignore[type-var]
     if not message:
         raise SrosError(
             "a worker process died",
-            f"Its wait status is {status}; perhaps there was too little memory.",
+            _end_text(os.waitstatus_to_exitcode(status)),
             "Try again.",
         )
     result = pickle.loads(message)  # noqa: S301 - from our own child, through a pipe

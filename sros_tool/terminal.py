@@ -105,7 +105,7 @@ def echo_bytes(data: bytes) -> None:
 def redraw(text: str) -> None:
     """Replace the current line of the terminal on standard error; "" erases it.
 
-    It goes to the terminal itself: a signal may come while the stream's buffer is in use.
+    The text does not go through the buffer of the stream, which may be in use when a signal comes.
     """
     os.write(sys.stderr.fileno(), f"\r\x1b[K{visible_line(text)}".encode())
 

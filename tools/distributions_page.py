@@ -40,8 +40,8 @@ def distributions_page() -> str:
         shipped,
         "The versions are the latest as of November 2026; sros assumes that patches of a release "
         "decide alike. For a release that is *not tested*, sros uses the rules of another "
-        "release, and does not see how the two differ.",
-        "The rules in which two tested releases differ:",
+        "release, and does not see how the two releases differ.",
+        "Rules that are not the same in all tested releases:",
         table_text("rule", "where it holds", rows=_rules()),
         "What an update changes is reported as:",
         table_text("finding", "severity", "what it says", rows=_findings()),

@@ -275,7 +275,10 @@ def _number(target: TargetFile | None, source: str, robot: str) -> int:
         )
     number = target.custom.get("number") if isinstance(target.custom, dict) else None
     if not isinstance(number, int) or number < 1:
-        raise FetchError(FetchProblem.NOT_SIGNED, f"the metadata of {robot} states no number")
+        raise FetchError(
+            FetchProblem.NOT_SIGNED,
+            f"the metadata of robot {robot} does not state the number of its release",
+        )
     return number
 
 

@@ -194,8 +194,8 @@ def _check_release(
         raise KeystoreError(
             f"'{folder}' trusts no permissions CA yet",
             "Nothing here shows whether the release comes from your keystore.",
-            "Bring the first enclave with `sros import` or a play, or name the permissions CA with "
-            "`sros agent init --ca`.",
+            "Bring the first enclave with `sros import` or an Ansible play, or name the "
+            "permissions CA with `sros agent init --ca`.",
         )
     if release.number < installed:
         raise KeystoreError(
@@ -339,7 +339,7 @@ def _change(
 
 
 def _check_not_older(folder: Folder, place: str, sent: OpenedEnclave, now: datetime) -> None:
-    """Raise `KeystoreError` if the enclave has newer files, which a play or `sros import` brought.
+    """Raise `KeystoreError` if the enclave has newer files, from `sros import` or an Ansible play.
 
     Only files that a process could load count: the owner of the folder can write anything into it.
     """
@@ -400,8 +400,8 @@ def _present_key(folder: Folder, name: str, files: Mapping[str, bytes]) -> Publi
     raise KeystoreError(
         f"the key of enclave {name} {KEY_NOT_HERE}",
         "",
-        "Bring the key once, with `sros distribute_key` or a play, or make one here with "
-        "`sros create_request`.",
+        "Bring the key once, with `sros distribute_key` or an Ansible play, or make one here "
+        "with `sros create_request`.",
     )
 
 

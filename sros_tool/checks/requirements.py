@@ -57,7 +57,7 @@ NOT_CROSSING = FindingKind(
 OF_EXPORT = FindingKind(
     "requirement.of-export",
     NOTE,
-    "requirements that were decided for the enclaves of an export only",
+    "requirements that were checked for the enclaves of an export only",
     "An export may lack enclaves of its keystore. A laptop or another computer can have an enclave "
     "that breaks a requirement.",
     "The requirements file.",
@@ -67,7 +67,7 @@ OF_EXPORT = FindingKind(
 NOT_ON_ZENOH = FindingKind(
     "requirement.not-on-zenoh",
     NOTE,
-    "requirements were not decided for Zenoh",
+    "requirements were not checked for Zenoh",
     "The policy cannot be translated to Zenoh, so its access on Zenoh is not known.",
     "zenoh.io, Access Control.",
     "Ignore this if the robot uses DDS.",

@@ -130,8 +130,8 @@ def _init(
 ) -> None:
     """Set up the agent of the security folder FOLDER, in FOLDER/.agent/agent.toml.
 
-    FOLDER is where `sros import` or a play installs this robot's enclaves. The agent runs as the
-    owner of FOLDER. Compare the printed SHA-256 of the root metadata with the SHA-256 that
+    FOLDER is where `sros import` or an Ansible play installs this robot's enclaves. The agent runs
+    as the owner of FOLDER. Compare the printed SHA-256 of the root metadata with the SHA-256 that
     `sros fleet publish` printed.
 
     Example:
@@ -169,8 +169,9 @@ def _init(
         raise UsageError(
             f"'{folder}' has no permissions CA, so this robot could trust no release",
             "No enclave is there that was delivered.",
-            "Bring the enclaves of this robot first, with `sros distribute_key` or a play; or, if "
-            "their keys were made here by `sros create_request`, name the CA with --ca.",
+            "Bring the enclaves of this robot first, with `sros distribute_key` or an Ansible "
+            "play; or, if their keys were made here by `sros create_request`, name the CA with "
+            "--ca.",
         )
     settings = AgentSettings(
         robot,
@@ -242,12 +243,12 @@ def _unit(text: str) -> Unit:
 )  # fmt: skip
 @json_option
 def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool) -> int:
-    """Fetch and install the robot's releases in FOLDER, and confirm its files and processes.
+    """Install the robot's releases in FOLDER, and report which files and processes the robot has.
 
     A round fetches the robot's release, verifies it, installs it whole or not at all, restarts
     units or reports the restarts that are due, checks the running processes, asks for renewal in
-    the last third of a certificate's validity, and sends a signed message. If one step fails, the
-    others still run, and the next round tries it again.
+    the last third of a certificate's validity, and sends a signed report to the keystore machine.
+    If one step fails, the others still run, and the next round tries the failed step again.
 
     Example:
       $ sros agent run /etc/sros/keystore --once

@@ -104,7 +104,7 @@ def audit(
     Example:
       $ sros audit robot.xml
       /talker publish topic /status (/talker): no rule allows publish rt/status
-      1 right would be denied of 2 nodes with 47 endpoints, on Fast DDS 2.14
+      1 right would be denied to 2 nodes with 47 endpoints, on Fast DDS 2.14
       to allow what is denied, add --patch missing.xml to this command: ...
       $ sros audit robot.xml --watch 1h --patch missing.xml
       watching for 3600 s, or until Ctrl-C; then the result is shown
@@ -115,8 +115,8 @@ def audit(
       $ sros audit keystore --distro lyrical
 
     Exit status: 0 if nothing would be denied and every node of POLICY or KEYSTORE was seen; 1 if
-    something would be denied, or if a node was not seen, something could not be judged or the graph
-    kept changing (--partial accepts these three); 2 if the audit could not be done.
+    something would be denied; also 1, unless --partial is given, if a node was not seen, something
+    could not be judged, or the graph kept changing; 2 if the audit could not be done.
     """
     from sros_tool.explain import audit as audits
     from sros_tool.fleet.fleet_file import read_fleet
@@ -262,7 +262,7 @@ def _show(audited: Audit, enclaves: AuditedEnclaves, changing_seconds: float) ->
         echo(line)
     what = [counted(len(audited.denied), "right")] if audited.denied else []
     what += [counted(len(audited.refused), "whole enclave")] if audited.refused else []
-    verdict = f"{' and '.join(what) or 'nothing'} would be denied of "
+    verdict = f"{' and '.join(what) or 'nothing'} would be denied to "
     verdict += f"{counted(len(audited.observation.nodes), 'node')} with "
     verdict += (
         f"{counted(audited.observation.endpoint_count, 'endpoint')}, on {enclaves.vendor.title}"

@@ -120,10 +120,10 @@ def _report(folder: Path, robot: str) -> None:
     """On a robot, print a report of its enclaves' files and its DDS, for `fleet confirm`.
 
     The report is JSON. It has the time, the SHA-256 of each file of the enclaves in DIR except
-    their keys, and the DDS libraries that processes have loaded or that are installed. As
-    problems, it names enclaves in which no process could start, for example because the key does
-    not fit the certificate, and files that other users can read or change. docs/json.md describes
-    the report under "confirmation".
+    their keys, and the DDS libraries that processes have loaded or that are installed. Its
+    problems are enclaves in which no process could start, for example because the key does not fit
+    the certificate, and files that other users can read or change. docs/json.md describes the
+    report under "confirmation".
 
     Example:
       $ ssh r7 sros fleet report /etc/sros/keystore --robot r7 |
@@ -572,9 +572,10 @@ def _status(
     published is shown even if its files are current. The last line counts the known vulnerabilities
     of the robots' DDS, by the advisories of sros; --robot and --advisories list them.
 
-    sros counts the revocation list as in force on a robot that has the list and reports that no
-    restart is due. A robot does not report which earlier files a process has loaded. So after any
-    change of files, sros counts the list as in force only once the processes were restarted.
+    sros counts the revocation list as in force on a robot if the robot has the list, and its
+    confirmation says that no restart is due. A robot does not report which earlier files a process
+    has loaded. So after any change of files, sros counts the list as in force only once the
+    processes were restarted.
 
     Example:
       $ sros fleet status keystore

@@ -579,9 +579,9 @@ def _use_lines(enclave: MinimizedEnclave) -> Iterator[str]:
     yield f"  permissions.p7s: {sizes.before} bytes{then}, of at most {sizes.limit - 1}{too_large}"
     for proposal in enclave.proposals:
         names = [right.describe() for right in proposal.adds]
-        adds = first_few(names, _SHOWN) or "no name known here"
+        adds = first_few(names, _SHOWN) or "no other known name"
         yield f"    {proposal.rule.describe()}  in place of {len(proposal.replaces)} names"
-        yield f"      would save {proposal.saves} bytes and add {adds}"
+        yield f"      this rule saves {proposal.saves} bytes, and also allows {adds}"
 
 
 def _as_written(value: Any) -> Any:

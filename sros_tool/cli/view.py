@@ -51,10 +51,10 @@ class _SeveralObserved(SeveralValues):
     several = ("--observed", "--focus")
 
 
-def _complete_focus(
+def _focus_completions(
     ctx: click.Context, _parameter: click.Parameter, incomplete: str
 ) -> list[CompletionItem | str]:
-    """Complete the names and enclaves in the rights of the first SOURCE, if it can be read."""
+    """Return the names and enclaves of the first SOURCE that begin with ``incomplete``."""
     from sros_tool.keystore.rights import load_rights
 
     given = ctx.params.get("sources") or ctx.args
@@ -106,7 +106,7 @@ def _complete_focus(
     metavar="NAME...",
     help="Draw only the enclaves and names that can influence this topic, service, action "
     "or enclave, or be influenced by it.",
-    shell_complete=_complete_focus,
+    shell_complete=_focus_completions,
 )
 @click.option(
     "--hops",

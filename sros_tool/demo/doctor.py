@@ -155,9 +155,9 @@ class SecurityProvider:
     """The Python package whose `ros2 security` runs, and the packages that it hides."""
 
     provider: str
-    """The package whose command runs; ``sros_tool`` and ``sros_ros2_security`` are sros."""
+    """The package whose command runs; ``sros_tool`` and ``sros_ros2_security`` belong to sros."""
     hidden: tuple[str, ...]
-    """Other packages with the command; theirs does not run."""
+    """Other packages with this command, whose command does not run."""
 
     @property
     def ours(self) -> bool:

@@ -609,7 +609,7 @@ class _Examiner:
         )
 
     def _for_export(self, text: str) -> str:
-        """Return a remedy with the export in its commands, except those that need the CA keys."""
+        """Return a remedy with this export as KEYSTORE of the commands that need no CA keys."""
         parts = _COMMAND.split(text)
         named = [
             part if NEEDS_CA_KEYS.match(part) else _with_name(part, "KEYSTORE", self._root)

@@ -386,7 +386,7 @@ class WhoByVendor(NamedTuple):
     enclaves: Sequence[VendorOutcome]
     """All enclaves, with the decision for each."""
     export: bool = False
-    """Whether an export was asked, which may lack enclaves of its keystore."""
+    """Whether the question was about an export, which may lack enclaves of its keystore."""
 
     @property
     def anybody(self) -> bool:

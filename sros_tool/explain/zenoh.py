@@ -258,7 +258,7 @@ class WhoOnZenoh(NamedTuple):
     enclaves: Sequence[ZenohEnclaveOutcome]
     """All enclaves; the enclave of the router may do whatever passes through the router."""
     export: bool = False
-    """Whether an export was asked, which may lack enclaves of its keystore."""
+    """Whether the question was about an export, which may lack enclaves of its keystore."""
 
 
 class ZenohEvaluator:

@@ -163,7 +163,7 @@ class _Raising:
         other = self._named[self._owner[topic]]
         return PolicyError(
             f'{protection.source}: {protection} has protect="{protection.word}", but the '
-            f"settings of the keystore have their own protection for {other}",
+            f"settings of the keystore already protect {other}",
             "Some names match both wildcards, and it is unclear which of the two decides.",
             "In the policy, protect names that only one of the wildcards matches, or change the "
             "settings: `sros update_keystore --help` describes --rule and --drop-rule.",

@@ -53,10 +53,9 @@ _SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """A right that one policy allows and the other denies, completely or in part.
+    """A right that the policy file allows and a merged policy denies, or the reverse.
 
-    The denial always wins.  With ``new``, the merge adds the denial to a file that allows the
-    right; otherwise the file has the denial, and the merge requests the right.
+    The right may be denied in part.  The denial always decides.
     """
 
     denied: Right
@@ -64,7 +63,7 @@ class Contradiction:
     allowed: Right
     """The rule that allows the right."""
     new: bool
-    """Whether the merge adds the denial to the policy file."""
+    """Whether the merge adds the denial to the policy file; otherwise the file already has it."""
 
 
 @dataclass(frozen=True, slots=True)

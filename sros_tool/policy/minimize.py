@@ -406,7 +406,9 @@ def _narrowed_enclave(
 def _profile(
     path: str, profile: Profile, kept_rights: Set[Right], pending: dict[Right, Sequence[Right]]
 ) -> Profile:
-    """Return the narrowed profile, and remove the replacements that it states from ``pending``."""
+    """Return the profile with its denials, ``kept_rights`` and the replacements of other rights.
+
+    ``pending`` maps rights to their replacements.  Those of this profile are removed from it."""
     said: dict[tuple[str, str, Level | None], dict[tuple[str, Qualifier], None]] = {}
     for group in profile.groups:
         level = group.protect

@@ -449,7 +449,8 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "the governance of the peer protects the topic differently: the processes have enclaves "
         "of different keystores, or one was started before the governance changed",
         "`sros check KEYSTORE OTHER`, with the keystore or export of the peer, names the topic. "
-        "Export the enclaves of both again from one keystore, and restart both.", vagueness=1,
+        "Export the enclaves of both processes again, from the same keystore, and restart both "
+        "processes.", vagueness=1,
     ),
     # ── Fast DDS, starting ─────────────────────────────────────────────────────────────────
     _log_text(

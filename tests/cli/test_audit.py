@@ -39,7 +39,7 @@ def test_nothing_would_be_denied(program: Program, tmp_path: Path) -> None:
     (tmp_path / "hall.xml").write_text(POLICY.replace('"/t"', '"/l"').replace("talker", "listener"))
     both = graph(FINE, ("/", "/", "listener", "02", ["publish rt/chatter"]))
     ended = program(both, "robot.xml", "hall.xml", *SHORT)
-    summary = "nothing would be denied of 2 nodes with 2 endpoints, on Fast DDS 2.14\n"
+    summary = "nothing would be denied to 2 nodes with 2 endpoints, on Fast DDS 2.14\n"
     assert ended == Ended(0, "", summary)
 
 
@@ -51,7 +51,7 @@ TO_ALLOW = (
 
 def test_something_would_be_denied_and_nothing_is_written(program: Program, tmp_path: Path) -> None:
     ended = program(graph(LOUD), "robot.xml", *SHORT)
-    summary = "1 right would be denied of 1 node with 2 endpoints, on Fast DDS 2.14\n"
+    summary = "1 right would be denied to 1 node with 2 endpoints, on Fast DDS 2.14\n"
     assert (ended.status, ended.out) == (1, DENIED)
     assert ended.err == f"{summary}{TO_ALLOW}\n"
     assert [each.name for each in tmp_path.iterdir()] == ["robot.xml"]
@@ -65,20 +65,20 @@ TWO = POLICY.replace("</profiles>", '<profile ns="/hall" node="listener"></profi
     [
         (
             (FINE,), (), 1, "not seen: node /hall/listener of enclave /t\n",
-            "only 1 of 2 nodes of the policy was seen: nothing would be denied of 1 node",
+            "only 1 of 2 nodes of the policy was seen: nothing would be denied to 1 node",
         ),
         (
             (FINE,), ("--partial",), 0, "not seen: node /hall/listener of enclave /t\n",
-            "only 1 of 2 nodes of the policy was seen: nothing would be denied of 1 node",
+            "only 1 of 2 nodes of the policy was seen: nothing would be denied to 1 node",
         ),
         (
             (LOUD,), ("--partial",), 1, DENIED + "not seen: node /hall/listener of enclave /t\n",
-            "only 1 of 2 nodes of the policy was seen: 1 right would be denied of 1 node",
+            "only 1 of 2 nodes of the policy was seen: 1 right would be denied to 1 node",
         ),
         (
             (FINE, ("/", "/hall", "listener", "01", ["subscribe rt/chatter"])), (), 1,
             "/t subscribe topic /chatter (/hall/listener): no rule allows subscribe rt/chatter\n",
-            "1 right would be denied of 2 nodes",
+            "1 right would be denied to 2 nodes",
         ),
     ],
 )  # fmt: skip

@@ -125,7 +125,7 @@ def test_one_name_has_one_protection(one: str, other: str, kind: str) -> None:
 def test_settings_that_meet_a_demand_in_some_names_are_refused() -> None:
     named = (NamedProtection("topics", "/camera/*", OPEN),)
     settings = DomainProtection(rtps=Level.NONE, named=named)
-    with pytest.raises(PolicyError, match=r"have their own protection for topic /camera/\*"):
+    with pytest.raises(PolicyError, match=r"already protect topic /camera/\*"):
         with_stated(settings, [stated("/*/image", Level.ENCRYPT)])
     raised = with_stated(settings, [stated("/*", Level.ENCRYPT)])
     assert raised.named[0].protection.data is Level.ENCRYPT

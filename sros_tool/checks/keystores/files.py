@@ -204,8 +204,9 @@ HIDDEN_ENCLAVE = FindingKind(
     "DDS loads it, and a node that names it has its rights. No verb of sros lists, renews, revokes "
     "or exports it, and the check of enclaves leaves it out.",
     "rcl 9 (rcl/src/rcl/security.c) takes a folder of any name; sros keystore layout.",
-    "Remove the folder, or give the enclave a name without a dot (`sros create_enclave`). If "
-    "others had it, replace the CA (`sros rotate_ca`): its certificate stays valid.",
+    "Remove the folder. If you need the enclave, create one without a dot in its name (`sros "
+    "create_enclave`). If others had the folder, replace the CA (`sros rotate_ca`), because the "
+    "enclave's certificate stays valid.",
 )
 UNKNOWN_FILE = FindingKind(
     "keystore.unknown-file",

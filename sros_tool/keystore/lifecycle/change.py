@@ -485,7 +485,7 @@ class KeystoreChange:
 
     @property
     def moment(self) -> datetime:
-        """The time of the change, or when certificates that a CA service issued begin later."""
+        """The time of the change, or a later begin of validity of a CA service's certificates."""
         return max(
             [self.now, *(parse_iso(entry.not_before) for entry in self._entries_of_ca_service())]
         )
