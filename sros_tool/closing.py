@@ -1023,9 +1023,9 @@ class OpenRobot:
                     f"{shlex.join(processes[0].command)} starts the processes of "
                     f"{enumerated(enclaves)}, and all of them would run in one enclave; nothing "
                     f"was signed; in '{self.policy}', move their profiles into one of these "
-                    "enclaves, which then has the rights of all, and remove the others; or let the "
-                    f"program start each with the method spawn after setting {ENCLAVE} in "
-                    "os.environ, and watch again: "
+                    "enclaves, which then has the rights of all, and remove the other "
+                    "enclaves; or let the program start each process with the method spawn after "
+                    f"setting {ENCLAVE} in os.environ, and watch again: "
                     f"sros close {shlex.quote(str(self.folder))} --for 1m"
                 )
 
@@ -1106,7 +1106,7 @@ class OpenRobot:
             for enclave, of_enclave in variables.items()
         }
         services = [
-            "# Rename the services to those of your own file; give both to Docker Compose 2."
+            "# Rename the services to those of your own file; give both files to Docker Compose 2."
         ]
         for process in observed.processes:
             of_enclave = variables[observed.started_in(process)]

@@ -276,10 +276,10 @@ class Fault(Enum):
         "permissions CA issued. If that CA also issues identities, each enclave can sign rights "
         "for itself: someone with the signer's key signed this document.",
         "CVE-2023-24011; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
-        "Unless you signed it on purpose, treat the signer's key as stolen: `sros revoke {root} "
-        "{enclave}`. If one CA is for both, use separate CAs for identities and documents, as "
+        "Unless you signed the document on purpose, treat the signer's key as stolen: `sros revoke "
+        "{root} {enclave}`. If one CA is for identities and documents, use separate CAs, as "
         "keystore.one-authority says.",
-        {"governance.p7s": f"Find out who signed it. {_GOVERNANCE}"},
+        {"governance.p7s": f"Find out who signed the governance. {_GOVERNANCE}"},
     )
     GOVERNANCE_MALFORMED = (
         "governance-malformed",

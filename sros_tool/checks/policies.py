@@ -769,7 +769,7 @@ DOCUMENT_SIZE = FindingKind(
     "ros2/sros2 issue 228; Fast DDS 2.6.12, 2.9.1 (SecurityManager.cpp), 2.14.5, 3.2.5 and "
     "3.6.2, Cyclone DDS 0.10.2; tested.",
     "Remove rights that are never used, or use wildcards (`sros minimize_policy POLICY --observed "
-    "OBSERVED` shows both), or split the enclave.",
+    "OBSERVED` shows such rights and wildcards), or split the enclave.",
     vendors=tuple(vendor for vendor in FAST_DDS if vendor.traits.largest_document),
 )
 LONG_NAME = FindingKind(

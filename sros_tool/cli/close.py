@@ -289,7 +289,7 @@ def _show_undone(robot: OpenRobot, closed: Closing) -> None:
         return
     if closed.problems:
         ask = f"ask again with sros close {shlex.quote(str(robot.folder))} --undo"
-        echo(f"the robot is not open yet; next: restart these, and {ask}", err=True)
+        echo(f"the robot is not open yet; next: restart these processes, and {ask}", err=True)
     else:
         stopped = not any(process.pid for process in closed.observed.processes)
         state = "no process of the robot runs" if stopped else "the robot is open"

@@ -1075,7 +1075,7 @@ def _text_without_findings(log: str) -> str:
         f"a node ran in '{found['folder']}'. Where its peers refuse it, it often logs nothing: "
         "explain the log of the other node, too. Both logs can be empty if the CAs, a revocation "
         "list, the governance or the domains of both ends do not fit: `sros check FOLDER OTHER` "
-        "finds this in the keystores or exports of both. They can be empty if a clock is wrong: "
+        "finds this in their keystores or exports. Both can also be empty if a clock is wrong: "
         "`sros check runtime` on both machines finds a clock that is behind, `date -u` shows one "
         "that is ahead. `sros explain KEYSTORE --who publish NAME` says whether anybody may send"
     )

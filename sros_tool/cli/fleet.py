@@ -716,7 +716,7 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     restored = f"`{publish} --restored`; docs/howto/keystore_is_lost.md says what else"
     if status.edited:
         remedy = FLEET_REMEDY.replace("KEYSTORE", quote(str(status.keystore)))
-        yield f"these are perhaps not all robots: the fleet file {status.edited}. {remedy}"
+        yield f"perhaps not all robots are shown: the fleet file {status.edited}. {remedy}"
     if status.clock:
         yield f"{status.clock}: how old the confirmations are is not known. Set the clock"
     if status.older:

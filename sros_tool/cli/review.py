@@ -576,7 +576,7 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
                 parts += [title, bounded_list(map(code, lines), 6000, rest)]
             return "\n\n".join(part.rstrip("\n") for part in parts)
         case DroppedRequirements(chosen=chosen):
-            title = "### The requirements changed: these are checked as they were before"
+            title = "### Requirements that changed, checked as they were before the change"
             return f"{title}\n\n{findings(chosen)}"
         case ExpiryCheck(due=due, unreadable=unreadable):
             lines = [describe_lifetime(lifetime, request.at) for lifetime in due]

@@ -132,7 +132,7 @@ _ROTATION = (
 )
 _RIGHTS = (
     "Sign the intended permissions: `sros create_permission {root} {enclave} POLICY`; `sros renew` "
-    "refuses these, because the ledger has later permissions."
+    "refuses the present permissions, because the ledger has later ones."
 )
 _VENDOR = (
     "Write it in the form that all vendors read alike: `sros create_permission {root} {enclave} "

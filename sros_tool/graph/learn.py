@@ -510,8 +510,8 @@ _TEXTS = {
     "half-service": "left out, because only the request or the reply of these services was "
     "observed; observe again with a longer --spin-time: {}",
     "no-ros-name": "left out, because a policy cannot name topics that have no ROS name: {}",
-    "odd-name": "left out, because these are not valid ROS names; an attacker may be trying to get "
-    "a wildcard into your policy: {}",
+    "odd-name": "left out, because these names are not valid in ROS; an attacker may be trying to "
+    "get a wildcard into your policy: {}",
     "odd-node": "left out, because a policy cannot name these nodes or their enclaves: {}",
     "partial-action": "only parts of an action are used, so they are listed as "
     "topics and services: {}",

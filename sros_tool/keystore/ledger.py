@@ -665,8 +665,8 @@ class LedgerFile:
     def _new_index(self, last_part: BinaryIO, head: _Head | None) -> tuple[IndexUpdate, bool]:
         """Return the index of all lines, and whether they are the chain that ``head`` signs.
 
-        ``last_part`` is the last part.  Both are from one reading: between two, another process
-        that can write to the keystore could exchange a part.
+        ``last_part`` is the last part, from the same reading as ``head``: between two readings,
+        another process that can write to the keystore could exchange a part.
 
         Raises:
             KeystoreError: as `_every_line`.

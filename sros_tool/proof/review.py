@@ -136,7 +136,7 @@ class RightsChange:
 
 @dataclass(frozen=True, slots=True)
 class DroppedRequirements:
-    """Findings on requirements of BASE that HEAD drops or weakens, and the number of these.
+    """Findings on requirements of BASE that HEAD drops or weakens, and how many they are.
 
     Each such requirement has a finding, and a second one if HEAD breaks it.
     """

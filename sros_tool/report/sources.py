@@ -276,12 +276,11 @@ def drawn_difference(
     Args:
         first_source: the rights before.
         second_source: the rights after.
-        difference: the rights that only one of both has.
+        difference: the rights that only one source has.
         letters: the maximum length of the diagram, in characters.
         arrows: the maximum number of arrows.
 
-    Returns None if the diagram is too large, and "" if nothing differs or both are of different
-    kinds.
+    Returns None if the diagram is too large, and "" if the sources are equal or of different kinds.
     """
     if first_source.kind != second_source.kind or not difference:
         return ""
@@ -435,7 +434,7 @@ def read_source(
     ``sample`` the enclaves of a keystore that are read; None for all.
 
     Raises:
-        DocumentError: ``path`` is none of these.
+        DocumentError: ``path`` is nothing of this kind.
     """
     data = read_bytes(path, "file") if path.is_file() else b""
     if data.lstrip()[:1] == b"{" and not is_zenoh(data, path):

@@ -241,7 +241,8 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "a PEER was refused: its governance has other protection than the governance of this "
         "process. The processes have enclaves of different keystores, or one was started before "
         "the governance changed",
-        f"{_PEERS} It also shows the governance. Export the enclaves again, and restart both.",
+        f"{_PEERS} It also shows the governance. Export the enclaves again, and restart both "
+        "processes.",
     ),
     _log_text(
         "peer-unsecured", _CYCLONE, r"Non secure remote (?:reader|writer) \S+ is not allowed"

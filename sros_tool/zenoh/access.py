@@ -104,7 +104,7 @@ class AccessControl:
     """The access control of a process: rules by common name; all other processes are denied.
 
     Each common name occurs only once.  A second subject with the same name would add its rights to
-    the first; in Zenoh up to 1.5.1, a random one of both would decide.
+    the first; in Zenoh up to 1.5.1, a random one of the two subjects would decide.
     """
 
     remotes: tuple[RemoteRights, ...]
@@ -295,7 +295,7 @@ def joined_rights(name: str, rights: Iterable[RemoteRights]) -> RemoteRights:
 
 
 class RightsBetween:
-    """What processes of two enclaves may send each other directly: only what both may.
+    """What processes of two enclaves may send each other directly: only what both enclaves may.
 
     So a process that obeys its own rules never sends or receives more than its rights permit,
     whatever the other process does.
@@ -472,7 +472,7 @@ class AclSubject:
         return self.cert_common_names is not None or self.usernames is not None
 
     def overlaps(self, other: AclSubject) -> bool:
-        """Return whether a process can match both subjects, and so has the rights of both.
+        """Return whether a process can match both subjects, and so has their rights together.
 
         Two subjects with the same properties do not count: Zenoh joins their common values to one.
         """
@@ -491,7 +491,7 @@ PROPERTIES = tuple(
 
 @dataclass(frozen=True, slots=True)
 class AclPolicy:
-    """An entry of Zenoh's ``policies``: which rules apply to which subjects, both by id."""
+    """An entry of Zenoh's ``policies``: which rules apply to which subjects, by their ids."""
 
     rules: tuple[str, ...]
     subjects: tuple[str, ...]

@@ -418,8 +418,8 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     undone = robot.close("--undo", status=1)
     assert would.out == undone.out and not would.err
     assert undone.err == (
-        "the robot is not open yet; next: restart these, and ask again with sros close robot "
-        "--undo\n"
+        "the robot is not open yet; next: restart these processes, and ask again with sros close "
+        "robot --undo\n"
     )
     robot.by_hand = set()
     # Of files that are not those of the folder, nobody knows whether they are a copy of them.

@@ -383,7 +383,7 @@ def test_a_rotation_goes_on_when_every_robot_has_confirmed_its_stage(field: Fiel
 def test_a_rotation_goes_on_without_robots_if_that_is_chosen(field: Field) -> None:
     refused = field.run("rotate_ca", "ks", "--finish", status=2).err
     assert "several stages at once would cut off every robot: r1, r2, r3. " in refused
-    assert "confirm both" not in refused and "add --allow-unconfirmed" in refused
+    assert "confirm the files" not in refused and "add --allow-unconfirmed" in refused
     field.run("rotate_ca", "ks", "--next", "--identity")
     field.deliver("r1", "r3")
     words = ("rotate_ca", "ks", "--to", "reissue", "--allow-unconfirmed")
@@ -499,7 +499,7 @@ def test_a_fleet_file_that_was_edited_is_not_believed(field: Field) -> None:
     found = field.status()
     assert len(found["robots"]) == 2 and "is not the file that sros wrote" in found["edited"]
     told = field.run("fleet", "status", "ks", status=1).out
-    assert "2 robots: 2 current\nthese are perhaps not all robots: the fleet file is not" in told
+    assert "2 robots: 2 current\nperhaps not all robots are shown: the fleet file is not" in told
 
 
 def test_a_revoked_robot_of_which_only_a_copied_list_knows(field: Field) -> None:

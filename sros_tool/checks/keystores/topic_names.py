@@ -42,7 +42,7 @@ RELAY_ONLY = FindingKind(
     "permissions.relay-only",
     WARNING,
     "topics that only <relay> allows",
-    "No RMW relays data: a node publishes and subscribes, and both are denied.",
+    "No RMW relays data: a node publishes and subscribes, which the permissions deny.",
     "DDS-Security 1.1, 9.4.1.3.2.3; tested.",
     "Write the topics into <publish> or <subscribe>.",
 )

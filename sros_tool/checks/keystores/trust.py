@@ -1,4 +1,4 @@
-"""Whether the nodes of several keystores and exports communicate, by the files of both."""
+"""Whether the nodes of several keystores and exports communicate, as their files say."""
 
 from __future__ import annotations
 
@@ -70,10 +70,10 @@ PEERS_DOMAINS = FindingKind(
     "keystore.peers-domains",
     NOTE,
     "keystores or exports for different ROS domains",
-    "Nodes find each other only in one ROS domain, and these files let no node of the one join a "
-    "domain of the other.",
+    "Nodes find each other only in one ROS domain, and no node of one keystore or export may join "
+    "a domain of the other one.",
     "DDS-Security 1.1, 9.4.1.2 and 9.4.1.3; tested.",
-    "If their nodes have to communicate, name the domain of both in `sros update_keystore KEYSTORE "
+    "If their nodes have to communicate, name a common domain with `sros update_keystore KEYSTORE "
     "--domain IDS --allow-looser`, and export the enclaves again; if not, ignore this.",
     prominent=True,
 )

@@ -616,11 +616,11 @@ def _check_number(path: Path, answer: RequestAnswer, remedy: str) -> bool:
     if not old or present == answer.seal:
         return bool(old)
     if not new:
-        why = f"It has no number, the installed answer has {old}: an earlier sros made it."
+        why = f"It has no number, the installed answer has {old}: an earlier sros made this answer."
     elif new < old:
         why = f"It has the number {new}, the installed answer has {old}."
     elif new == old:
-        why = f"Both have the number {old}, so the keystore's ledger was reset in between."
+        why = f"Both answers have the number {old}, so the keystore's ledger was reset in between."
     else:
         return True
     raise KeystoreError(

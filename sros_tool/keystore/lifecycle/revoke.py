@@ -372,7 +372,7 @@ def _router_error(change: KeystoreChange, router: str) -> KeystoreError:
     other = next(n for at in count(2) if (n := f"{router}{at}") not in change.names)
     return KeystoreError(
         f"{router} is the enclave of the Zenoh router",
-        "Without a router, no node on Zenoh finds the others; and every session trusts the "
+        "Without a router, no node on Zenoh finds the other nodes; and every session trusts the "
         "router's key.",
         f"Move the router first: `sros zenoh {where} --router {other}`. Stop the router in "
         f"{router}, start one in {other}, restart the processes that the verb names, and revoke "

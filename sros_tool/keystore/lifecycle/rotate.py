@@ -235,9 +235,10 @@ def _cut_off_error(
         )
     return KeystoreError(
         f"not every robot has confirmed the stage {rotation.stage}: {names}",
-        "After the next stage, they could not communicate with the other robots.",
+        "After the next stage, these robots could not communicate with the other robots.",
         "Deliver the current files, restart processes that run with earlier files, and confirm "
-        f"both; see `sros fleet status {where}`. --allow-unconfirmed goes on without them.",
+        f"the files and the restart; see `sros fleet status {where}`. --allow-unconfirmed goes on "
+        "without these robots.",
     )
 
 

@@ -219,7 +219,7 @@ def _checked_target(root: Path, present_settings: PresentSettings, target: Templ
             )
     if not target.separate_authorities and len(Keystore(root).authority_files) > 1:
         raise UsageError(
-            "a keystore with separate CAs cannot change back to one CA for both",
+            "a keystore with separate CAs cannot change back to one CA for both purposes",
             "With one CA, every enclave can sign its own permissions (Cyclone DDS 0.10.2, Fast DDS "
             "2.9.1).",
             "Add --set authorities.layout=separate to keep separate CAs, or create another "
@@ -632,7 +632,7 @@ class _Updater:
     # ── authorities ────────────────────────────────────────────────────────────────────────
 
     def _part_authorities(self) -> None:
-        """Stage a separate file for each CA, if one file has both; DDS loads the same bytes."""
+        """Stage a separate file for each CA if one file has both CAs; DDS loads the same bytes."""
         settings, files = self._goal.settings, self._change.keystore.authority_files
         if not settings.separate_authorities or len(files) > 1:
             return
