@@ -105,17 +105,16 @@ def made(made_keystore: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "generate_artifacts -k strict -p p.xml",
         "distribute_key strict --all robot",
         "distribute_key strict --all damaged",
-        "distribute_key strict /a alone",
         "create_request /r asking",
         "sign_request ks asking/enclaves/r/request.pem -o answer.tar.gz",
         "generate_artifacts -k late -p p.xml",
         "generate_artifacts -k zenoh -p p.xml",
         "generate_artifacts -k crew -p crew.xml --fleet crew.toml",
+        "distribute_key crew /a alone",
     ):
         sros(*line.split(), cwd=folder).ok()
     (folder / "damaged/enclaves/a/cert.pem").write_text("damaged")
-    copy_of(folder / "strict", folder / "fleet")
-    (folder / "fleet/fleet.toml").write_text('enclaves = ["/{robot}"]\n[robots.a]\n[robots.b]\n')
+    copy_of(folder / "crew", folder / "fleet")
     for name in ("a", "b"):
         said = sros("fleet", "report", "alone", "--robot", name, cwd=folder).ok()
         confirmed = {**json.loads(said.out), "dds": DDS}  # not that of this machine
