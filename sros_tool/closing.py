@@ -1503,7 +1503,7 @@ class OpenRobot:
         needed = ("--requirements", str(self.requirements), "--include", "requirement.*")
         places = [self.export, *[self._rights] * bool(self._not_here)]
         status = max(self._check(str(place), *needed) for place in places)
-        reasons = {0: "all of them", 1: "one is violated", 2: "they could not be decided"}
+        reasons = {0: "all of them", 1: "one is violated", 2: "sros could not check them"}
         holds = {0: True, 1: False}.get(status)
         yield Proof("the requirements hold", holds, f"{reasons[status]}: {self.requirements}")
 

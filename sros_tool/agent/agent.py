@@ -625,7 +625,7 @@ class _Round:
 
     def _unreadable(self, name: str, error: Exception) -> None:
         text = self._refused(error) if isinstance(error, OSError) else str(error)
-        self._problems.append(f"{name} is not confirmed: {text}")
+        self._problems.append(f"the confirmation leaves out {name}: {text}")
 
     def _signed(self, confirmation: Confirmation, names: Sequence[str]) -> bytes:
         """Return the message, signed by the enclave whose certificate is valid longest.

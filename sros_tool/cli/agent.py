@@ -50,7 +50,7 @@ class _Agent(Verb, VerbGroup):
 
 @click.group("agent", cls=_Agent)
 def agent() -> None:
-    """On a robot: fetch its published releases, install them, and confirm.
+    """On a robot: fetch its published releases, install them, and report its files.
 
     Example:
       $ sros agent init /etc/sros/keystore --robot r1 --root root.json \\

@@ -247,7 +247,7 @@ def _show_end(robot: OpenRobot, closed: Closing, *, apply: bool, holds: bool) ->
         echo(f"next: sros close {folder}{' --apply' if apply else ''}", err=True)
     elif holds:
         asked = all(proof.holds for proof in closed.proofs)
-        but = "" if asked else ", except for what was not asked"
+        but = "" if asked else ", except for what was not checked"
         if missing := [name for name in closed.without if name not in closed.secured]:
             but += f", without a process of {', '.join(missing)}"
         following = f"; next: bring {folder}/keystore to another machine: it has the CA keys"
@@ -334,6 +334,6 @@ def _started_together(processes: Sequence[ClosedProcess]) -> str:
 
 
 _MOST_DENIED = 4
-_ANSWERS = {True: "yes", False: "no", None: "not asked"}
+_ANSWERS = {True: "yes", False: "no", None: "not checked"}
 _EARLIER = "with earlier files"
-_ACCEPT = "accept with --partial what could not be asked, "
+_ACCEPT = "accept with --partial what could not be checked, "

@@ -321,7 +321,7 @@ def diff_policy(
             echo("what the policies say about protection differs", err=True)
         if compared.governance_differs:
             command = f"sros diff_policy --no-new-access {quote(str(a))} {quote(str(b))}"
-            shows = f"`{command}` shows what B opens, `sros inspect` shows what each states"
+            shows = f"`{command}` shows what B opens, `sros inspect` shows each governance"
             echo(f"the governance differs: {shows}", err=True)
     print_notes((*first.notes, *second.notes))
     return 0 if not compared and first.sound and second.sound else 1

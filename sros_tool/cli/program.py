@@ -68,7 +68,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
             "deployment", "Install a signed answer on the robot.", attribute="import_verb"
         ),
         "fleet": VerbEntry("fleet", "Which files do robots have? Publish files to them."),
-        "agent": VerbEntry("agent", "On a robot: fetch published releases, install them, confirm."),
+        "agent": VerbEntry("agent", "On a robot: fetch and install releases, report the files."),
         "zenoh": VerbEntry("zenoh", "Write the files that make Zenoh enforce policies."),
     },
     "Policy": {

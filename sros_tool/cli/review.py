@@ -380,7 +380,7 @@ def _sentence(result: Review, step: ReviewStep) -> str:
             return ", ".join(clauses)
         case DroppedRequirements(count=count, chosen=chosen):
             dropped = counted(count, "requirement")
-            return f"{dropped} dropped or changed, decided as they were before: {chosen.summary()}"
+            return f"{dropped} dropped or changed, checked as before the change: {chosen.summary()}"
         case ExpiryCheck(due=due, unreadable=unreadable, lasting=count) as expiry:
             unread = f", {len(unreadable)} cannot be read" if unreadable else ""
             left_out = expiry.short_lived_text()

@@ -147,8 +147,8 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
     picture = _compared_picture(read, hosts, use=bool(drawing.observed))
     governed = [source.governance for source in read if source.governance]
     if len(governed) == 2 and governed[0] != governed[1]:
-        text = "the governance of the two differs, and that of the second one is drawn: `sros "
-        text += "inspect` shows what each states."
+        text = "the sources differ in governance, and the one of the second source is drawn: "
+        text += "`sros inspect` shows each governance."
         finding = PicturedFinding("view.governance-differs", "warning", text)
         picture = replace(picture, findings=(*picture.findings, finding))
     if len(domains := {enclave.domains for enclave in picture.enclaves} - {""}) > 1:

@@ -579,9 +579,9 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
     robot.remaining = ()
     ended = robot.close("--proof", "--partial", status=1)
     assert (
-        "not asked: everything that talked can still talk: there is nothing to audit" in ended.out
+        "not checked: everything that talked can still talk: there is nothing to audit" in ended.out
     )
-    assert "not asked: an open listener finds nothing: nor does the observer in its" in ended.out
+    assert "not checked: an open listener finds nothing: nor does the observer in its" in ended.out
     assert "accept with --partial" not in ended.err
     robot.remaining = (TALKER, LISTENER)
     robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
@@ -592,8 +592,8 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
         "policy.xml' differs from the signed permissions of /listener: `sros close robot` checks"
         in ended.err
     )
-    assert "not asked: every process was started in its enclave" in ended.out
-    assert "closed, except for what was not asked" in ended.err
+    assert "not checked: every process was started in its enclave" in ended.out
+    assert "closed, except for what was not checked" in ended.err
 
 
 # ── interrupted ────────────────────────────────────────────────────────────────────────────
