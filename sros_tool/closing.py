@@ -477,7 +477,9 @@ def assign(
 
 
 def _is_in_domain(process: Process, domain: int) -> bool:
-    return process.domain == str(domain) and not process.network
+    # A domain that rcl cannot read can be any for a program without it.
+    near = process.domain == str(domain) or not process.domain.isdecimal()
+    return near and not process.network
 
 
 def _process_text(process: Process) -> str:
@@ -849,6 +851,13 @@ class OpenRobot:
                 f"Correct {option}.",
             )
 
+    def _may_use_files(self, process: Process) -> bool:
+        """Return whether a process is of a user who can read the enclaves.
+
+        Another user's process can only claim to run in one.
+        """
+        return process.user in (0, self.export.stat().st_uid)
+
     def _with_later(
         self, observed: ObservedProcesses, running: RunningProcesses
     ) -> ObservedProcesses:
@@ -861,7 +870,7 @@ class OpenRobot:
         known |= {process.enclave for process in observed.processes}
         later = []
         for process, enclave in self._secured(running):
-            if enclave.name not in known and process.user in (0, self.export.stat().st_uid):
+            if enclave.name not in known and self._may_use_files(process):
                 command, argument = process.program[1], (ROS_ARGS, "--enclave", enclave.name)
                 if command[-3:] == argument:  # sros wrote it
                     command = command[:-3]
@@ -1362,7 +1371,10 @@ class OpenRobot:
             if not process.asks_for_security
         }
         own = [*self._secured(running, everywhere=True)]
-        secured = {enclave.name: process for process, enclave in own}
+        secured = {
+            enclave.name: process
+            for process, enclave in sorted(own, key=lambda each: self._may_use_files(each[0]))
+        }
         if self.policy.exists():
             observed = observed.within(read_policy(self.policy))
         by_hand = [*chain.from_iterable(observed.commands_by_hand(self.folder).values())]
@@ -1371,7 +1383,10 @@ class OpenRobot:
         for command in dict.fromkeys(
             process.open_command(
                 self.domain,
-                secured[process.enclave] if processes_of[process.enclave] == 1 else None,
+                secured[process.enclave]
+                if processes_of[process.enclave] == 1
+                and self._may_use_files(secured[process.enclave])
+                else None,
             )
             for process in closed
         ):
@@ -1381,7 +1396,11 @@ class OpenRobot:
                 how = f"start it open: {process.open_command(self.domain)}"
                 self._shell.say(f"{process.enclave} does not run; {how}")
         for name in sorted(secured.keys() - {process.enclave for process in observed.processes}):
-            yield f"{name} runs in an enclave, too; restart it open: {_process_text(secured[name])}"
+            guest = secured[name]
+            how = f"restart it open: {_process_text(guest)}"
+            if not self._may_use_files(guest):
+                how = f"it is {guest.label} of user {guest.user}, who cannot read its files"
+            yield f"{name} runs in an enclave, too; {how}"
         pids = {process.pid for process, _ in own}
         for other in filter(self._is_neighbour, running.processes):
             if (enclave := other.enclave) and other.pid not in pids and not other.is_daemon:
@@ -1502,7 +1521,7 @@ class OpenRobot:
             return
         needed = ("--requirements", str(self.requirements), "--include", "requirement.*")
         places = [self.export, *[self._rights] * bool(self._not_here)]
-        status = max(self._check(str(place), *needed) for place in places)
+        status = min({self._check(str(place), *needed) for place in places} - {0} or {0})
         reasons = {0: "all of them", 1: "one is violated", 2: "sros could not check them"}
         holds = {0: True, 1: False}.get(status)
         yield Proof("the requirements hold", holds, f"{reasons[status]}: {self.requirements}")
@@ -1557,6 +1576,7 @@ class OpenRobot:
             enclave.name
             for process, enclave in self._secured(running)
             if enclave.is_there
+            and self._may_use_files(process)
             and process.environment.get(STRATEGY) == "Enforce"
             and not [*newer_files(process, enclave)]
         }

@@ -627,9 +627,8 @@ def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             )
             yield statement.found(RELATIVE_GLOBAL, text, f"Write /{statement.written}.")
     own = {
-        (enclave.path, expand("~", profile.ns, profile.node))
+        enclave.path: {expand("~", profile.ns, profile.node) for profile in enclave.all_profiles()}
         for enclave in checked_policy.policy.enclaves
-        for profile in enclave.all_profiles()
     }
     for statement in checked_policy.statements:
         enclave, name = statement.right.enclave, statement.name
@@ -638,9 +637,9 @@ def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             statement.allows
             and statement.right.right == "reply"
             and service in PARAMETER_SERVICES
-            and (enclave, node) not in own
+            and not any(covers(each, node) for each in own[enclave])
         ):
-            text = f"{enclave} may serve {name}, and has no node {node}"
+            text = f"may serve {name}, and has no node {node}"
             yield statement.found(OTHER_NODES_PARAMETERS, text)
 
 

@@ -425,7 +425,8 @@ def _outcome(evaluator: Evaluator, name: str, question: Question) -> VendorOutco
     expression = answer.decision.expression or ""
     access = evaluator.access
     opened = access.topics_of_unauthenticated() if access else None
-    anybody = opened is not None and all(part.topic in opened for part in question.parts)
+    parts = question.parts
+    anybody = opened is not None and bool(parts) and all(part.topic in opened for part in parts)
     return VendorOutcome(
         name, answer.outcome, answer.reason, answer.text, expression, anybody=anybody
     )

@@ -268,8 +268,15 @@ class ZenohEvaluator:
     router, or routers that are not connected to each other: what they enforce is then unknown.
     """
 
-    def __init__(self, keystore: Keystore, *, moment: datetime, domain: int) -> None:
+    def __init__(
+        self, keystore: Keystore, *, moment: datetime, domain: int, joining: bool = False
+    ) -> None:
+        """Read the routers.
+
+        In a copy of a keystore without any keys, they count as there, except for ``joining``.
+        """
         keystore.check()
+        self._counts_keys = not (joining or keystore.has_keys)
         self.keystore = keystore
         self.root = keystore.root
         self.domain = domain
@@ -521,7 +528,7 @@ class ZenohEvaluator:
     def _is_left_out(self, problem: Problem) -> bool:
         """Return whether a copy of the keystore for others lacks the file of a problem, a key."""
         lacks_key = (problem.file, problem.fault) == (KEY_FILE, Fault.FILE_MISSING)
-        return lacks_key and not self.keystore.has_keys
+        return lacks_key and self._counts_keys
 
     def _configuration(self, path: Path) -> tuple[Mode, MessageFilter, tuple[ZenohEndpoint, ...]]:
         """Return the mode of a process, what it enforces, and where it connects or listens."""
@@ -1021,14 +1028,15 @@ def explain_on_zenoh(
         )
     stated = Evaluator(Vendor.STANDARD, enclave, context)
     question, taken = question_meant(stated, asked_enclave, question, kind)
-    evaluator = ZenohEvaluator(keystore, moment=context.at, domain=context.domain)
+    joins = question.word == "join"
+    evaluator = ZenohEvaluator(keystore, moment=context.at, domain=context.domain, joining=joins)
     answer = evaluator.answer(enclave.name, question)
     outdated = evaluator.outdated_enclaves(answer)
     by_permissions = explain(stated, question)
     notes = (
         *taken,
         *_notes(answer, by_permissions, outdated),
-        *note_on_lacking_keys(keystore),
+        *(() if joins else note_on_lacking_keys(keystore)),
     )
     what = Asked(enclave.name, question, context)
     return ZenohExplanation(what, why, answer, outdated, by_permissions, keystore.root, notes)

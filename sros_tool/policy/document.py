@@ -1152,6 +1152,7 @@ def _write_profile(
 # ── folders of policies ────────────────────────────────────────────────────────────────────
 
 
+_MOST_LEVELS = 100
 _MOST_FILES = 10_000
 _LOOKED_AT = 256 * 1024
 """Size in bytes of the largest file without the ending ``.xml`` that is searched for a policy."""
@@ -1230,6 +1231,12 @@ def _files_below(folder: Path) -> Iterator[Path]:
         raise DocumentError(f"'{error.filename}' cannot be read", str(error.strerror)) from error
 
     for parent, folders, files in os.walk(folder, onerror=fail):
+        if len(Path(parent).parts) - len(folder.parts) > _MOST_LEVELS:
+            raise DocumentError(
+                f"'{folder}' has more than {_MOST_LEVELS} levels of folders",
+                "",
+                "Name a policy in it.",
+            )
         folders[:] = sorted(name for name in folders if name != ".git")  # no file of a repository
         for each in (Path(parent, name) for name in folders):
             if each.is_symlink():

@@ -149,16 +149,29 @@ def policy_in_enclave(policy: Policy, path: str) -> Policy:
 
 
 def policy_of_nodes(policy: Policy, nodes: Collection[str]) -> Policy:
-    """Return a policy with only the profiles of the named nodes, and the enclaves that have one."""
+    """Return a policy with only the rights of the named nodes, in the enclaves that have one.
 
-    def with_nodes(enclave: Enclave) -> Enclave:
-        blocks = (
-            block._replace(profiles=tuple(p for p in block.profiles if p.node in nodes))
-            for block in enclave.profiles
+    What the enclaves deny to other nodes stays: it applies to all nodes of an enclave.
+    """
+
+    def denials(profile: Profile) -> Profile:
+        groups = (
+            replace(group, rights=tuple(pair for pair in group.rights if pair[1] is DENY))
+            for group in profile.groups
         )
-        return replace(enclave, profiles=tuple(block for block in blocks if block.profiles))
+        return replace(profile, groups=tuple(group for group in groups if group.rights))
 
-    enclaves = (enclave for enclave in map(with_nodes, policy.enclaves) if enclave.profiles)
+    def reduced(profile: Profile) -> Profile:
+        return profile if profile.node in nodes else denials(profile)
+
+    enclaves = []
+    for enclave in policy.enclaves:
+        if any(profile.node in nodes for profile in enclave.all_profiles()):
+            blocks = (
+                block._replace(profiles=tuple(p for p in map(reduced, block.profiles) if p.groups))
+                for block in enclave.profiles
+            )
+            enclaves.append(replace(enclave, profiles=tuple(b for b in blocks if b.profiles)))
     return replace(policy, enclaves=tuple(enclaves))
 
 

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable
 from functools import cache
 
 from sros_tool.files import policies_dir
-from sros_tool.names import PARAMETER_SERVICES, is_expression
+from sros_tool.names import NODE_SERVICES, PARAMETER_SERVICES, is_expression
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, Policy
+from sros_tool.policy.patterns import Names
 from sros_tool.policy.rights import Right, Rules, policy_rights, unfolded
+
+_ANY_NODE = "/*"
+"""The nodes of an enclave without a policy."""
+_WITHOUT_PARAMETERS = {"get_type_description"}
+"""The service of a node without parameters."""
 
 
 @cache
@@ -27,28 +33,46 @@ def _basics() -> Rules:
 class NodeRights:
     """Which of the rights of some enclaves are those that their own nodes need to start.
 
-    The parameter services of a node count only if the enclave may serve all of them, and no other
-    enclave may: a right to serve those of another enclave's node lets a process pose as that node.
+    The services of a node count only if the enclave may serve all of them, and no other enclave may
+    serve one of them: with such a right, a process can pose as another enclave's node.  A right to
+    serve those of nodes of any name, which an enclave without a policy has, is not compared.
     """
 
     def __init__(self, rights: Iterable[Right]) -> None:
         served: defaultdict[tuple[str, str], set[str]] = defaultdict(set)
+        enclaves: defaultdict[str, set[str]] = defaultdict(set)
         for right in unfolded(rights):
+            if (right.qualifier, right.right) != (ALLOW, "reply"):
+                continue
             node, _, service = right.name.rpartition("/")
-            if (right.qualifier, right.right) == (ALLOW, "reply") and service in PARAMETER_SERVICES:
+            if service in NODE_SERVICES:
                 served[right.enclave, node].add(service)
-        nodes = [
-            place for place, services in served.items() if len(services) == len(PARAMETER_SERVICES)
-        ]
-        enclaves = Counter(node for _, node in nodes)
+            if node != _ANY_NODE:
+                enclaves[right.name].add(right.enclave)
+        wild = Names(sorted(filter(is_expression, enclaves)))
+
+        def is_alone(enclave: str, node: str, services: set[str]) -> bool:
+            if node == _ANY_NODE:
+                return True
+            # Nodes without parameters, such as those of tf2_ros, have one name in many processes.
+            compared = PARAMETER_SERVICES if services == _WITHOUT_PARAMETERS else NODE_SERVICES
+            names = {f"{node}/{service}" for service in compared}
+            names |= {each for name in [*names] for each in wild.overlapping(name)}
+            return all(enclaves.get(name, {enclave}) <= {enclave} for name in names)
+
+        complete = (set(NODE_SERVICES), set(PARAMETER_SERVICES), _WITHOUT_PARAMETERS)
         self._own = {
-            (enclave, node) for enclave, node in nodes if is_expression(node) or enclaves[node] == 1
+            place
+            for place, services in served.items()
+            if services in complete and is_alone(*place, services)
         }
 
     def needs(self, right: Right) -> bool:
         """Return whether a right is one that the nodes of its enclave need to start."""
         node, _, service = right.name.rpartition("/")
-        if right.right == "reply" and service in PARAMETER_SERVICES:
+        if right.qualifier is not ALLOW:
+            return False
+        if right.right == "reply" and service in NODE_SERVICES:
             return (right.enclave, node) in self._own
         return _basics().cover(right._replace(enclave="/"))
 

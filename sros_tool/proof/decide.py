@@ -51,6 +51,7 @@ from sros_tool.proof.requirements import (
     Widest,
 )
 from sros_tool.proof.worlds import (
+    ANYBODY,
     Topics,
     TopicUser,
     World,
@@ -402,6 +403,10 @@ def _witness_against_at_most(
             for part in _sufficient_parts(right):
                 for met in world.side(part.writes).users_of_topics(part.topics(expression), limit):
                     holders.setdefault(met.enclave, []).append((part, met))
+            for part, met in holders.get(ANYBODY, ()):
+                # There is no limit to these processes.
+                if topic := world.use(met, part.topics(expression), limit):
+                    return Witness((_use(ANYBODY, right, part, part.topics(expression), topic),))
             if len(holders) <= most:
                 continue
             name = _shared_by(world, holders.values(), most + 1, expression, limit)
@@ -523,7 +528,8 @@ def _witness_against_not_both(
 ) -> Witness | None:
     """Return a witness with an enclave that has rights of both sets: its shortest use of each."""
     first, second = (
-        _uses_of_rights(rights, world, limit) for rights in (requirement.first, requirement.second)
+        _with_anybody(_uses_of_rights(rights, world, limit), world)
+        for rights in (requirement.first, requirement.second)
     )
     pairs = [
         (min(first[enclave], key=_use_order), min(second[enclave], key=_use_order))
@@ -533,6 +539,18 @@ def _witness_against_not_both(
         return None
     best = min(pairs, key=lambda pair: [_use_order(use) for use in pair])
     return Witness(best, tuple(pair for pair in pairs if pair is not best))
+
+
+def _with_anybody(uses: Mapping[str, Sequence[Use]], world: World) -> Mapping[str, Sequence[Use]]:
+    """Return uses in which each enclave has those of processes without an identity, too.
+
+    A process that has an enclave's files can run without them.
+    """
+    of_anybody = uses.get(ANYBODY, ())
+    if not of_anybody:
+        return uses
+    by_enclave = {name: [*uses.get(name, ()), *of_anybody] for name in world.enclaves}
+    return {**by_enclave, ANYBODY: of_anybody}
 
 
 def _witness_against_protected(
@@ -580,6 +598,8 @@ def _witness_against_apart(requirement: Apart, world: World, limit: SearchLimit)
     through = _matching_enclaves(requirement.through, world.enclaves)
     sources = sorted(_matching_enclaves(requirement.sources, world.enclaves) - through)
     targets = _matching_enclaves(requirement.targets, world.enclaves) - through
+    if sources and any(each.open_topics for each in (world, *world.elsewhere)):
+        sources.append(ANYBODY)  # their processes can run without an identity, too
     chain = _shortest_chain(world, sources, targets, through, limit)
     if not chain:
         return None
@@ -653,6 +673,8 @@ def _why_never_fails(requirement: Requirement, world: World) -> str:
     A list with the names of all present enclaves is no such reason: enclaves may be added.
     """
     count = len(world.enclaves)
+    if world.open_topics:
+        return ""
     match requirement:
         case Only(enclaves=enclaves) if any(map(is_expression, enclaves)):
             if len(_matching_enclaves(enclaves, world.enclaves)) == count:

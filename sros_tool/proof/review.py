@@ -8,6 +8,7 @@ result names what was not compared.
 from __future__ import annotations
 
 import os
+import secrets
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -109,8 +110,8 @@ class ReviewRequest:
 class AccessChange:
     """Access that HEAD allows and BASE does not.
 
-    ``undenied`` are denials that HEAD drops, of names that BASE does not allow: promises to users
-    who merge the policy with others.
+    ``undenied`` are denials that HEAD drops, of names that it does not allow either: promises to
+    users who merge the policy with others.
     """
 
     before: AccessSource
@@ -722,7 +723,7 @@ class _Review:
 
     def _compared_access(self, before: AccessSource, after: AccessSource) -> tuple[int, Content]:
         growth = compare_access(before, after)
-        stated, denied = Rules(before.rights), Rules(after.rights)
+        stated = Rules(after.rights)
         left = {right.enclave for right in after.rights}
         undenied = tuple(
             right
@@ -730,7 +731,7 @@ class _Review:
             if right.qualifier is DENY
             and right.enclave in left
             and not stated.overlaps(right._replace(qualifier=ALLOW))
-            and not denied.cover(right)
+            and not stated.cover(right)
         )
         status = _FOUND if growth or undenied else _OK
         return status, AccessChange(before, after, growth, undenied)
@@ -894,8 +895,8 @@ def _is_same_file(base: CommitFiles | None, head: CommitFiles, path: str) -> boo
     return base is not None and base.files.get(path) == head.files.get(path)
 
 
-_SOMEWHERE = "/some_namespace"
-"""A namespace that no policy uses, into which users put the nodes of a package."""
+_SOMEWHERE = f"/n{secrets.token_hex(8)}"
+"""A namespace that no policy can know, into which users put the nodes of a package."""
 
 
 def _fixed_or_moving_names(
@@ -917,11 +918,16 @@ def _fixed_or_moving_names(
         allows = placed.right.qualifier is ALLOW
         if allows and was.cover(placed.right) and not was_elsewhere.cover(moved):
             yield placed
-    places = {placed.right: placed for enclave in after for placed in placed_rights(enclave)}
+    denials = [
+        placed
+        for enclave in after
+        for placed in placed_rights(enclave)
+        if placed.right.qualifier is DENY
+    ]
     for placed, moved in chain.from_iterable(map(_moved_rights, before)):
         denies = placed.right.qualifier is DENY
         if denies and now.cover(placed.right) and not now_elsewhere.cover(moved):
-            yield places.get(placed.right, placed)
+            yield next(each for each in denials if Rules([each.right]).overlaps(placed.right))
 
 
 def _moved_rights(enclave: Enclave) -> Iterator[tuple[PlacedRight, Right]]:

@@ -451,7 +451,7 @@ class World:
     def written_by(self, enclave: str, excluded_names: NameSet) -> Written:
         """Return what an enclave may write, except ``excluded_names`` (equal in all calls)."""
         if enclave not in self._written:
-            names = self.side(True).of[enclave] - excluded_names
+            names = self.side(True).of.get(enclave, NameSet()) - excluded_names
             around = names.around()
             exact = tuple(topic for topic in around.exact if topic in names) if around else ()
             self._written[enclave] = Written(names, around, exact)
@@ -465,7 +465,7 @@ class World:
         ``written`` has to depend on the writer only.
         """
         if (writer, reader) not in self._shared:
-            both = written & self._readers.of[reader]
+            both = written & self._readers.of.get(reader, NameSet())
             crossing = self.topics_between(writer, reader)
             both = both if crossing is None else both & crossing
             valid = (both & names for names in _VALID)

@@ -132,8 +132,18 @@ class Process:
 
     @property
     def domain(self) -> str:
-        """The ROS domain that the process names, as text that is safe to print."""
-        return plain(self.environment.get(DOMAIN) or "0")
+        """The ROS domain that the process names, as a number.
+
+        rcl reads it as strtoul(3) does, such as 0x0.  What is no number is text that is safe to
+        print.
+        """
+        named = self.environment.get(DOMAIN) or "0"
+        number = re.fullmatch(r"\s*\+?(0[xX][0-9a-fA-F]+|0[0-7]*|[1-9][0-9]*)", named)
+        if number is None:
+            return plain(named)
+        digits = number[1].lower()
+        base = 16 if digits.startswith("0x") else 8 if digits.startswith("0") else 10
+        return str(int(digits, base))
 
     @property
     def rmw(self) -> str:

@@ -188,13 +188,22 @@ def test_who_may_what_counts_processes_without_an_identity(tmp_path: Path) -> No
     (tmp_path / "open.toml").write_text(f"{head}[protection]\n{OPEN_DOOR}{rest}")
     (tmp_path / "p.xml").write_text(policy_text({"/a": may("publish", "/x")}))
     rules = tmp_path / "r.toml"
-    rules.write_text('[[only]]\npublish = ["/x"]\nenclaves = ["*"]\n')
+    rules.write_text(
+        '[[only]]\npublish = ["/x"]\nenclaves = ["*"]\n'
+        '[[at_most]]\npublish = ["/x"]\nenclaves = 9\n'
+        '[[not_both]]\nfirst = { publish = ["/x"] }\nsecond = { subscribe = ["/y"] }\n'
+    )
     keystore = tmp_path / "ks"
     sros("create_keystore", keystore, "--template", tmp_path / "open.toml").ok()
     sros("generate_artifacts", "-k", keystore, "-p", tmp_path / "p.xml").ok()
     for vendor, is_open in (("cyclonedds", True), ("fastdds", False)):  # measured by the demo
         judged = sros("check", keystore, "--requirements", rules, "--vendor", vendor)
-        assert ("anybody without an identity: may publish /x" in judged.out) is is_open
+        for text in (
+            "anybody without an identity: may publish /x",
+            "/x: anybody without an identity may publish /x, but at most 9 enclaves",
+            "/a: may publish /x and subscribe /y",
+        ):
+            assert (text in judged.out) is is_open, judged
         assert ("allow_unauthenticated_participants=false" in judged.out) is is_open
         who = sros("explain", keystore, "--who", "publish", "/nobodys", "--vendor", vendor)
         assert (who.status, "[explain.anybody]" in who.err) == (

@@ -240,5 +240,14 @@ def test_parameter_services_of_other_nodes_are_no_rights_that_every_node_needs(
             "/gripper": group("services", "reply", "/camera/set_parameters"),
         },
     )
-    beyond = [(edge.enclave, edge.name) for edge in compose(source).edges if not edge.common]
-    assert beyond == [("/gripper", "/camera/set_parameters")]
+    every = {(enclave, name) for enclave in ("/camera",) for name in own}
+    beyond = {(edge.enclave, edge.name) for edge in compose(source).edges if not edge.common}
+    assert beyond == every | {("/gripper", "/camera/set_parameters")}
+    posing = {
+        "/camera": group("services", "reply", *own),
+        "/bad": group("services", "reply", "/cam*"),
+    }
+    edges_of = compose(source_of(tmp_path, posing)).edges
+    assert not any(edge.common for edge in edges_of)
+    alone = compose(source_of(tmp_path, {"/camera": group("services", "reply", *own)})).edges
+    assert all(edge.common for edge in alone)

@@ -528,10 +528,11 @@ class GovernedDomain:
             return None
         from sros_tool.automata import NameSet
 
-        return NameSet.first(
+        rules = [
             (names, is_open_to_unauthenticated(domain, rule, self.vendor))
             for names, rule in self.names_by_rule()
-        )
+        ]
+        return NameSet.first(rules) if any(is_open for _, is_open in rules) else None
 
     def all_controlled(self) -> bool:
         """Return whether every topic rule controls reading and writing."""

@@ -757,14 +757,16 @@ class _Run:
             dry_run=self._dry_run,
         )
         self.keystore = Keystore(self.keystore.root)
+        done = ""
         if forgotten_lists.lists:
             whence = f"the last release in '{self._folder}' has"
             self._notes.append(restored_note(revocation, whence))
+            done = f"In the keystore, {self._notes[-1].text} "
         for note in revocation.notes:
             if note.id == REPLACED_AFTER_BACKUP:
                 raise KeystoreError(
                     f"'{self._folder}' cannot be published yet: {note.text[:-1]}",
-                    "Robots would refuse these enclaves.",
+                    f"Robots would refuse these enclaves. {done}".rstrip(),
                     "Then repeat this command, with --restored.",
                 )
         self._notes += revocation.notes
