@@ -121,8 +121,8 @@ NOT_IN_EXPORT = FindingKind(
     "A robot needs only the enclaves of its own processes; a node that starts in another one fails "
     "there.",
     "rcl 9 (security.c).",
-    "Export an enclave as well if a process of this robot runs in it: `sros distribute_key KEYSTORE "
-    "ENCLAVE EXPORT`.",
+    "Export an enclave as well if a process of this robot runs in it: `sros distribute_key "
+    "KEYSTORE ENCLAVE EXPORT`.",
     prominent=True,
 )
 
