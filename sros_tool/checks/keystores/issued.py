@@ -281,7 +281,7 @@ def check_issued(
                 yield NOT_IN_KEYSTORE.found(name, "the keystore does not have this enclave", root)
         elif missing:
             text = f"{len(missing)} of {len(wanted)} enclaves of the policy are not in this export"
-            yield NOT_IN_EXPORT.found(root, f"{text}: {first_few(missing, 3)}", root)
+            yield NOT_IN_EXPORT.found(missing[0], f"{text}: {first_few(missing, 3)}", root)
         yield from _lower_protection_findings(keystore)
 
 
