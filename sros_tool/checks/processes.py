@@ -481,7 +481,7 @@ PROCESS_OTHER_FOLDER = FindingKind(
     "The process loaded a copy of the enclave's files. What is delivered here, such as a "
     "revocation list, does not reach it, also not by a restart.",
     "rcl 9 (rcl/src/rcl/security.c): ROS_SECURITY_KEYSTORE names the folder.",
-    "Stop the process, start it from the folder that gets new files (`sros run FOLDER ENCLAVE -- "
+    "Stop the process, start it from the folder that gets new files (`sros run KEYSTORE ENCLAVE -- "
     "COMMAND...`), and remove the copy.",
 )
 ZENOH_UNREAD = FindingKind(
