@@ -121,7 +121,8 @@ def _with_policy_change(evaluator: Evaluator, answer: Answer) -> Answer | None:
     if change.add or change.lift:
         return answer._replace(change=change)
     # The current policy allows it.
-    return answer._replace(sign=True) if answer.provenance is Provenance.CHANGED else None
+    other = answer.provenance in (Provenance.CHANGED, Provenance.UNKNOWN)
+    return answer._replace(sign=True) if other else None
 
 
 # ── remedies ───────────────────────────────────────────────────────────────────────────────

@@ -245,6 +245,8 @@ def _provenance_notes(answer: Answer) -> Iterator[Note]:
             )
         case Provenance.UNKNOWN:
             text = f"the ledger does not say whether the permissions were made from '{policy}'."
+            if answer.sign:
+                text = f"'{policy}' allows this: the permissions are older, or from another policy."
         case _:
             return
     yield Note(f"explain.policy-{answer.provenance}", text)

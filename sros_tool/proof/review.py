@@ -733,6 +733,8 @@ class _Review:
             and not stated.overlaps(right._replace(qualifier=ALLOW))
             and not stated.cover(right)
         )
+        named = _fixed_or_moving_names([*before.enclaves.values()], [*after.enclaves.values()])
+        undenied += tuple(each.right for each in named if each.right.qualifier is DENY)
         status = _FOUND if growth or undenied else _OK
         return status, AccessChange(before, after, growth, undenied)
 

@@ -814,6 +814,7 @@ def test_a_copy_without_keys_is_answered_as_if_they_were_there(whole: Path, tmp_
     assert answer(copy, ENCLAVE, "publish", "/chatter")["counts_key"]
     assert not answer(whole, ENCLAVE, "publish", "/chatter")["counts_key"]
     assert "no rule allows" in explain(copy, ENCLAVE, "publish", "/nothing").out
+    assert "nothing is wrong if this is a copy without keys" in sros("check", copy).out
     assert "key.pem: missing" in explain(copy, ENCLAVE, "join").out
     who = explain(copy, "--who", "publish", "/chatter")
     assert ENCLAVE in who.out and "explain.without-keys" in who.err

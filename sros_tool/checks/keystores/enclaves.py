@@ -28,6 +28,7 @@ from sros_tool.faults import VENDOR_FAULTS, Fault
 from sros_tool.keystore.layout import (
     IDENTITY,
     IDENTITY_CA_FILE,
+    KEY_FILE,
     KEY_URI_FILE,
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
@@ -77,6 +78,9 @@ def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
         kind = _LOADING_KINDS[f"enclave.{problem.fault.id}"]
         text = problem.text if problem.text != "missing" else f"{problem.file} is missing"
         file = enclave.file(problem.file)
+        lacks_key = (problem.file, problem.fault) == (KEY_FILE, Fault.FILE_MISSING)
+        if lacks_key and not enclave.keystore.opened.has_keys:
+            text += ", as all keys here: nothing is wrong if this is a copy without keys"
         remedy = fault_remedy(enclave, problem.fault, problem.file)
         accepted = enclave.accepts_expiry if problem.fault in _EXPIRED else ""
         yield kind.found(enclave.name, text, file, remedy=remedy, accepted=accepted)
