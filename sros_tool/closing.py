@@ -991,7 +991,8 @@ class OpenRobot:
             if process.pid in {each.pid for each in processes} and own:
                 self._shell.say(
                     f"{process.label} has variables that this shell does not have, and that its "
-                    f"command below does not set: {first_few(sorted(own), _MOST_NAMES)}"
+                    f"command in {self.start / COMMANDS} does not set: "
+                    f"{first_few(sorted(own), _MOST_NAMES)}"
                 )
         number = counted(len(processes), "process", "processes")
         self._shell.say(f"saw {counted(len(nodes), 'node')} in {number} of this machine")
@@ -1742,8 +1743,8 @@ def _keystore_of(enclave: ProcessEnclave) -> str:
 
 
 _CLAIM = "every process was started in its enclave"
-_OF_EVERY_SHELL = ("_", "SHLVL", "PWD", "OLDPWD", "COLUMNS", "LINES")
-"""Variables that differ between shells, and that no program is meant to read."""
+_OF_EVERY_SHELL = ("_", "SHLVL", "PWD", "OLDPWD", "COLUMNS", "LINES", DOMAIN)
+"""Variables that differ between shells, or that the commands set."""
 _TALK = "everything that talked can still talk"
 _SILENCE = "an open listener finds nothing"
 
