@@ -924,6 +924,21 @@ def test_what_is_printed_as_json(robot: Robot) -> None:
 # ── which process ──────────────────────────────────────────────────────────────────────────
 
 
+def test_no_command_of_another_user_is_proposed(robot: Robot) -> None:
+    """Anybody can start a program whose variables name the export."""
+    robot.close()
+    robot.by_hand, robot.absent = {"/talker", "/listener"}, {"/talker"}
+    export = robot.folder / "robot/export"
+    variables = secured_environment(export, "/talker", 0)
+    later = datetime.now(UTC) + timedelta(days=1)
+    mapped = frozenset({"libfastrtps"})
+    command = ("/tmp/evil", "--as-root")
+    robot.more = (robot.with_its_files(Process(66, command, variables, later, mapped, user=12345)),)
+    words = {**graph(), "secured": graph(*secured(*robot.remaining))}
+    ended = robot.beside("close", words, "robot", "--undo")
+    assert "evil" not in ended.out and "restart it open: cd /opt && /opt/run talker" in ended.out
+
+
 def process(pid: int, *command: str, **more: Any) -> Process:
     return Process(pid, command, {}, datetime.now(UTC), frozenset({"libfastrtps"}), **more)
 
