@@ -179,27 +179,22 @@ class ClosedProcess(NamedTuple):
         may run, but could not be examined, keeps its id, and so does a process that its unit
         restarts.
         """
-        commands = ((*self.command,), (*self.command, ROS_ARGS, "--enclave", self.enclave))
+        own = _without_enclave_argument(self.command, self.enclave)
         programs = [process.program for process in running.processes]
-        pids = [pid for pid, command in programs if command in commands]
+        pids = [
+            pid for pid, words in programs if _without_enclave_argument(words, self.enclave) == own
+        ]
         unseen = {process.pid for process in running.unseen}
         if self.unit or running.hidden or self.pid in unseen or self.pid in pids:
             return self
         return self._replace(pid=pids[0] if pids else 0)
 
-    def open_command(self, domain: int, running: Process | None = None) -> str:
-        """Return the shell command that starts the process open, in its ROS domain.
-
-        That is the command with which it was started, or, if it is known, that of the process that
-        is ``running`` now.
-        """
+    def open_command(self, domain: int) -> str:
+        """Return the shell command that starts the process open, in its ROS domain."""
         if self.container:
             return "docker compose up -d"
-        command = running.program[1] if running else self.command
-        if command[-3:] == (ROS_ARGS, "--enclave", self.enclave):  # of `sros run`
-            command = command[:-3]
         set_domain = ("env", f"{DOMAIN}={domain}") if domain else ()
-        words = (*set_domain, *(self.launch or command))
+        words = (*set_domain, *(self.launch or self.command))
         return f"cd {shlex.quote(self.folder)} && {shlex.join(words)}"
 
     def secured_command(self, folder: Path, of_launch: str = "") -> str:
@@ -222,6 +217,12 @@ class ClosedProcess(NamedTuple):
         elif self.rmw:
             words = ("env", f"{RMW}={self.rmw}", *words)
         return f"cd {shlex.quote(self.folder)} && {shlex.join(words)}"
+
+
+def _without_enclave_argument(command: Sequence[str], enclave: str) -> Sequence[str]:
+    """Return a command without the argument for its enclave that ``sros run`` adds at its end."""
+    words = tuple(command)
+    return words[:-3] if words[-3:] == (ROS_ARGS, "--enclave", enclave) else words
 
 
 def _launch_words(folder: Path, before: Sequence[str], after: Sequence[str]) -> Sequence[str]:
@@ -871,12 +872,7 @@ class OpenRobot:
         later = []
         for process, enclave in self._secured(running):
             if enclave.name not in known and self._may_use_files(process):
-                command, argument = process.program[1], (ROS_ARGS, "--enclave", enclave.name)
-                if command[-3:] == argument:  # sros wrote it
-                    command = command[:-3]
-                origin = process_origin(process.pid)
-                started = replace(process, command=command, forked_by=(0, ()))
-                later.append(ClosedProcess.of(started, enclave.name, origin, "enclave"))
+                later.append(_closed_process(process, enclave.name))
         return observed._replace(processes=[*observed.processes, *later])
 
     def _valid_until(self) -> datetime | None:
@@ -1268,19 +1264,21 @@ class OpenRobot:
             )
         if observed.elsewhere:
             here = {process.enclave: process.pid for process in observed.processes}
-            if twice := sorted(here.keys() & {*observed.elsewhere}):
+            twice = sorted(here.keys() & {*observed.elsewhere})
+            if twice:
                 yield (
                     f"nodes of {twice[0]} are in process {here[twice[0]]} and in another one that "
                     "sros does not see: if another robot is in this ROS domain, switch it off, or "
                     "give it a domain of its own, remove the rights that it added to "
                     f"'{self.policy}', and watch again: sros close {folder} --for 1m"
                 )
-            named = first_few(observed.elsewhere, _MOST_NAMES)
-            options = " ".join(f"--elsewhere {name}" for name in observed.elsewhere)
-            yield (
-                f"sros knows no process of this machine for nodes of {named}; if they run on "
-                f"another machine: sros close {folder} {options}; otherwise {silent}"
-            )
+            if only_there := [name for name in observed.elsewhere if name not in twice]:
+                named = first_few(only_there, _MOST_NAMES)
+                options = " ".join(f"--elsewhere {name}" for name in only_there)
+                yield (
+                    f"sros knows no process of this machine for nodes of {named}; if they run on "
+                    f"another machine: sros close {folder} {options}; otherwise {silent}"
+                )
 
     # ── applying ────────────────────────────────────────────────────────────────────────────
 
@@ -1381,16 +1379,15 @@ class OpenRobot:
         by_hand = [*chain.from_iterable(observed.commands_by_hand(self.folder).values())]
         closed = [process for process in by_hand if process.enclave in secured]
         processes_of = Counter(process.enclave for process in closed)
-        for command in dict.fromkeys(
-            process.open_command(
-                self.domain,
-                secured[process.enclave]
-                if processes_of[process.enclave] == 1
-                and self._may_use_files(secured[process.enclave])
-                else None,
-            )
-            for process in closed
-        ):
+        commands = []
+        for process in closed:
+            now = secured[process.enclave]
+            is_alone = processes_of[process.enclave] == 1 and not process.launch
+            if is_alone and not process.container and self._may_use_files(now):
+                commands.append(_closed_process(now, process.enclave).open_command(self.domain))
+            else:
+                commands.append(process.open_command(self.domain))
+        for command in dict.fromkeys(commands):
             yield f"restart it open: {command}"
         for process in by_hand:
             if process.enclave not in secured and tuple(process.command) not in are_open:
@@ -1457,8 +1454,8 @@ class OpenRobot:
             if not missing:
                 break
             if time.monotonic() > end:
-                earlier = {enclave.name for _, enclave in self._secured(running)}
-                needed = {*missing}.difference(self._without) | earlier.intersection(missing)
+                running_now = {enclave.name for _, enclave in self._secured(running)}
+                needed = {*missing}.difference(self._without) | running_now.intersection(missing)
                 if needed or expected == {*missing}:
                     why = self._why_missing(
                         sorted(needed) or missing, observed.as_they_run(running), running
@@ -1522,7 +1519,8 @@ class OpenRobot:
             return
         needed = ("--requirements", str(self.requirements), "--include", "requirement.*")
         places = [self.export, *[self._rights] * bool(self._not_here)]
-        status = min({self._check(str(place), *needed) for place in places} - {0} or {0})
+        statuses = [self._check(str(place), *needed) for place in places]
+        status = 1 if 1 in statuses else max(statuses)
         reasons = {0: "all of them", 1: "one is violated", 2: "sros could not check them"}
         holds = {0: True, 1: False}.get(status)
         yield Proof("the requirements hold", holds, f"{reasons[status]}: {self.requirements}")
@@ -1538,10 +1536,14 @@ class OpenRobot:
     def _why_missing(
         self, missing: Sequence[str], observed: ObservedProcesses, running: RunningProcesses
     ) -> str:
-        """Return which enclaves have no process, or an open one, and which have earlier files."""
-        earlier = {enclave.name: process.pid for process, enclave in self._secured(running)}
+        """Return which enclaves have no process, or an open one, and what the others lack."""
+        wrong = {
+            enclave.name: (process, self._why_not_current(process))
+            for process, enclave in self._secured(running)
+            if enclave.name in missing
+        }
         are_open = {process.enclave: process.pid for process in observed.processes if process.pid}
-        absent = [name for name in missing if name not in earlier]
+        absent = [name for name in missing if name not in wrong]
         others = {name: f"stop process {pid}, which is open" for name, pid in are_open.items()}
         others |= {
             enclave.name: f"{process.label} has the files of '{_keystore_of(enclave)}'"
@@ -1549,7 +1551,6 @@ class OpenRobot:
             if (enclave := process.enclave)
         }
         named = ", ".join(f"{name} ({others[name]})" if name in others else name for name in absent)
-        old = [f"{name} (process {earlier[name]})" for name in missing if name in earlier]
         reasons = [
             f"no secured process of {named}; start it as {self.start / COMMANDS} says; "
             f"if it ended: sros explain {shlex.quote(str(self.export))} --log ITS_LOG"
@@ -1557,16 +1558,22 @@ class OpenRobot:
         if may_end := [name for name in absent if name not in {*are_open, *self._without}]:
             options = " ".join(f"--without {name}" for name in may_end)
             reasons.append(f"if it does not always run, add {options}")
-        if old:
-            no_strategy = [
-                name
-                for process, enclave in self._secured(running)
-                if (name := enclave.name) in missing
-                and process.environment.get(STRATEGY) != "Enforce"
-            ]
-            what = f"no {STRATEGY}=Enforce" if no_strategy else "earlier files"
-            reasons.append(f"{what} in the processes of {', '.join(old)}; restart them")
+        for why in dict.fromkeys(why for _, why in wrong.values()):
+            named = ", ".join(
+                f"{name} (process {wrong[name][0].pid})"
+                for name in missing
+                if name in wrong and wrong[name][1] == why
+            )
+            reasons.append(f"{why} the processes of {named}; restart them")
         return "; ".join(reasons)
+
+    def _why_not_current(self, process: Process) -> str:
+        """Return what precedes "the processes of ENCLAVE" where they do not count as closed."""
+        if not self._may_use_files(process):
+            return f"user {process.user}, who cannot read the files, runs"
+        if process.environment.get(STRATEGY) != "Enforce":
+            return f"no {STRATEGY}=Enforce in"
+        return "earlier files in"
 
     def _enclaves_with_process(self, running: RunningProcesses) -> set[str]:
         """Return the enclaves in which a process runs with the current files of the export.
@@ -1633,7 +1640,7 @@ class OpenRobot:
         guests += [
             f"; {process.label} runs open in domain {process.domain}"
             for process in others
-            if process.enclave is None and not process.is_daemon
+            if not (process.enclave or process.network or process.is_daemon)
         ]
         said = f"{counted(number, 'enclave')}, and no open process in domain {self.domain}"
         return Proof(_CLAIM, True, f"{said}{''.join(guests)}")
@@ -1711,6 +1718,12 @@ class OpenRobot:
         self._shell.say(f"+ {step.command}")
         status, output, _ = self._shell.run(step.words, False)
         return status, json.loads(output)
+
+
+def _closed_process(process: Process, enclave: str) -> ClosedProcess:
+    """Return a process that runs in an enclave, with the command that starts it open."""
+    known = ClosedProcess.of(process, enclave, process_origin(process.pid), "enclave")
+    return known._replace(command=_without_enclave_argument(known.command, enclave))
 
 
 def _needs_enclave_argument(process: ClosedProcess) -> bool:

@@ -348,16 +348,17 @@ class _Review:
         if self.base:
             before = cache(partial(load_policies, of_base, _BASE, base_fleet))
             after = cache(partial(load_policies, of_head, _HEAD, head_fleet))
+            moving = cache(lambda: [*_fixed_or_moving_names(before(), after())])
             yield from self._step_result(
                 "new-access",
                 named,
-                lambda: self._access(of_base, base_fleet, before, after),
+                lambda: self._access(of_base, base_fleet, before, after, moving),
                 only_with_result=bool(asked.policies),
             )
             yield from self._step_result(
                 "rights",
                 named,
-                partial(self._rights, before, after),
+                partial(self._rights, before, after, moving),
                 only_with_result=bool(of_base),
             )
         for path, keystore in keystores.items():
@@ -711,6 +712,7 @@ class _Review:
         base_fleet: Fleet | None,
         before: Callable[[], AccessSource],
         after: Callable[[], AccessSource],
+        moving: Callable[[], Sequence[PlacedRight]],
     ) -> tuple[int, Content]:
         head = after()
         if not base_paths:
@@ -719,9 +721,11 @@ class _Review:
                 self.base.policies(path, placeholders=base_fleet is not None)
             new = (("is new, so that all of its access is new", " ".join(self.request.policies)),)
             return _FOUND, Facts(new)
-        return self._compared_access(before(), head)
+        return self._compared_access(before(), head, moving())
 
-    def _compared_access(self, before: AccessSource, after: AccessSource) -> tuple[int, Content]:
+    def _compared_access(
+        self, before: AccessSource, after: AccessSource, moving: Sequence[PlacedRight] = ()
+    ) -> tuple[int, Content]:
         growth = compare_access(before, after)
         stated = Rules(after.rights)
         left = {right.enclave for right in after.rights}
@@ -733,20 +737,19 @@ class _Review:
             and not stated.overlaps(right._replace(qualifier=ALLOW))
             and not stated.cover(right)
         )
-        named = _fixed_or_moving_names([*before.enclaves.values()], [*after.enclaves.values()])
-        undenied += tuple(each.right for each in named if each.right.qualifier is DENY)
+        undenied += tuple(each.right for each in moving if each.right.qualifier is DENY)
         status = _FOUND if growth or undenied else _OK
         return status, AccessChange(before, after, growth, undenied)
 
     @staticmethod
     def _rights(
-        before: Callable[[], AccessSource], after: Callable[[], AccessSource]
+        before: Callable[[], AccessSource],
+        after: Callable[[], AccessSource],
+        moving: Callable[[], Sequence[PlacedRight]],
     ) -> tuple[int, Content] | None:
-        base, head = before(), after()
-        first, second = base.as_rights(), head.as_rights()
-        named = [*_fixed_or_moving_names([*base.enclaves.values()], [*head.enclaves.values()])]
-        absolute = tuple(each for each in named if each.written.startswith("/"))
-        relative = tuple(each for each in named if not each.written.startswith("/"))
+        first, second = before().as_rights(), after().as_rights()
+        absolute = tuple(each for each in moving() if each.written.startswith("/"))
+        relative = tuple(each for each in moving() if not each.written.startswith("/"))
         compared = compare_sources(first, second)
         if not compared and not (absolute or relative):
             return None
@@ -901,32 +904,26 @@ _SOMEWHERE = f"/n{secrets.token_hex(8)}"
 """A namespace that no policy can know, into which users put the nodes of a package."""
 
 
-def _fixed_or_moving_names(
-    before: Sequence[Enclave], after: Sequence[Enclave]
-) -> Iterator[PlacedRight]:
+def _fixed_or_moving_names(before: AccessSource, after: AccessSource) -> Iterator[PlacedRight]:
     """Yield the rights in ``after`` that are new only for nodes in another namespace.
 
     That is because a name there is absolute now, or relative.  Of denials, those are yielded that
     deny less there.
     """
-    (was, was_elsewhere), (now, now_elsewhere) = (
-        (
-            Rules(right for enclave in enclaves for right, *_ in placed_rights(enclave)),
-            Rules(moved for enclave in enclaves for _, moved in _moved_rights(enclave)),
-        )
-        for enclaves in (before, after)
+    of_before, of_after = (
+        [*chain.from_iterable(map(_moved_rights, source.enclaves.values()))]
+        for source in (before, after)
     )
-    for placed, moved in chain.from_iterable(map(_moved_rights, after)):
+    (was, was_elsewhere), (now, now_elsewhere) = (
+        (Rules(placed.right for placed, _ in rights), Rules(moved for _, moved in rights))
+        for rights in (of_before, of_after)
+    )
+    for placed, moved in of_after:
         allows = placed.right.qualifier is ALLOW
         if allows and was.cover(placed.right) and not was_elsewhere.cover(moved):
             yield placed
-    denials = [
-        placed
-        for enclave in after
-        for placed in placed_rights(enclave)
-        if placed.right.qualifier is DENY
-    ]
-    for placed, moved in chain.from_iterable(map(_moved_rights, before)):
+    denials = [placed for placed, _ in of_after if placed.right.qualifier is DENY]
+    for placed, moved in of_before:
         denies = placed.right.qualifier is DENY
         if denies and now.cover(placed.right) and not now_elsewhere.cover(moved):
             yield next(each for each in denials if Rules([each.right]).overlaps(placed.right))

@@ -375,7 +375,8 @@ class World:
             and (self._weak, self.demanded) == (other._weak, other.demanded)
             and (self.own, self.open_topics) == (other.own, other.open_topics)
             and self.fitting_others == other.fitting_others
-            and [world.own for world in self.elsewhere] == [world.own for world in other.elsewhere]
+            and [(world.own, world.open_topics) for world in self.elsewhere]
+            == [(world.own, world.open_topics) for world in other.elsewhere]
             and self.crossing is other.crossing is None
         )
 

@@ -70,6 +70,9 @@ _MOST_BYTES = 4 * 1024 * 1024
 _MOST_MAPS = 32 * 1024 * 1024
 _MOST_TRIES = 3
 _KERNEL_THREAD = 0x00200000
+_DOMAIN_NUMBER = re.compile(
+    r"\s*\+?(0[xX][0-9a-fA-F]{1,16}|0[0-7]{0,22}|[1-9][0-9]{0,19})", re.ASCII
+)
 _LONGEST = 40
 
 
@@ -134,13 +137,13 @@ class Process:
     def domain(self) -> str:
         """The ROS domain that the process names, as a number.
 
-        rcl reads it as strtoul(3) does, such as 0x0.  What is no number is text that is safe to
-        print.
+        rcl reads it as strtoul(3) does, such as 0x0.  What is no number, or none of 64 bits, is
+        quoted text that is safe to print.
         """
         named = self.environment.get(DOMAIN) or "0"
-        number = re.fullmatch(r"\s*\+?(0[xX][0-9a-fA-F]+|0[0-7]*|[1-9][0-9]*)", named)
+        number = _DOMAIN_NUMBER.fullmatch(named)
         if number is None:
-            return plain(named)
+            return f"'{plain(named)}'"
         digits = number[1].lower()
         base = 16 if digits.startswith("0x") else 8 if digits.startswith("0") else 10
         return str(int(digits, base))

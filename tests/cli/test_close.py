@@ -544,7 +544,21 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
     named = f"earlier files in the processes of /talker (process {PID['/talker']}); restart them\n"
     out = robot.close("--proof", status=1).out
     assert f"no: every process was started in its enclave: {named}" in out
-    robot.outdated = set()
+    robot.outdated, robot.absent = set(), {"/talker"}
+    talker = robot.process("/talker", is_secured=True)
+    lax = {**talker.environment, "ROS_SECURITY_STRATEGY": "Permissive"}
+    for changed, why in (
+        (replace(talker, environment=lax), "no ROS_SECURITY_STRATEGY=Enforce in"),
+        (replace(talker, user=12345), "user 12345, who cannot read the files, runs"),
+    ):
+        robot.more = (changed,)
+        named = f"{why} the processes of /talker (process {PID['/talker']}); restart them\n"
+        assert f"in its enclave: {named}" in robot.close("--proof", status=1).out
+    robot.absent = set()
+    seven = Process(5, ("guest",), {"ROS_DOMAIN_ID": "7"}, datetime.now(UTC))
+    robot.more = (seven, replace(seven, command=("inner",), network="net:[1]"))
+    assert "in domain 0; process 5 (guest) runs open in domain 7\n" in robot.close("--proof").out
+    robot.more = ()
     robot.remaining = (TALKER,)
     assert (
         "no: everything that talked can still talk: gone: /listener "
@@ -657,6 +671,14 @@ def test_units_that_do_not_restart_are_named(robot: Robot) -> None:
     assert "`systemctl daemon-reload` ended with 1" in ended.err and "--undo" in ended.err
     (robot.folder / "status").write_text("0")
     robot.close("--apply")
+
+
+def test_a_node_of_another_robot_is_not_proposed_for_another_machine(robot: Robot) -> None:
+    """Its enclave is that of a process of this machine, whose key would leave the export."""
+    robot.nodes += (ros_node("talker", "010f7f02671200000000", "publish rt/chatter"),)
+    ended = robot.close(status=1)
+    assert "nodes of /talker are in process 4711 and in another one" in ended.out
+    assert "--elsewhere" not in ended.out
 
 
 # ── refused ────────────────────────────────────────────────────────────────────────────────

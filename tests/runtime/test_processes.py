@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -111,6 +111,12 @@ def test_the_first_of_two_variables_counts_as_for_getenv(proc: Proc) -> None:
     assert process.domain == "3"
     assert process.environment["Z"] == "\udcff"
     assert (process.user, process.network) == (8, "net:[1]")
+    for text, domain in (
+        *(("0x0", "0"), ("010", "8"), (" +5", "5"), ("", "0"), ("0XfF", "255")),
+        *(("x\n", "'x?'"), ("-1", "'-1'"), ("\u0665", "'\u0665'")),
+        *((f"{number}{'1' * 5000}", f"'{number:1<40}'") for number in ("1", "0", "0x")),
+    ):
+        assert replace(process, environment={"ROS_DOMAIN_ID": text}).domain == domain
 
 
 @pytest.mark.parametrize(("enable", "loads"), [("true", True), ("True", False), ("", False)])
