@@ -29,8 +29,20 @@ REPLACE = (
     "Replace the file: `rm {path} && sros create_enclave {root} {enclave}` links the keystore's "
     "file, or issues the file again."
 )
+_SET_DOMAIN = (
+    "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env {root} {enclave} --domain ID` prints "
+    "the variables."
+)
+_DOMAIN = (
+    f"{_SET_DOMAIN} To add a domain, name all domains in `sros update_keystore {{root}} --domain "
+    "IDS --allow-looser`."
+)
 ORIGINAL_KEYSTORE = "keystore that has the CA keys"
 """How the remedies for an export name the keystore that issued it."""
+REFUSE_STRANGERS = (
+    "`sros update_keystore KEYSTORE --set protection.allow_unauthenticated_participants=false`"
+)
+"""The command with which a keystore admits no process without an identity any more."""
 
 _IN_EXPORT = {
     _CLOCK: "Set the clock of this host; if the clock is right, sign again in the keystore that "
@@ -40,6 +52,8 @@ _IN_EXPORT = {
     REPLACE: "Export the enclave again. If `sros check {root}` finds the same in the keystore that "
     "has the CA keys, first replace the file there: `rm {path} && sros create_enclave {root} "
     "{enclave}`.",
+    _DOMAIN: f"{_SET_DOMAIN} To add a domain, name all domains in the {ORIGINAL_KEYSTORE}: `sros "
+    "update_keystore KEYSTORE --domain IDS --allow-looser`. Then export the enclave again.",
 }
 """Remedies for an export, which has no CA keys, that differ from the remedies for a keystore."""
 _GOVERNANCE = (
@@ -301,9 +315,7 @@ class Fault(Enum):
         'The node dies with "Not found topic access rule for topic ros_discovery_info" (Fast '
         'DDS) or "Could not find domain in governance" (Cyclone DDS, code 141).',
         "DDS-Security 1.1, 9.4.1.2; tested.",
-        "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env {root} {enclave} --domain ID` "
-        "prints the variables. To add a domain, name all domains in `sros update_keystore {root} "
-        "--domain IDS --allow-looser`.",
+        _DOMAIN,
     )
     PERMISSIONS_EXPIRED = (
         "permissions-expired",
@@ -439,8 +451,6 @@ class Fault(Enum):
     def remedy_in_export(self, file: str) -> str:
         """Return the remedy for this fault in ``file`` of an export, which has no CA keys."""
         text = self.remedy_in(file)
-        if self is Fault.GOVERNANCE_DOMAIN:
-            return text.replace("To add a domain", f"To add a domain in the {ORIGINAL_KEYSTORE}")
         if "`" not in text:
             return text
         if text in _IN_EXPORT:

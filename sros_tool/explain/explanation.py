@@ -187,12 +187,12 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
         text = fault.remedy_in(file)
     keystore = Path(root) if root and Path(root).is_dir() else None
     if keystore and not is_original_keystore(keystore):
-        if "`" not in text or fault is Fault.GOVERNANCE_DOMAIN:
-            here, and_then, there = text.partition(" To add a domain")
-            there = _filled_remedy(there, "KEYSTORE", enclave, file)
-            return f"{_filled_remedy(here, root, enclave, file)}{and_then}{there}"
         if fault:
-            return _filled_remedy(fault.remedy_in_export(file), "KEYSTORE", enclave, file)
+            is_done_here = "`" not in text or fault is Fault.GOVERNANCE_DOMAIN
+            where = root if is_done_here else "KEYSTORE"
+            return _filled_remedy(fault.remedy_in_export(file), where, enclave, file)
+        if "`" not in text:
+            return _filled_remedy(text, root, enclave, file)
         return remedy_in_original_keystore(_filled_remedy(text, "KEYSTORE", enclave, file))
     if keystore and fault:
         wrong_issuer = fault is Fault.CERTIFICATE_ISSUER

@@ -24,12 +24,14 @@ from sros_tool.explain.asking import (
     rights_naming,
 )
 from sros_tool.explain.explanation import explain, likely_names
+from sros_tool.faults import REFUSE_STRANGERS
 from sros_tool.keystore.layout import (
     SETTINGS,
     ZENOH_SIGNED,
     has_zenoh_files,
     is_keystore,
     is_original_keystore,
+    remedy_in_keystore,
 )
 from sros_tool.keystore.participant import (
     JoinContext,
@@ -174,7 +176,7 @@ def explain_on_dds(
     """Return the decision of the chosen vendor, or those of all vendors or distributions.
 
     ``chosen_vendor`` is the vendor and the reason to choose it; ``kind`` is the kind of the name
-    (topic, service or action) if the user gave it; ``every`` says what is compared.
+    (topic, service or action) if the user gave it; ``compared`` says what is compared.
     """
     vendor, why = chosen_vendor
     enclave = asked_enclave.enclave
@@ -184,6 +186,8 @@ def explain_on_dds(
     question, taken = question_meant(evaluator, asked_enclave, question, kind)
     answer = explain(evaluator, question)
     beside = _zenoh_decision(enclave, question, context)
+    is_on_robot = enclave.state is not None and enclave.state.key_on_robot
+    copied = enclave.keystore if answer.counts_key and not is_on_robot else None
     notes = (
         *taken,
         *_provenance_notes(answer),
@@ -191,7 +195,7 @@ def explain_on_dds(
         *_other_type_notes(evaluator, answer, kind),
         *_not_a_topic_notes(answer, asked_enclave),
         *_similar_name_notes(answer),
-        *(note_on_lacking_keys(enclave.keystore) if enclave.keystore and answer.counts_key else ()),
+        *(note_on_lacking_keys(copied) if copied else ()),
     )
     what = Asked(enclave.name, question, context)
     if compared is Compared.VENDORS:
@@ -434,12 +438,11 @@ def _outcome(evaluator: Evaluator, name: str, question: Question) -> VendorOutco
     )
 
 
-def _note_on_anybody(outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
+def _note_on_anybody(outcomes: Sequence[VendorOutcome], remedy: str) -> Iterator[Note]:
     if any(outcome.anybody for outcome in outcomes):
         text = (
             "processes without an identity may do it, too: the governance admits them, and does "
-            "not protect the name. Run `sros update_keystore KEYSTORE --set "
-            "protection.allow_unauthenticated_participants=false`."
+            f"not protect the name. {remedy}"
         )
         yield Note("explain.anybody", text)
 
@@ -482,7 +485,7 @@ class VendorOfPolicy(NamedTuple):
 
     def notes(self, outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
         """Yield a note if processes without an identity may do it, too."""
-        return _note_on_anybody(outcomes)
+        return _note_on_anybody(outcomes, f"Change the template, or run {REFUSE_STRANGERS}.")
 
 
 class VendorOfKeystore(NamedTuple):
@@ -550,6 +553,7 @@ class VendorOfKeystore(NamedTuple):
         from sros_tool.explain.who import note_on_export  # as in `outcomes`
 
         yield from note_on_export(self.keystore.root)
-        yield from _note_on_anybody(outcomes)
+        refuse = remedy_in_keystore(self.keystore.root, f"Run {REFUSE_STRANGERS}.")
+        yield from _note_on_anybody(outcomes, refuse)
         if not all(outcome.stopped for outcome in outcomes):
             yield from note_on_lacking_keys(self.keystore)

@@ -44,6 +44,10 @@ class EnclaveOutcome(Protocol):
         """Whether the enclave may do it."""
 
     @property
+    def anybody(self) -> bool:
+        """Whether processes without an identity may do it, too."""
+
+    @property
     def wildcard(self) -> str:
         """The expression that allows the access, if it is a wildcard, or ""."""
 
@@ -90,8 +94,7 @@ class AnswerForAll(NamedTuple):
     @property
     def allowed(self) -> bool:
         """Whether any enclave may do it, or processes without an identity."""
-        open_to_all = any(note.id == "explain.anybody" for note in self.notes)
-        return open_to_all or any(outcome.allowed for outcome in self.outcomes)
+        return any(outcome.allowed or outcome.anybody for outcome in self.outcomes)
 
 
 def note_on_export(root: Path) -> Iterator[Note]:

@@ -178,6 +178,11 @@ class ZenohAnswer:
     domains: str = ""
 
     @property
+    def anybody(self) -> bool:
+        """Whether processes without an identity may do it, too: the rules name certificates."""
+        return False
+
+    @property
     def in_brief(self) -> ZenohInBrief:
         """Whether Zenoh allows it, and why."""
         mode = self.mode.value if self.mode else None

@@ -16,6 +16,7 @@ from sros_tool.checks.requirements import (
     VIOLATED,
 )
 from sros_tool.dds.decision.vendors import joined_titles
+from sros_tool.faults import REFUSE_STRANGERS
 from sros_tool.keystore.template import DEFAULT_TEMPLATE
 from sros_tool.names import (
     action_part,
@@ -238,9 +239,7 @@ def _subject(violation: Violation) -> str:
 
 
 _CLOSE_GOVERNANCE = (
-    "Run `sros update_keystore KEYSTORE --set "
-    "protection.allow_unauthenticated_participants=false` (for a policy: change its template), and "
-    "check the requirement again."
+    f"Run {REFUSE_STRANGERS} (for a policy: change its template), and check the requirement again."
 )
 
 

@@ -821,3 +821,5 @@ def test_a_copy_without_keys_is_answered_as_if_they_were_there(whole: Path, tmp_
     assert explain_access(copy, ENCLAVE, "publish", "/chatter").counts_key
     assert not explain_access(copy, ENCLAVE, "join").counts_key
     assert "without-keys" not in explain(whole, ENCLAVE, "publish", "/chatter").ok().err
+    (copy / f"enclaves{ENCLAVE}/request.pem").touch()  # its key was made on the robot
+    assert "without-keys" not in explain(copy, ENCLAVE, "publish", "/chatter").ok().err

@@ -205,10 +205,9 @@ def test_who_may_what_counts_processes_without_an_identity(tmp_path: Path) -> No
         ):
             assert (text in judged.out) is is_open, judged
         assert ("allow_unauthenticated_participants=false" in judged.out) is is_open
+        refuse = f"`sros update_keystore {keystore} --set protection.allow_unauthenticated"
         who = sros("explain", keystore, "--who", "publish", "/nobodys", "--vendor", vendor)
-        assert (who.status, "[explain.anybody]" in who.err) == (
-            (0, True) if is_open else (1, False)
-        )
+        assert (who.status, refuse in who.err) == ((0, True) if is_open else (1, False))
     table = sros("view", keystore, "--format", "markdown").ok().out
     assert "| topic `/x` | everybody, even without an identity, `/a` |" in table
 

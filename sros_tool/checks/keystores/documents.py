@@ -31,6 +31,7 @@ from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
 from sros_tool.dds.permissions import Criteria, Grant, Rule, portability_problems
 from sros_tool.errors import SrosError
+from sros_tool.faults import REFUSE_STRANGERS
 from sros_tool.keystore.fleet import EnclaveDomains
 from sros_tool.keystore.layout import GOVERNANCE_FILE, GOVERNANCE_XML
 from sros_tool.keystore.settings import edit_remedy
@@ -464,8 +465,7 @@ UNAUTHENTICATED = FindingKind(
     "it, and ignores allow_unauthenticated_participants.",
     f"{_GOVERNANCE} (allow_unauthenticated_participants); Fast DDS 2.9.1 and 2.14.5, Cyclone DDS "
     "0.10 and 11.0; tested.",
-    "Run `sros update_keystore KEYSTORE --set "
-    "protection.allow_unauthenticated_participants=false`.",
+    f"Run {REFUSE_STRANGERS}.",
 )
 UNAUTHENTICATED_KEPT_OUT = FindingKind(
     "governance.unauthenticated-kept-out",
