@@ -132,7 +132,7 @@ def write_state(folder: Path, state: AgentState) -> None:
 def mark_outdated(folder: Path) -> None:
     """Note by the time of the file that the state is not the last one.
 
-    `write_state` ends that.
+    `write_state` ends that.  On a file system that became read-only, the age of the state shows it.
     """
     with suppress(OSError), Folder(agent_folder(folder)) as opened:
         opened.set_time(_STATE, 0)

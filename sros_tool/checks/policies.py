@@ -626,6 +626,10 @@ def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
                 f"{statement.written} becomes {statement.name} in namespace {statement.profile.ns}"
             )
             yield statement.found(RELATIVE_GLOBAL, text, f"Write /{statement.written}.")
+
+
+def _check_parameters_of_others(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
+    """Yield findings about parameter services of nodes that the enclave does not have."""
     own = {
         enclave.path: {expand("~", profile.ns, profile.node) for profile in enclave.all_profiles()}
         for enclave in checked_policy.policy.enclaves
@@ -1110,6 +1114,7 @@ ROBOT_WRITTEN_OUT = FindingKind(
 _CHECKS = (
     _check_rules,
     _check_nodes,
+    _check_parameters_of_others,
     _check_names,
     _check_protection,
     _check_root_enclave,

@@ -293,7 +293,10 @@ def _show_undone(robot: OpenRobot, closed: Closing) -> None:
     else:
         stopped = not any(process.pid for process in closed.observed.processes)
         state = "no process of the robot runs" if stopped else "the robot is open"
-        echo(f"{state}: sros sees no process in an enclave of this folder", err=True)
+        but = ""
+        if there := closed.observed.not_here:
+            but = f"; start {enumerated(there)}, on other machines, without sros run, too"
+        echo(f"{state}: sros sees no process in an enclave of this folder{but}", err=True)
 
 
 def _state(closed: Closing, *, apply: bool) -> str:

@@ -66,7 +66,6 @@ _KINDS = {
     **dict.fromkeys(("call", "serve", "request", "reply"), "services"),
     "execute": "actions",
 }
-"""The word of --vendor for Zenoh, which is not DDS."""
 _ZENOH_TITLE = "Zenoh"
 _VENDORS = (*(vendor.value for vendor in Vendor), ZENOH)
 
@@ -283,14 +282,13 @@ def explain(
         raise UsageError("--who, --reach and --log exclude each other")
     if len(logs) > 1:
         raise UsageError("--log takes one log", "", "Run the command once for each log.")
+    from sros_tool.explain.asking import is_policy
     from sros_tool.runtime.rmw import chosen_vendor
 
     mode = "--who" if who else "--reach" if reach else "--log" if logs else ""
     _refuse_ignored(mode)
     check_one_decider()
     root, rest = _split(arguments, keystore, verb=0 if who else 1)
-    from sros_tool.explain.asking import is_policy
-
     names_policy = root is not None and is_policy(root)
     if names_policy and not (policy or logs or reach):
         policy, root = root, None

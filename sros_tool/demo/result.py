@@ -671,7 +671,8 @@ class UsedLibrary(NamedTuple):
             return f"{name} has no known vulnerability{unclear}."
         number = counted(len(self.vulnerabilities), "known vulnerability", "known vulnerabilities")
         ids = first_few(self.vulnerabilities, maximum)
-        unless = ", unless its package fixes them" if self.packaged else ""
+        them = "it" if len(self.vulnerabilities) == 1 else "them"
+        unless = f", unless its package fixes {them}" if self.packaged else ""
         return f"{name} has {number}{unless}: {ids}{unclear}."
 
 

@@ -204,7 +204,7 @@ class RobotStatus:
     which a file expires soon or has expired.  ``has_list`` says whether it has the current
     revocation list, in force or not, and ``renew_from`` from when a file of it expires soon.
     ``lacks_key`` are enclaves whose key the keystore has and the robot does not, which no release
-    brings.  ``is_ahead`` says that its files are from after the backup that the keystore is from.
+    brings.  ``is_ahead`` says that, by its message, they are from after the backup of the keystore.
     ``reads_copy`` says that it fetched after the publication and got an earlier release,
     and ``is_locked_out`` that all its certificates are revoked.
     """
@@ -839,7 +839,7 @@ class _Known:
         return later_in_folder(self._keystore)
 
     def is_ahead(self, confirmed: Confirmation) -> bool:
-        """Return whether a robot has a release of after the backup that the keystore is from."""
+        """Return whether a robot says that it has a release from after the keystore's backup."""
         is_from_backup = bool(self.age_clause or restored_at(self._keystore))
         return bool(
             confirmed.release and is_from_backup and confirmed.release not in self._releases
@@ -1027,8 +1027,8 @@ def _status(
     )
     if is_ahead and confirmed:
         text = (
-            f"release {confirmed.release} is from after the backup of the keystore: its files are "
-            "newer than the keystore, which replaces them by its next release"
+            f"it says that it has release {confirmed.release}, from after the backup of the "
+            "keystore: its files are newer then, and the next release replaces them"
         )
         compared_robot = compared_robot._replace(notes=(*compared_robot.notes, text))
     has_list = (

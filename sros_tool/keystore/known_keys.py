@@ -11,11 +11,16 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
+from shlex import quote
 
 from cryptography import x509
 
 from sros_tool.errors import KeystoreError, Note, PkiError, SrosError
-from sros_tool.keystore.delivery.published import later_revoked_serials, may_have_later_releases
+from sros_tool.keystore.delivery.published import (
+    later_revoked_serials,
+    may_have_later_releases,
+    read_published,
+)
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     KEY_FILE,
@@ -200,7 +205,9 @@ class KnownKeys:
             )
         if certificate and certificate.serial_number in self._unrecorded:
             if may_have_later_releases(self._keystore):
-                remedy = "First publish with --restored, which takes this list over."
+                folder = quote(read_published(self._keystore).folder)
+                publish = f"sros fleet publish {quote(str(self._keystore.root))} {folder}"
+                remedy = f"First run `{publish} --restored`, which takes this list over."
             raise KeystoreError(
                 f"the certificate of {holder} was revoked",
                 "A revocation list names it, and the ledger does not: the keystore may come from a "

@@ -1010,7 +1010,8 @@ def _first_ca_line(
 ) -> int:
     """Return the number of the first ledger line about any of these CAs.
 
-    It is 0 if one of the CAs has no line, or was renewed with the same key."""
+    It is 0 if one of the CAs has no line, or was renewed with the same key.
+    """
     wanted = {digest(authority) for authority in authorities}
     lines: dict[str, int] = {}
     for number, entry in entries:

@@ -408,7 +408,8 @@ def _profile(
 ) -> Profile:
     """Return the profile with its denials, ``kept_rights`` and the replacements of other rights.
 
-    ``pending`` maps rights to their replacements.  Those of this profile are removed from it."""
+    ``pending`` maps rights to their replacements.  Those of this profile are removed from it.
+    """
     said: dict[tuple[str, str, Level | None], dict[tuple[str, Qualifier], None]] = {}
     for group in profile.groups:
         level = group.protect

@@ -597,7 +597,8 @@ def test_a_key_that_was_replaced_after_the_backup_is_not_certified_again(
     publisher.publish()
     shutil.rmtree(publisher.root)
     backup.rename(publisher.root)
-    assert "First publish with --restored" in sros("renew", publisher.root, "/r2/base").err
+    command = f"First run `sros fleet publish {publisher.root} {publisher.pub} --restored`"
+    assert command in sros("renew", publisher.root, "/r2/base").err
     if renewed_first:
         publisher.pub.rename(publisher.folder / "server")
         publisher.run("renew", "ks", "--all")

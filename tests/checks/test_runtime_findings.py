@@ -101,7 +101,7 @@ def test_the_name_of_a_process_cannot_be_taken_for_another_one(sound_one: Runtim
     node = Process(7, (name,), {DOMAIN: "4, all"}, sound_one.now, libraries=frozenset({"librcl"}))
     (found,) = runtime_findings(with_processes(replace(sound_one, environment={}), node))
     text = found.text.partition("without it: ")[2]
-    assert text == f"process 7 (x? in domain 0? process 1 ?y??2J{'z' * 8}) in domain 4? all"
+    assert text == f"process 7 (x? in domain 0? process 1 ?y??2J{'z' * 8}) in domain '4? all'"
 
 
 def test_a_session_file_of_zenoh_is_security_without_ros_variables(

@@ -1074,6 +1074,11 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     assert list_enclaves(robot.folder / "robot/export") == ("/sros_observer", "/talker")
     robot.remaining = (TALKER, LISTENER)
     assert "as before, without /operator/look\n" in robot.close("--proof").out
+    robot.by_hand = set()
+    there = "start /listener and /operator/look, on other machines, without sros run, too"
+    assert f"sros sees no process in an enclave of this folder; {there}\n" in (
+        robot.close("--undo").err
+    )
 
 
 def test_the_nodes_of_a_process_that_has_several(tmp_path: Path) -> None:

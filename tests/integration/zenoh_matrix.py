@@ -37,7 +37,7 @@ Tried = tuple[str, str, str]
 
 @dataclass(frozen=True)
 class Voice:
-    """A session of an enclave; a ignores_rules one obeys no rules."""
+    """A session of an enclave, which may ignore its own rules."""
 
     enclave: str
     ignores_rules: bool
