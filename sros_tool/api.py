@@ -71,8 +71,8 @@ class AccessAnswer:
     rule, or for Zenoh the key expression with a wildcard that allows it, or "".  ``policy_lines``
     are the places ``FILE:LINE`` in the given policy that the rule comes from.  ``until`` is the
     first expiry among the enclave's files, in UTC.  ``remedy`` says what to do if the cause of a
-    denial is not the policy.  ``counts_key`` says that the enclave's key is not here, and counts as
-    there: on its robot, or in the keystore of which this is a copy.
+    denial is not the policy.  ``counts_key`` says that the enclave's key is not here, and was
+    assumed to exist: on its robot, or in the keystore from which this copy was made.
     """
 
     allowed: bool
@@ -427,7 +427,7 @@ def fleet_status(
         keystore: A keystore with a fleet, or its path.
         robots: The names of some robots; all by default.
         max_age: Robots whose last confirmation is older are ``overdue`` and ``offline``; without
-            it, robots that fetch are, after more than a day without a message.
+            it, robots that fetch are both after a day without a message.
         now: The time from which ages count; the current time by default.
 
     Returns:
@@ -513,8 +513,9 @@ def explain_access(
         name: The absolute ROS name of the topic, service or action; "" for "join".
         kind: The kind of ``name``; without it, "call" and "serve" mean an action if the rights of
             the enclave, the policy or the keystore have an action and no service of that name.
-        vendor: "fastdds" (2.14, or that of ``distribution``), "cyclonedds" (0.10, likewise), or
-            another name that `sros explain --vendor` takes, such as "fastdds-3.2" or "zenoh".
+        vendor: "fastdds" (2.14, or the release in ``distribution``), "cyclonedds" (0.10, or the
+            release in ``distribution``), or another name that `sros explain --vendor` takes, such
+            as "fastdds-3.2" or "zenoh".
         distribution: A ROS 2 distribution, such as "lyrical", whose release of ``vendor``
             decides.
         policy: The policy of the enclave, or its file, in which to find the ``policy_lines``.

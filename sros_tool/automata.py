@@ -639,7 +639,7 @@ def _between(node: _Node, begin: str, end: str) -> _Node:
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """A simple set that includes a complicated one: exact names, and automata."""
+    """A simple set that includes a complicated set: exact names, and automata."""
 
     exact: frozenset[str]
     automata: frozenset[Automaton]

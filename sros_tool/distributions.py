@@ -145,8 +145,7 @@ _ROLLING = "rolling"
 def find_distribution(name: str) -> Distribution:
     """Return a distribution by its name.
 
-    One that is not supported any more is taken to be like the next supported one, and Rolling like
-    the latest.
+    An unsupported distribution counts as the next supported one, and Rolling as the latest.
 
     Raises:
         UsageError: there is no distribution of this name.

@@ -213,7 +213,7 @@ def _check_folders_closed(root: Path, folder: Path, name: str) -> None:
 def _check_joining(
     name: str, folder: Path, state: OpenedEnclave, vendor: Vendor | None, context: JoinContext
 ) -> OpenedEnclave:
-    """Return an enclave with its faults for a DDS vendor, or for all vendors if it is None.
+    """Return an enclave with its faults for a DDS vendor; for all vendors if ``vendor`` is None.
 
     Raises:
         KeystoreError: each of these vendors refuses the enclave, and none of its own faults says

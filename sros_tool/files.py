@@ -33,8 +33,8 @@ def staged_file(
     Args:
         target: the path of the file.
         data: its content.
-        mode: its permission bits from the first byte on, less those of the umask.
-        like: a file whose permission bits and, if permitted, owner it gets.
+        mode: its permission bits from the first byte on, before the umask.
+        like: a file to copy the permission bits and, if permitted, the owner from.
 
     Raises:
         OSError: the file cannot be written; what is at ``target`` stays.
@@ -94,7 +94,7 @@ def write_new_file(
     If root writes it into a folder of the user ``for_user``, that user becomes its owner.
 
     Raises:
-        FileExistsError: something is at ``path`` already, be it a link that leads nowhere.
+        FileExistsError: ``path`` exists already, perhaps as a link that leads nowhere.
         OSError: the file cannot be written; nothing is left of it.
     """
     with Folder(path.parent) as folder:
@@ -152,7 +152,7 @@ def write_new_folder(path: Path, files: Mapping[str, bytes]) -> None:
     """Make the folder ``path`` with these files, as in `new_files`, whole or not at all.
 
     Raises:
-        OSError: it cannot be made, or something other than an empty folder is there.
+        OSError: the folder cannot be made, or ``path`` is something other than an empty folder.
     """
     paths = make_folders(path.parent)
     spare = f".{path.name[:200]}.sros-{secrets.token_hex(4)}"
@@ -243,7 +243,7 @@ def read_toml(data: bytes, what: str, remedy: str = "", *, longest: int = _LONGE
     """Return the tables of a TOML document in a file; ``what`` names the file in errors.
 
     Raises:
-        DocumentError: it is not TOML in UTF-8, too long, or nested too deeply.
+        DocumentError: the file is not TOML in UTF-8, too long, or nested too deeply.
     """
     try:
         return parse_toml(data.decode(), longest)

@@ -228,8 +228,8 @@ class Folder:
     def close_to_others(self, path: str) -> None:
         """Remove all permissions of group and others from a file or folder (chmod go=).
 
-        It stays as it is if it belongs to somebody else than this folder, or has another hard link,
-        which may be elsewhere.
+        It stays as it is if it has another owner than this folder, or another hard link, which may
+        be outside of this folder.
         """
         parent, name = self._folder_and_name(path)
         with self._adding_path_to_errors(path):

@@ -110,7 +110,7 @@ class RefusedError(UnavailableError):
 
 
 class Round(NamedTuple):
-    """What a round of the agent did, and what it found."""
+    """The result of a round of the agent."""
 
     release: int
     """The number of the release that is installed."""
@@ -136,7 +136,7 @@ class Round(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """What a round takes from outside: the time, the zone, the processes, and programs."""
+    """The inputs of a round: time, time zone, processes, and programs to run."""
 
     now: datetime
     zone: tzinfo
@@ -321,7 +321,7 @@ class _Round:
         return installation, True
 
     def _changed_files(self) -> tuple[str, ...] | None:
-        """Return the paths of files that are missing, or not those of the installed release.
+        """Return the paths of files that are missing, or differ from the installed release.
 
         None if no release is installed with all its enclaves, or its seal cannot be read.
         """
@@ -659,7 +659,7 @@ class _Round:
     ) -> _Answer:
         """Return the answer of a server to the first enclave whose certificate it accepts.
 
-        The certificate of one enclave may be revoked already, where a new one is published.
+        Some certificates may already be revoked while their successors wait to be fetched.
 
         Raises:
             SrosError, OSError: what ``ask`` raised, for the last enclave if all were refused.
@@ -730,7 +730,7 @@ def send(
     client_certificate: ClientCertificate | None = None,
     tls_ca: Path | None = None,
 ) -> None:
-    """Put a message into the inbox, in place of the robot's last one.
+    """Put a message into the inbox, in place of the robot's last message.
 
     Args:
         inbox: ``https://…``, ``http://…``, or the path of a folder.
@@ -791,11 +791,11 @@ _NEW_KEYS = "new-keys"
 def _is_due(file: Path, now: datetime) -> bool:
     """Return whether at most a third of the life of the certificate in ``file`` is left.
 
-    A file is written only when it changes, so its modification time tells since when the
-    certificate has been here.
+    A file is written only when it changes, so its modification time shows since when the robot has
+    the certificate.
 
     Raises:
-        SrosError: it cannot be read.
+        SrosError: the certificate cannot be read.
     """
     validity = validity_of(read_certificate(file))
     here_since = time_of_file(file.stat().st_mtime)
@@ -806,7 +806,7 @@ def _enclave_key(folder: Path, name: str, secrets: Secrets) -> PrivateKey:
     """Return the private key of an enclave on this robot, from its file or its token.
 
     Raises:
-        SrosError: there is none, or it cannot be used.
+        SrosError: the enclave has no key, or the key cannot be used.
     """
     place = enclave_path(folder, name)
     if (place / KEY_FILE).exists():

@@ -100,7 +100,7 @@ def pin_root(agent_folder: Path, data: bytes, *, now: datetime) -> str:
         now: the current time.
 
     Raises:
-        FetchError: it is no root metadata that its own keys signed, or it expired.
+        FetchError: ``data`` is not root metadata signed by its own keys, or has expired.
         UnavailableError: the package ``tuf`` is not installed.
     """
     check_tuf()
@@ -258,7 +258,7 @@ def _number(target: TargetFile | None, source: str, robot: str) -> int:
     """Return the number of the release that the metadata describes.
 
     Raises:
-        FetchError: there is none for the robot, or it is too large.
+        FetchError: no release is published for the robot, or it is too large.
     """
     if target is None:
         raise FetchError(
@@ -307,7 +307,7 @@ _CLOCK = "set the clock of this robot, if it is wrong"
 
 
 def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
-    """Return what an error of the client of TUF means for the robot."""
+    """Return the `FetchError` for an error of the TUF client."""
     from tuf.api import exceptions
 
     why = _sentence(error)

@@ -5,8 +5,8 @@ robot already trusts sealed the release, and that nothing in it is older than th
 Then each enclave is tried as DDS would load it, with the robot's key.  An enclave that cannot be
 used keeps its files, and no other enclave waits for it.
 
-Units and containers mount the folders of enclaves, so a folder stays the same folder, and a file
-that does not change is not touched.
+Units and containers mount the folders of enclaves, so no folder is replaced, and a file that does
+not change is not touched.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def install_release(
         folder: the security folder of this robot.
         release: the release; so far, its files were only compared with its seal.
         robot: the name of this robot.
-        now: the time of the clock, or a later one that verified documents prove has passed.
+        now: the time of the clock, or a later time that verified documents prove to be over.
         installed: the highest number of a release that was accepted before.
         pinned: SHA-256 of permissions CAs that count as trusted, too.
         new_keys: keys that wait for their certificate, by enclave.

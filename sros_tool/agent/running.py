@@ -45,7 +45,7 @@ _ASK_SECONDS = 30.0
 
 
 class EnclaveProcesses(NamedTuple):
-    """What runs in the enclaves of a security folder."""
+    """The processes in the enclaves of a security folder."""
 
     states: Mapping[str, RunningFiles]
     """The files that the processes of each enclave have loaded, of those that run from the folder.
@@ -253,10 +253,10 @@ def _due_units(
     routers: Iterable[str],
     active: Iterable[str],
 ) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield the units to restart and their enclaves, those of Zenoh routers first.
+    """Yield the units to restart and their enclaves, units of Zenoh routers first.
 
-    The order is otherwise that of the settings; then come the units of `sros units` in ``active``
-    that run in enclaves without a unit in the settings.
+    Then come the units of the settings, in their order, and the units of `sros units` in ``active``
+    for enclaves without a unit in the settings.
     """
     units = [
         (unit.name, unit.enclaves)

@@ -41,7 +41,7 @@ class AgentSettings:
     """The settings of a robot's agent.
 
     ``source`` and ``inbox`` are URLs (https, http) or absolute paths of folders.  ``authorities``
-    are the SHA-256 of permissions CAs that are trusted besides those that the folder has.
+    are the SHA-256 of permissions CAs that are trusted in addition to the CAs in the folder.
     ``tls_ca`` is a file with the CAs of the servers, or "" for those of the system.  With
     ``new_key``, the agent makes a new key for each renewal.  With ``restart``, it restarts units:
     ``units``, and those of `sros units` that are active; ``restart_if`` is a command that exits

@@ -44,7 +44,7 @@ class AgentState:
     verified documents begin to be valid then.  ``due`` are the enclaves whose processes were not
     yet seen with the installed files, since the start ``boot`` of the machine (see `boot_id`); of
     those in ``unseen``, no process was seen.  ``files`` maps enclaves to a digest of their files at
-    the end of the last round: other files, from whomever, make a restart due.  ``fetched`` and
+    the end of the last round: other files, whoever wrote them, make a restart due.  ``fetched`` and
     ``sent`` tell when the source and the inbox were last reached.  ``repaired`` is a sentence on
     files that were not those of the release and were replaced, at ``repaired_at``.
     """
@@ -90,7 +90,7 @@ def _state_from(value: Any) -> AgentState:
     """Return the state in a JSON value.
 
     Raises:
-        ValueError, TypeError, KeyError, InvalidNameError: it is not of that form.
+        ValueError, TypeError, KeyError, InvalidNameError: the value has another form.
     """
     if not isinstance(value, dict) or value.pop("format", None) != _FORMAT:
         raise ValueError("another format")
@@ -130,16 +130,17 @@ def write_state(folder: Path, state: AgentState) -> None:
 
 
 def mark_outdated(folder: Path) -> None:
-    """Note by the time of the file that the state is not the last one.
+    """Mark the state as outdated, by the modification time 0 of its file.
 
-    `write_state` ends that.  On a file system that became read-only, the age of the state shows it.
+    The next `write_state` removes the mark.  On a file system that became read-only, only the age
+    of the state shows that it is outdated.
     """
     with suppress(OSError), Folder(agent_folder(folder)) as opened:
         opened.set_time(_STATE, 0)
 
 
 def _outdated_sentences(folder: Path) -> Iterator[str]:
-    """Yield a sentence if the last round could not write what it did."""
+    """Yield a sentence if the last round could not write its state."""
     with suppress(OSError):
         if (agent_folder(folder) / _STATE).stat().st_mtime == 0:
             yield (
@@ -171,7 +172,7 @@ def agent_lock(folder: Path) -> Iterator[None]:
     """Let only one agent at a time work in ``folder``.
 
     Raises:
-        KeystoreError: another one does.
+        KeystoreError: another agent works in it.
     """
     with Folder(agent_folder(folder)) as opened:
         handle = opened.open_private(_LOCK)
@@ -204,7 +205,7 @@ class InitializedAgent(NamedTuple):
 
 
 class AgentStatus(NamedTuple):
-    """What the agent of a robot last did, and what waits."""
+    """The last round of a robot's agent, and its pending work."""
 
     folder: Path
     """FOLDER, as given on the command line."""
@@ -267,7 +268,7 @@ def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStat
 
 
 def _expired_since(folder: Path, state: AgentState, now: datetime) -> Iterator[str]:
-    """Yield sentences on enclaves of which a file has expired since the last round."""
+    """Yield sentences on enclaves with a file that has expired since the last round."""
     known = {problem.partition(" could not start")[0] for problem in state.problems}
     for name in enclave_names(folder):
         with suppress(SrosError, OSError):

@@ -1,8 +1,7 @@
 """How files of a publishing folder get to the robot: by https, http, or from a folder.
 
-Both classes are what `tuf` fetches with, while their ``connection`` is entered.  They allow neither
-endless nor slow answers, follow no redirect and no link, and leave it to `tuf` to verify what
-comes.
+`tuf` fetches through either class, while its ``connection`` is entered.  They allow neither endless
+nor slow answers, follow no redirect and no link, and leave the verification of files to `tuf`.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ class FolderTransport(FetcherInterface):
 class HttpTransport(FetcherInterface):
     """Gets the files of a publishing folder from a web server, over one connection.
 
-    Its ``connection`` has to be entered: what still goes on after some minutes is cut off.
+    Its ``connection`` has to be entered, and is cut off after some minutes.
     """
 
     def __init__(
@@ -83,7 +82,7 @@ class HttpTransport(FetcherInterface):
 
         Raises:
             UsageError: ``url`` has another form.
-            OSError: a file of the certificates cannot be read, or is none.
+            OSError: a certificate file cannot be read, or has no certificate.
         """
         parts = urlsplit(url)
         self.base = url.rstrip("/")

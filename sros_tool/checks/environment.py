@@ -408,9 +408,9 @@ _NEEDED = {
 
 
 def secured_by(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
-    """Yield, as clauses, what secures the nodes that are started in an environment and a folder.
+    """Yield clauses on settings that secure the nodes started in an environment and a folder.
 
-    Also what may secure them, because sros cannot read it.
+    Settings that sros cannot read count as well, because they may secure nodes.
     """
     if environment.get(ENABLE) == "true":
         yield f"{ENABLE} is set"

@@ -46,10 +46,11 @@ _Kinds = Mapping[str, tuple[Hashable, Hashable]]
 def folded_findings(
     groups: Iterable[tuple[Finding, ...]], fleet: Fleet | None
 ) -> Iterator[tuple[tuple[Finding, ...], str]]:
-    """Merge single findings that differ only in one robot or one enclave; yield the first of each.
+    """Merge single findings that differ only in one robot or one enclave.
 
-    The text that comes with it names the other robots or enclaves; it is "" if there are none.
-    Findings that share a cause, or that have a line or related places, stay as they are.
+    Yields the first finding of each group, with a text that names the robots or enclaves of the
+    others ("" if there are none).  Findings that share a cause, or that have a line or related
+    places, stay as they are.
     """
     alike: dict[Hashable, list[tuple[tuple[Finding, ...], str]]] = {}
     for group, others in _merge_robots(groups, fleet):
@@ -78,12 +79,12 @@ def _key_without_enclave(group: tuple[Finding, ...]) -> Hashable:
 def _merge_robots(
     groups: Iterable[tuple[Finding, ...]], fleet: Fleet | None
 ) -> Iterator[tuple[tuple[Finding, ...], str]]:
-    """Merge single findings that differ only in one robot; yield the first of each kind.
+    """Merge single findings that differ only in one robot.
 
-    The text that comes with it names the other robots; it is "" if there are none.  If a finding
-    names several robots, it is merged by the robot that merges it with the most findings; if many
-    of the merged findings differ only in the other robots that they name, these become one, too.
-    Findings that share a cause stay as they are, and without ``fleet``, all findings do.
+    Yields the first finding of each group, with a text that names the robots of the others ("" if
+    there are none).  A finding that names several robots is merged by the robot that gives the
+    largest group; many merged findings that differ only in another robot are merged again. Findings
+    that share a cause stay as they are, and without ``fleet``, all findings do.
     """
     read = [(group, _kinds(group, fleet) if fleet else {}) for group in groups]
     robots: dict[Hashable, set[str]] = defaultdict(set)

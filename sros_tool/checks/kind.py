@@ -35,7 +35,7 @@ class Severity(StrEnum):
         return _WEIGHTS[self]
 
     def __lt__(self, other: str) -> bool:
-        """Return whether this is less severe; raise `ValueError` for any other word."""
+        """Return whether this severity is lower; raise `ValueError` for an unknown word."""
         return self.weight < Severity(other).weight
 
     def __le__(self, other: str) -> bool:
@@ -43,7 +43,7 @@ class Severity(StrEnum):
         return self.weight <= Severity(other).weight
 
     def __gt__(self, other: str) -> bool:
-        """Return whether this is more severe."""
+        """Return whether this severity is higher than ``other``."""
         return self.weight > Severity(other).weight
 
     def __ge__(self, other: str) -> bool:
@@ -140,7 +140,7 @@ class Finding(NamedTuple):
     """A finding of ``sros check``.
 
     ``own_remedy`` replaces the remedy of the kind unless it is empty.  An accepted finding counts
-    as a note.  ``cause`` is set if others have the same cause.
+    as a note.  ``cause`` is set if other findings have the same cause.
     """
 
     kind: FindingKind

@@ -378,7 +378,7 @@ def _is_service_of_every_node(name: str) -> bool:
 
 
 def _offered_by_others_findings(unused_statements: Iterable[_Statement]) -> Iterator[Finding]:
-    """Yield findings about services that nobody calls, offered by their node and by others."""
+    """Yield findings about uncalled services of a node that another enclave may offer, too."""
     owners = {
         (statement.right.right, statement.name): statement
         for statement in unused_statements
@@ -689,7 +689,7 @@ def _is_not_shipped(folder: str) -> bool:
 
 
 def _denied_at_start(lacking: Sequence[_Lacking]) -> str:
-    """Return a sentence on what nodes do when they start although the policy denies it."""
+    """Return a sentence on actions of each starting node that the policy denies."""
     nodes = list(dict.fromkeys(gap.node for gap in lacking))
     kinds = Counter(gap.finding.kind for gap in lacking)
     what = [
@@ -1227,8 +1227,8 @@ def _robots_in_unknown_groups(named: Collection[str], fleet: Fleet) -> str:
 
     ``named`` are the groups in the policies, with "" for enclaves of all robots.  Other groups may
     belong to policies that were not named.  So a group counts only if no other robot has it, and
-    its name is like that of a group in the policies, but for more than a number.  A robot without a
-    group counts if every enclave is for a group.
+    its name is similar to a group in the policies, other than in a number.  A robot without a group
+    counts if every enclave is for a group.
     """
     for_all, groups = not named or "" in named, {*named} - {""}
     clauses = []
@@ -1263,7 +1263,7 @@ def _robots_on_one_domain(
 ) -> tuple[Robot, Robot] | None:
     """Return two robots that may be in the same ROS domain, or None.
 
-    The first is one of ``others`` (without them, of ``robots``), the second one of ``robots``.
+    The first robot is from ``others`` (None: from ``robots``), the second from ``robots``.
     """
     seen = {robot.domain: robot for robot in others or ()}
     for robot in robots:

@@ -238,7 +238,7 @@ class _Loaded:
 def _loaded_files(
     enclave: ProcessEnclave, newer_files: Sequence[str], started: datetime
 ) -> _Loaded:
-    """Return the files that a process loaded; the ledger has those that changed since."""
+    """Return the files that a process loaded; files that changed since are in the ledger."""
     windows: dict[str, Window] = {}
     changed = {file.split()[0] for file in newer_files}
     certificate = next(iter(_certificates_in(enclave, CERTIFICATE_FILE)), None)
@@ -874,7 +874,7 @@ def _different_security_findings(
 
 
 def _unseen_process_findings(running: RunningProcesses) -> Iterator[Finding]:
-    """Yield a finding for each node that could not be examined, and one with their number."""
+    """Yield a finding for each node that could not be examined, and one with their count."""
     remedy = _ROOT_MAY_NOT if running.by_root else ""
     for process in running.unseen:
         if process.speaks:

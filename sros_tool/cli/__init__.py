@@ -24,7 +24,7 @@ from types import FrameType
 
 
 def main(arguments: list[str] | None = None, *, name: str = "sros") -> None:
-    """Run ``sros`` and exit with 0 (yes or done), 1 (no, or findings) or 2 (not answered or done).
+    """Run ``sros`` and exit with 0 (yes, done), 1 (no, findings) or 2 (not answered, not done).
 
     ``arguments`` are by default the arguments of the process; ``name`` is the program's name in
     help.

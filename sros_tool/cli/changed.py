@@ -134,7 +134,7 @@ def print_plan(root: Path, changes: Sequence[Change]) -> None:
 
 
 def _change_lines(root: Path, paths: Sequence[str]) -> Iterator[str]:
-    """Yield the paths of files; those that differ only in the robot of a fleet are one."""
+    """Yield the paths of files; paths that differ only in the robot of a fleet share a line."""
     from sros_tool.fleet.robots import folded
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.reader import Keystore

@@ -496,7 +496,7 @@ def _circumstances(
     fleet_file: Path | None = None,
     paths: Sequence[Path] = (),
 ) -> Circumstances:
-    """Return the options; placeholders are for the fleet of its file, or of the only keystore."""
+    """Return the options; the fleet is from --fleet, or from the only keystore."""
     from sros_tool.checks.targets import Circumstances
     from sros_tool.cli.common import local_zone
     from sros_tool.keystore.layout import is_keystore
@@ -714,9 +714,9 @@ def _print_markdown(chosen_findings: ChosenFindings, fleet: Fleet | None) -> Non
 
 
 def _fleet_of(circumstances: Circumstances, paths: Sequence[Path]) -> Fleet | None:
-    """Return the fleet of policy files, with the enclave paths that they define, or of a keystore.
+    """Return the fleet of policies, with their enclave paths, or the fleet of a keystore.
 
-    It is None if there is none, or if it cannot be read.
+    None if there is no fleet, or if it cannot be read.
     """
     from sros_tool.fleet.expansion import fleet_with_enclaves
     from sros_tool.keystore.fleet import load_fleet
@@ -911,7 +911,7 @@ def _watch_processes(
     *,
     as_json: bool,
 ) -> None:
-    """Report what changes among the findings about processes, until SIGINT or SIGTERM."""
+    """Report changes of the findings about processes, until SIGINT or SIGTERM."""
     from sros_tool.checks.processes import process_findings
     from sros_tool.checks.runtime import FindingNews
     from sros_tool.checks.vulnerabilities import vulnerability_findings

@@ -317,8 +317,8 @@ def chosen_enclaves(
 ) -> tuple[str, ...]:
     """Return the enclaves that the arguments and the options of `several_enclaves` name.
 
-    Raises: UsageError: none is named. KeystoreError: a pattern matches no enclave, or a robot has
-    none.
+    Raises: UsageError: no enclave is named. KeystoreError: a pattern matches no enclave, or a robot
+    has none.
     """
     check_chosen(names, patterns, robots, all_enclaves=all_enclaves)
     if not (patterns or robots or all_enclaves):
@@ -526,7 +526,7 @@ def check_output(output: Path, *, force: bool) -> None:
     Devices and pipes need no ``force``, because writing does not replace them.
 
     Raises:
-        UsageError: it is ``-`` or a folder, its folder is missing, or the file exists without
+        UsageError: ``output`` is ``-`` or a folder, its folder is missing, or it exists without
             ``force``.
     """
     if str(output) == "-":
@@ -840,7 +840,7 @@ def _read_at_most(path: Path, count: int) -> bytes:
     Opening a pipe as usual would wait for a writer without end.
 
     Raises:
-        OSError: it cannot be read, or it is a pipe that nobody writes to.
+        OSError: the file cannot be read, or is a pipe that nobody writes to.
     """
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:

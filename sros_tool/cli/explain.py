@@ -920,9 +920,10 @@ def _who_lines(
 ) -> Iterator[str]:
     """Yield the allowed enclaves, the enclaves whose participant does not start now, and counts.
 
-    The enclaves of a fleet are grouped by robot.  ``domain`` is that of --domain, ``domains`` are
-    those of the keystore, None for an export or a policy: if only some of them allow the operation,
-    the line names these.  ``asked_in`` says where the enclaves are: " in this export", or "".
+    The enclaves of a fleet are grouped by robot.  ``domain`` is the value of --domain.  ``domains``
+    are the domains of the keystore (None for an export or a policy): if only some domains allow the
+    operation, its line names them.  ``asked_in`` says where the enclaves are: " in this export", or
+    "".
     """
     from sros_tool.fleet.robots import folded
 

@@ -758,7 +758,7 @@ def _list_in_force(status: FleetStatus) -> tuple[int, int] | None:
 
 
 def _remedies(root: Path, to_dos: Collection[str]) -> Mapping[str, str]:
-    """Return how to do what robots need, by what it is called in the column `to do`."""
+    """Map each entry of the column `to do` to instructions."""
     from sros_tool.keystore.fleet import publish_command
 
     where = quote(str(root))
@@ -880,8 +880,10 @@ def _rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator[tupl
 
 
 def _page_rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """Yield the state of each group of robots, their names, when the first of them confirmed and
-    when the first of their files expires, what to do, and why.
+    """Yield a row for each group of robots.
+
+    Its columns: state, names, earliest confirmation, earliest expiry of a file, what to do, and
+    why.
     """
     from sros_tool.validity import iso
 

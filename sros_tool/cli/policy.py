@@ -417,7 +417,7 @@ def _difference_lines(
 ) -> list[str]:
     """Return the lines for a difference; lines that differ only in the robot are merged.
 
-    ``first`` and ``second`` are the fleets of the two sides, which are called ``sides``.
+    ``first`` and ``second`` are the fleets of the two sides, ``sides`` their names.
     """
     from sros_tool.fleet.robots import folded
 

@@ -446,7 +446,7 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
 
 
 def _finding_line(finding: Finding) -> str:
-    """Return a finding in one line; that of a dropped requirement also names its line in BASE."""
+    """Return a finding in one line; for a dropped requirement also with its line in BASE."""
     from sros_tool.checks.requirements import DROPPED
 
     subject = "" if finding.subject == finding.file else f"{finding.subject}: "

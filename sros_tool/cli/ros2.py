@@ -1,8 +1,8 @@
 """The verbs of sros as `ros2 security`, a command that the program ``ros2`` of ros2cli loads.
 
 ros2cli loads the class that the entry point ``security`` of the group ``ros2cli.command`` names,
-and calls its methods; it needs nothing else of it (ros2cli 0.32, ``ros2cli/command/__init__.py``).
-So this module imports nothing of ROS.
+and calls its methods (ros2cli 0.32, ``ros2cli/command/__init__.py``). So this module imports
+nothing of ROS.
 """
 
 from __future__ import annotations

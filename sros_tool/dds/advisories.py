@@ -170,7 +170,7 @@ def read_advisories(path: Path) -> tuple[Advisory, ...]:
 
 
 def parse_advisories(data: bytes, label: str) -> tuple[Advisory, ...]:
-    """Return the advisories in an OSV record or a list of records; errors call it ``label``.
+    """Return the advisories in OSV records; ``label`` is the name of ``data`` in errors.
 
     Records with the same id become one advisory, which has the releases of all of them.  A
     withdrawn record affects no release.  Products that sros does not know are left out.

@@ -149,7 +149,7 @@ def attributes(rule: type[DomainRule | TopicRule]) -> tuple[Attribute, ...]:
 
 
 def settings(rule: type[DomainRule | TopicRule], *, protect: bool) -> dict[str, Any]:
-    """Map the attributes of a rule to values that protect, or with ``protect`` False do not."""
+    """Map the attributes of a rule to values that protect; if not ``protect``, to open values."""
     return {
         attribute.name: attribute.portable if protect else attribute.open
         for attribute in attributes(rule)
@@ -205,7 +205,7 @@ def _attribute_lines(rule: DomainRule | TopicRule) -> Iterator[str]:
 
 
 def parse_governance(data: bytes, name: str = "the governance document") -> Governance:
-    """Return the governance document in ``data``, which errors call ``name``.
+    """Return the governance document in ``data``; ``name`` is its name in errors.
 
     Raises:
         DocumentError: ``data`` is not a governance document.

@@ -179,7 +179,7 @@ def _write_list(lines: list[str], item: str, texts: tuple[str, ...]) -> None:
 
 
 def parse_permissions(data: bytes, name: str = "the permissions document") -> Permissions:
-    """Return the permissions document in ``data``, which errors call ``name``.
+    """Return the permissions document in ``data``; ``name`` is its name in errors.
 
     Raises:
         DocumentError: ``data`` is not a permissions document.
@@ -364,8 +364,8 @@ def portability_problems(
 ) -> Iterator[tuple[str, str]]:
     """Yield (id, clause) for each part of a document that vendors do not all read alike.
 
-    ``meets_some_of`` returns, for some expressions, the function that tells whether another
-    expression matches a name that one of them matches.
+    ``meets_some_of(expressions)`` returns a predicate: whether an expression matches a name that
+    one of ``expressions`` matches.
     """
     if signed_bytes >= MAX_SIGNED_BYTES:
         yield "portable.document-size", f"the signed permissions have {signed_bytes} bytes"
@@ -437,7 +437,7 @@ def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
 
 
 def mistaken_names(names: Iterable[str]) -> list[tuple[str, str]]:
-    """Return pairs of enclaves of which Cyclone DDS takes the first for the second, sorted.
+    """Return sorted pairs of enclaves (a, b) in which Cyclone DDS takes a for b.
 
     Cyclone DDS checks only that the second subject has every part of the first: so the permissions
     of ``/robot/admin`` fit the identity ``/robot``.

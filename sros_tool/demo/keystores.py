@@ -48,7 +48,7 @@ from sros_tool.zenoh.configuration import Mode
 
 @dataclass(frozen=True)
 class KeystoreSpec:
-    """What is needed to create keystores: ROS topic (absolute), domains, template, and time.
+    """The inputs for creating keystores: ROS topic (absolute), domains, template, and time.
 
     ``endpoint`` is where a Zenoh router listens.
     """

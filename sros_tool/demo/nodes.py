@@ -36,8 +36,9 @@ class NodeOptions:
     server that an action client uses ("": unknown).  ``also`` are further topics for an observer.
     On Zenoh, messages of a talker have ``size`` bytes or more, and ``patience`` is how long a
     process waits for its connection, in seconds.  A talker or listener ``by_hand`` needs no right
-    but that of its topic, and reports what others have on the topic (`OtherTypes`).  A talker on
-    rclpy publishes messages of the ROS type ``type`` with default values, if it is not `STRING`.
+    but that of its topic, and reports the types of other endpoints on the topic (`OtherTypes`).  A
+    talker on rclpy publishes messages of the ROS type ``type`` with default values, if it is not
+    `STRING`.
     """
 
     role: str
@@ -180,9 +181,9 @@ class Node(Protocol):
         """Return the type of each discovered publisher, or else subscription, of a topic."""
 
     def count(self, name: str, kind: str, on_count: Callable[[int], None]) -> str:
-        """Count messages of a type that is no string; return why that cannot be done, or "".
+        """Count messages of a type other than string; return why that cannot be done, or "".
 
-        ``on_count`` is called with the number of messages that were received since.
+        ``on_count`` is called with the number of messages since its last call.
         """
 
     def serve(self, name: str, answer: Callable[[str], str]) -> None:
@@ -223,7 +224,7 @@ class NodeRole:
             self.act()
 
     def _other_types(self, *, of_publishers: bool) -> OtherTypes | None:
-        """Begin to discover what others have on the topic of a node by hand."""
+        """Begin to discover other endpoints on the topic of a node started by hand."""
         options, node = self._options, self._node
         if not options.by_hand:
             return None
@@ -244,7 +245,7 @@ class NodeRole:
 
 
 class OtherTypes:
-    """What others have on the topic of a talker or listener by hand.
+    """The types of other endpoints on the topic of a talker or listener started by hand.
 
     ``types`` returns the ROS type of each publisher, or for a talker of each subscription; a
     listener gets ``count``, as `Node.count` with a topic.

@@ -44,7 +44,7 @@ from sros_tool.wording import counted, first_few
 
 @dataclass(frozen=True)
 class PartyRecord:
-    """What was recorded of a process that has ended.
+    """The record of a process that has ended.
 
     ``text`` marks the messages of a talker; ``topic`` is its ROS topic; ``through`` is the name of
     the library that it used; ``output`` is what it printed; ``status`` is its exit status (negative
@@ -61,7 +61,7 @@ class PartyRecord:
 
 @dataclass(frozen=True)
 class RowRecord:
-    """What was recorded of a row that has ended.
+    """The record of a row that has ended.
 
     ``window`` is the start and end of the observation (seconds of CLOCK_MONOTONIC), or None if a
     party was not ready in time.  ``injected`` counts packets that were sent again or changed;
@@ -530,7 +530,7 @@ class KeystoreSummary(NamedTuple):
     elsewhere: int = 0
     """Number of enclaves whose key is elsewhere; the demo did not try them."""
     not_tried: tuple[str, ...] = ()
-    """Tests that a proof needs and the demo did not run; with any, the exit status is not 0."""
+    """Tests that a proof needs and the demo did not run; if there are any, the status is not 0."""
 
 
 @shows("name", "title", "as_expected", "cast", "keystore", "rows", "cost")
@@ -633,7 +633,7 @@ class DemoResult:
 
     @property
     def exit_status(self) -> int:
-        """Exit status: 0 as expected, 1 a row is not, `NOT_DONE` a keystore could not be proved."""
+        """Exit status: 0 all as expected, 1 a row was not, `NOT_DONE` a keystore was not proved."""
         if any(scenario.wrong for scenario in self.scenarios):
             return 1
         return 0 if self.as_expected else NOT_DONE

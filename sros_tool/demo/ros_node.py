@@ -85,7 +85,7 @@ def _run_role(build: _Build, options: NodeOptions, arguments: Sequence[str]) -> 
 
 
 def _create_node_by_hand(name: str) -> Any:
-    """Return a node without the parts that would need the rights of a node of this name."""
+    """Return a node without /rosout, parameters and type descriptions, which need more rights."""
     import rclpy
     from rclpy.parameter import Parameter
 
@@ -157,7 +157,7 @@ def _message_class(kind: str) -> Any:
     """Return the class of a ROS type such as ``geometry_msgs/msg/Twist``.
 
     Raises:
-        ImportError: its package is not installed, or does not have it.
+        ImportError: the package of the type is not installed, or lacks the type.
     """
     package, _, name = kind.replace("/", ".").rpartition(".")
     try:

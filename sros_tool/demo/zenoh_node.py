@@ -184,7 +184,7 @@ class _ZenohNode:
         return call
 
     def watch(self) -> None:
-        """Begin to discover nodes and what they have, by the tokens in the graph."""
+        """Begin to discover nodes and their endpoints, by the tokens in the graph."""
 
         def change(sample: zenoh.Sample) -> None:
             token = str(sample.key_expr)
@@ -235,7 +235,7 @@ class _ZenohNode:
 
 
 def _kind_of(token: str) -> str:
-    """Return the kind of what a graph token announces."""
+    """Return the kind of entity that a graph token announces."""
     return token.split("/")[5]
 
 

@@ -226,7 +226,7 @@ class DeniedRight:
     ``nodes`` are the full names of the nodes.  ``right.name`` is a DDS topic if it has no ROS name.
     ``endpoints`` are the endpoints that the nodes need.  With ``by_rule``, a deny rule denies the
     right, so that a new allow rule would not help.  With ``new_enclave``, the node has no enclave
-    yet, and that of ``right`` is a proposal.
+    yet, and the enclave of ``right`` is a proposal.
     """
 
     right: Right
@@ -450,7 +450,7 @@ _STRAYS = "not judged, because the writers or readers of these topics belong to 
 
 
 def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
-    """Return notes on what was observed but not judged, each with its number in words.
+    """Return notes on observed things that were not judged, each with their number in words.
 
     The words are "" for tools that only observe.
     """

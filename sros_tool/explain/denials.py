@@ -378,7 +378,7 @@ def _denied_common_part(
     node_rights: frozenset[NodeRight],
     common: CommonParts,
 ) -> tuple[str, ...]:
-    """Return the first common part of which a node has no right and was denied one, or ()."""
+    """Return the first common part of which a node has no right and was denied a right, or ()."""
     if is_expression(profile[1]):
         return ()
     for part in _NODE_PARTS:

@@ -527,7 +527,7 @@ class _Examiner:
         self._evaluators: dict[tuple[Vendor, str], Evaluator] = {}
 
     def is_security_message(self, hit: _Hit) -> bool:
-        """Return whether a hit is a security message; one line is not if the enclave "/" exists."""
+        """Return whether a hit is a security message; not `RUNS_OPEN` if the enclave / exists."""
         return hit.meaning is not RUNS_OPEN or self._find("/") is None
 
     def message(self, hits: list[_Hit]) -> LogFinding:

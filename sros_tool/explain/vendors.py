@@ -158,7 +158,7 @@ DdsExplanation = VendorExplanation | Comparison
 
 
 class Compared(Enum):
-    """Whose decisions are compared: those of all vendors, or of all distributions."""
+    """The compared decisions: of all vendors, or of all distributions."""
 
     VENDORS = auto()
     DISTRIBUTIONS = auto()
@@ -173,7 +173,7 @@ def explain_on_dds(
     kind: str | None = None,
     compared: Compared | None = None,
 ) -> DdsExplanation:
-    """Return the decision of the chosen vendor, or those of all vendors or distributions.
+    """Return the decision of the chosen vendor, or of all vendors or distributions.
 
     ``chosen_vendor`` is the vendor and the reason to choose it; ``kind`` is the kind of the name
     (topic, service or action) if the user gave it; ``compared`` says what is compared.
@@ -353,13 +353,13 @@ class VendorOutcome(NamedTuple):
     expression: str
     """The expression that decided, or null."""
     domains: str = ""
-    """The ROS domains in which the enclave may do it, such as ``10`` or ``10,20``, or null."""
+    """The ROS domains in which the enclave has the right, such as ``10`` or ``10,20``, or null."""
     anybody: bool = False
-    """Whether the enclave's governance also allows it to processes without an identity."""
+    """Whether the enclave's governance also gives the right to processes without an identity."""
 
     @property
     def allowed(self) -> bool:
-        """Whether the enclave may do it."""
+        """Whether the enclave has the right that was asked for."""
         return self.outcome.ok
 
     @property
@@ -396,7 +396,7 @@ class WhoByVendor(NamedTuple):
 
     @property
     def anybody(self) -> bool:
-        """Whether processes without an identity may do it, too, as the governance admits them."""
+        """Whether processes without an identity have the right, too, by the governance."""
         return any(outcome.anybody for outcome in self.enclaves)
 
     @property
@@ -484,7 +484,7 @@ class VendorOfPolicy(NamedTuple):
         return WhoByVendor(str(question), self.vendor, self.why, self.asking.domain, outcomes)
 
     def notes(self, outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
-        """Yield a note if processes without an identity may do it, too."""
+        """Yield a note if processes without an identity have the right, too."""
         return _note_on_anybody(outcomes, f"Change the template, or run {REFUSE_STRANGERS}.")
 
 

@@ -41,11 +41,11 @@ class EnclaveOutcome(Protocol):
 
     @property
     def allowed(self) -> bool:
-        """Whether the enclave may do it."""
+        """Whether the enclave has the right that was asked for."""
 
     @property
     def anybody(self) -> bool:
-        """Whether processes without an identity may do it, too."""
+        """Whether processes without an identity have the right, too."""
 
     @property
     def wildcard(self) -> str:
@@ -57,7 +57,7 @@ class EnclaveOutcome(Protocol):
 
     @property
     def domains(self) -> str:
-        """The ROS domains in which the enclave may do it, such as 10,20; "" for none."""
+        """The ROS domains in which the enclave has the right, such as 10,20; "" for none."""
 
 
 _Outcome = TypeVar("_Outcome", bound=EnclaveOutcome)
@@ -93,7 +93,7 @@ class AnswerForAll(NamedTuple):
 
     @property
     def allowed(self) -> bool:
-        """Whether any enclave may do it, or processes without an identity."""
+        """Whether any enclave has the right, or processes without an identity have it."""
         return any(outcome.allowed or outcome.anybody for outcome in self.outcomes)
 
 
@@ -155,10 +155,12 @@ def names_meant(decider: Decider, question: Question, enclaves: Container[str]) 
 def first_allowing_domain(
     parts: Iterable[DomainSet], decide: Callable[[int], _Outcome]
 ) -> tuple[_Outcome, str]:
-    """Return the decision of the first domain that allows it, or else of the first domain.
+    """Return the decision of the first domain that gives the right, else of the first domain.
 
-    Also returns the domains that allow it, as text.  ``decide`` is asked about one domain of each
-    part, because all domains of a part have the same rules.
+    Also returns the domains that give the right, as text.
+
+    ``decide`` is asked about one domain of each part, because all domains of a part have the same
+    rules.
     """
     outcomes = [(part, decide(next(iter(part)))) for part in parts]
     allowing = [(part, outcome) for part, outcome in outcomes if outcome.allowed]

@@ -114,7 +114,7 @@ class ZenohFile(NamedTuple):
 
 @shows("enclave", "problem", null_if_empty=("problem",))
 class Reached(NamedTuple):
-    """An enclave that has the right at the other end, such as to subscribe to what is published."""
+    """An enclave that has the right at the other end, such as to subscribe to a published topic."""
 
     enclave: str
     """The enclave."""
@@ -179,12 +179,12 @@ class ZenohAnswer:
 
     @property
     def anybody(self) -> bool:
-        """Whether processes without an identity may do it, too: the rules name certificates."""
+        """Whether processes without an identity have the right, too, by the rules."""
         return False
 
     @property
     def in_brief(self) -> ZenohInBrief:
-        """Whether Zenoh allows it, and why."""
+        """Whether Zenoh allows the access, and why."""
         mode = self.mode.value if self.mode else None
         return ZenohInBrief(self.allowed, mode, self.text, self.outcome)
 
@@ -210,7 +210,7 @@ class ZenohAnswer:
 
     @property
     def dropped(self) -> Check | None:
-        """The check that drops a message, or None; if several do, one on data."""
+        """The check that drops a message, or None; a check on data if several drop messages."""
         return _check_to_report((check for check in self.checks if not check.allowed), self.enclave)
 
     @property
@@ -246,7 +246,7 @@ class ZenohEnclaveOutcome(NamedTuple):
     wildcard: str
     """The key expression that allows the right, if it is a wildcard, or null."""
     domains: str
-    """The ROS domains in which the enclave may do it, such as ``10`` or ``10,20``, or null."""
+    """The ROS domains in which the enclave has the right, such as ``10`` or ``10,20``, or null."""
 
 
 class WhoOnZenoh(NamedTuple):
@@ -278,7 +278,7 @@ class ZenohEvaluator:
     ) -> None:
         """Read the routers.
 
-        In a copy of a keystore without any keys, they count as there, except for ``joining``.
+        In a copy of a keystore without any keys, keys count as present, except for ``joining``.
         """
         keystore.check()
         self._counts_keys = not (joining or keystore.has_keys)
@@ -326,7 +326,7 @@ class ZenohEvaluator:
         )
 
     def _router_of(self, enclave: str) -> ZenohFile:
-        """Return the file of the router whose rules name an enclave; else the first one's."""
+        """Return the file of the router whose rules name an enclave; else of the first router."""
         for file in self.routers.values():
             if file.process and file.process.access.rules_for(enclave):
                 return file
@@ -772,8 +772,8 @@ _DATA = (Message.PUT, Message.QUERY, Message.LIVELINESS_TOKEN)
 def _check_to_report(checks: Iterable[Check], enclave: str) -> Check | None:
     """Return the check that an answer reports; None if there is none.
 
-    A check of data comes before other checks, and after that, a check that another enclave makes
-    before one that ``enclave`` itself makes.
+    Checks of data come before other checks; then checks by other enclaves come before checks by
+    ``enclave`` itself.
     """
     return min(
         checks,
@@ -999,7 +999,7 @@ class ZenohExplanation(NamedTuple):
 
     @property
     def change(self) -> PolicyChange | None:
-        """The smallest change of the policy that would allow it, or null."""
+        """The smallest change of the policy that would allow the access, or null."""
         return self.stated.change if self.wants_rights else None
 
     @property

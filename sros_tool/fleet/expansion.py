@@ -205,7 +205,7 @@ def read_policy_for(
     ``policy_files`` returns the content of files that are not in the file system.
 
     Raises:
-        PolicyError: (or another `DocumentError`) as of `read_policy` and `FleetPolicy`.
+        PolicyError: (or another `DocumentError`) as `read_policy` and `FleetPolicy` raise it.
     """
     if fleet is None:
         return read_policy(path, policy_files=policy_files)

@@ -62,7 +62,7 @@ _OF_ROBOT = "{robot}"
 def read_fleet(path: Path) -> Fleet:
     """Return the fleet in a TOML file, or in an Ansible inventory in YAML or JSON.
 
-    The end of the name tells which: .yml, .yaml and .json are inventories.
+    Files with the ending .yml, .yaml or .json are inventories.
 
     Raises:
         DocumentError: the file cannot be read, or a value in it is not valid; the error names the

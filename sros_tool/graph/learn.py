@@ -88,7 +88,7 @@ class LearnedProfile:
 
 
 class RightsFound(StrEnum):
-    """Where learned rights come from.
+    """The source of learned rights.
 
     ``graph``: the ROS graph was observed; ``log``: the lines of a log deny them; ``audit``: they
     were observed, and the policy or keystore denies them.

@@ -212,7 +212,7 @@ def main() -> int:
 
 
 class GraphObserver(Protocol):
-    """Something that sees the ROS graph."""
+    """Interface of an observer of the ROS graph."""
 
     def sight(self) -> tuple[list[Any], list[Any]] | None:
         """Return nodes and endpoints of the same moment, or None."""

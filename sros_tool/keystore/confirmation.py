@@ -92,7 +92,7 @@ _PEM = re.compile(rb"-----BEGIN CERTIFICATE-----([A-Za-z0-9+/=\s]*)-----END CERT
 
 
 class Seen(StrEnum):
-    """Where a robot saw a DDS library."""
+    """The place where a robot saw a DDS library."""
 
     PROCESS = "process"
     """At least one running process has loaded it."""
@@ -141,7 +141,7 @@ class RunningFiles(StrEnum):
 
 
 class RobotClock(StrEnum):
-    """What a robot knows of its own clock."""
+    """The state of a robot's clock, as the robot reports it."""
 
     SYNCHRONIZED = "synchronized"
     """The clock is set by a time service, as the kernel says."""
@@ -161,15 +161,15 @@ class Confirmation:
     certificate and CA files to the SHA-256 of each certificate (DER) in the file, in order; without
     an entry, an earlier certificate in that file cannot be recognised.  ``dds`` is the DDS of the
     robot; ``restart`` are the enclaves whose processes still have earlier files. Both are None if
-    the confirmation does not tell.
+    the confirmation does not state them.
 
     The other parts come from `sros agent`, and are None in a confirmation of another program.
     ``sequence`` is higher in each message of a robot.  ``release`` is the number of the release
     that is installed; 0 for none.  ``expiry`` and ``running`` map enclaves to when their files
     expire, and to what their processes have loaded.  ``problems`` are short sentences, and
     ``requests`` signing requests (PEM) for certificates that expire.  ``crl`` is the newest
-    revocation list (PEM) on the robot, if it is perhaps not what was published last: a keystore
-    that was restored from a backup learns from it what it has revoked since.
+    revocation list (PEM) on the robot, if it may differ from the list that was published last: a
+    keystore that was restored from a backup learns from it what it has revoked since.
     """
 
     robot: str
@@ -194,8 +194,8 @@ class Confirmation:
 
 KEY_NOT_HERE = "is not on this robot"
 OF_ANOTHER_KEY = "it does not belong to the enclave's key"
-"""What the agent says of an enclave for which a release needs another key than the one that is on
-the robot: there is no key, or the certificate is for another one.
+"""The agent's message on an enclave for which a release needs another key than the robot has:
+there is no key on the robot, or the certificate is for another key.
 """
 
 
@@ -204,9 +204,9 @@ OLDER_THAN_INSTALLED = "which this robot has installed before"
 EXPIRED_METADATA = "The metadata in "
 OF_OTHER_CA = "is not sealed by a CA that this robot trusts"
 OF_SAME_NUMBER = "of the installed release, but other files"
-"""What the agent says of a release, or of published metadata, that it refuses."""
+"""The agent's message on a release, or on published metadata, that it refuses."""
 COULD_NOT_START = "could not start"
-"""What a robot says of an enclave in which no process would start."""
+"""A robot's message on an enclave in which no process would start."""
 
 
 def lacks_key(problem: str) -> bool:
@@ -581,7 +581,7 @@ def _message_from(value: Any, label: str) -> LastMessage:
     """Return the last message of a robot's agent in a JSON value.
 
     Raises:
-        DocumentError: it is not of that form.
+        DocumentError: the value has another form.
     """
     if not isinstance(value, dict) or value.keys() != set(LastMessage._fields):
         raise _invalid_confirmation_error(
@@ -643,7 +643,7 @@ def _restart_from(value: Any, label: str) -> tuple[str, ...]:
     """Return the names of enclaves in a JSON value.
 
     Raises:
-        DocumentError: it is not a list of such names.
+        DocumentError: the value is not a list of such names.
     """
     if not isinstance(value, list):
         raise _invalid_confirmation_error(label, "its restart is not a list")
@@ -654,7 +654,7 @@ def _enclave_from(name: Any, label: str) -> str:
     """Return the name of an enclave in a JSON value.
 
     Raises:
-        DocumentError: it is none.
+        DocumentError: the value is not the name of an enclave.
     """
     try:
         return check_enclave_name(name if isinstance(name, str) else "")
@@ -761,7 +761,7 @@ def _dds_from(value: Any, label: str) -> RobotDds:
     """Return the DDS of a robot in a JSON value.
 
     Raises:
-        DocumentError: it is not of that form.
+        DocumentError: the value has another form.
     """
     if not isinstance(value, dict) or value.keys() != set(RobotDds._fields):
         raise _invalid_confirmation_error(

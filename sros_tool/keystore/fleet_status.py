@@ -204,8 +204,8 @@ class RobotStatus:
     which a file expires soon or has expired.  ``has_list`` says whether it has the current
     revocation list, in force or not, and ``renew_from`` from when a file of it expires soon.
     ``lacks_key`` are enclaves whose key the keystore has and the robot does not, which no release
-    brings.  ``is_ahead`` says that, by its message, they are from after the backup of the keystore.
-    ``reads_copy`` says that it fetched after the publication and got an earlier release,
+    brings.  ``is_ahead`` says that, by its message, its files are newer than the backup of the
+    keystore. ``reads_copy`` says that it fetched after the publication and got an earlier release,
     and ``is_locked_out`` that all its certificates are revoked.
     """
 
@@ -310,7 +310,7 @@ class RobotStatus:
 
     @property
     def last_heard(self) -> datetime | None:
-        """The last time of a message from the robot, at least; None if it sent no confirmation."""
+        """The time of the last known message from the robot; None if it sent no confirmation."""
         if self.fetches and self.received and self.clock:
             return min(self.received, self.clock)
         return self.received
@@ -445,9 +445,9 @@ class FleetStatus:
         """Names of the robots that have not confirmed the stage of the CA rotation.
 
         First they have to confirm that they trust the new CA, then that they have the files it
-        issued.  Those where processes still run with earlier files, those that fetch and are
-        offline, or say that they have what was never published, and those whose last message was
-        refused have not confirmed it either.
+        issued.  A robot has not confirmed the stage either if its processes still run with earlier
+        files, if it fetches and is offline, if it reports a release that was never published, or if
+        its last message was refused.
         """
         return tuple(
             robot.robot

@@ -125,10 +125,10 @@ class KnownKeys:
         return (later_revoked_serials(self._keystore) | listed) - recorded
 
     def revoked_before(self, names: Collection[str]) -> set[str]:
-        """Return those of ``names`` whose last certificate was revoked, and not superseded.
+        """Return the enclaves in ``names`` whose last certificate was revoked, and not superseded.
 
-        Where the ledger lacks it, a revocation list that names the certificate decides; if the
-        ledger was lost, for the certificates in the folder ``revoked``.
+        If the ledger lacks the revocation, a revocation list that names the certificate decides; if
+        the ledger was lost, such a list decides for the certificates in the folder ``revoked``.
         """
         if not self._revoked_serials:
             return set()

@@ -153,7 +153,7 @@ def enclave_path(root: Path, name: str) -> Path:
 
 
 def fleet_key(role: str) -> str:
-    """Return the path of the private key of a role of what is published, such as ``snapshot``."""
+    """Return the path of the private key of a metadata role, such as ``snapshot``."""
     return f"{PRIVATE}/fleet_{role}.pem"
 
 
@@ -238,7 +238,7 @@ def folder_of_closed_robot(root: Path) -> Path | None:
 
 
 def how_to_add_domains(root: Path, domains: str) -> str:
-    """Return advice, as a clause, on how to add a domain to a keystore, or to that of an export.
+    """Return advice, as a clause, on how to add a domain to a keystore, or to an export's keystore.
 
     ``domains`` ("0,5") are all its domains afterwards.
     """

@@ -299,7 +299,8 @@ class _Files(NamedTuple):
     ``state`` is None without a ledger; ``lines`` is the content of the file, None if it is too long
     to keep in memory, or follows sealed parts.  ``ledger_index`` is None without an index that
     fits.  ``part`` is the number of the last part, which is the file; ``later`` is the name of a
-    later part, "" without one.  ``last_lines`` are its last ones, which are not verified.
+    later part, "" without one.  ``last_lines`` are the last lines of the file, which are not
+    verified.
     """
 
     head: _Head | None
@@ -736,7 +737,7 @@ def _not_as_sealed_error(root: Path, sealed: Entry) -> KeystoreError:
 
 
 def _later_than(root: Path, part: int, last: os.stat_result | None = None) -> str:
-    """Return the name of a later part of the ledger than the ``last`` one; "" without one.
+    """Return the name of a part of the ledger after the part ``last``; "" if there is none.
 
     ``part`` is the number of the last part, which may have another name, or be a copy of its file.
     """

@@ -181,7 +181,7 @@ class LedgerIndex:
         """Yield the postings of the lines whose field ``name`` has this value, oldest first.
 
         Raises:
-            IndexDamagedError: the bucket with them is not what it was when the head was signed.
+            IndexDamagedError: the bucket has changed since the head was signed.
         """
         term = _term(name, value)
         postings = self._postings_in(_bucket_of(term))
@@ -209,7 +209,7 @@ class LedgerIndex:
         With ``parts``, only names with one of these texts in them are returned.
 
         Raises:
-            IndexDamagedError: they are not what they were when the head was signed.
+            IndexDamagedError: the names have changed since the head was signed.
         """
         there = dict(self._rows("SELECT bucket, names FROM buckets"))
         buckets = [self._checked_bucket(there.get(i, b""), 2 * i) for i in range(_BUCKETS)]
@@ -223,7 +223,7 @@ class LedgerIndex:
         """Return the names and the postings in a bucket, verified.
 
         Raises:
-            IndexDamagedError: it is not what it was when the head was signed.
+            IndexDamagedError: the bucket has changed since the head was signed.
         """
         rows = self._rows("SELECT names FROM buckets WHERE bucket = ?", bucket)
         names = self._checked_bucket(rows[0][0] if rows else b"", 2 * bucket)
@@ -299,7 +299,7 @@ class IndexUpdate:
         """Return the root of the index with all lines that were added, in hexadecimal.
 
         Raises:
-            IndexDamagedError: the current index is not what it was when the head was signed.
+            IndexDamagedError: the current index has changed since the head was signed.
         """
         digests = bytearray(self._base.digests if self._base else _EMPTY * _BUCKETS)
         changed: dict[int, dict[str, bool]] = {bucket: {} for bucket in self._added}

@@ -445,7 +445,7 @@ class Keystore:
 
     @_Part
     def has_keys(self) -> bool:
-        """Whether any enclave has its key, or says where it is; a copy for others has none."""
+        """Whether any enclave has its key, or says where it is; copies may have none."""
         return any(
             os.path.lexists(enclave_path(self.root, name) / file)
             for name in enclave_names(self.root, hidden=True)

@@ -558,7 +558,7 @@ class DifferentProtection(NamedTuple):
     """A protection of a name that only one side demands."""
 
     only: OnlySide
-    """The side that demands it."""
+    """The side that demands the protection."""
     protection: StatedProtection
 
 
@@ -620,8 +620,8 @@ def compared_enclaves(
 ) -> frozenset[str] | None:
     """Return the enclaves in which two sources are compared; None for all.
 
-    If one source is only for some enclaves, it is these.  Two exports are compared in all their
-    enclaves, as are two enclaves; an enclave and an export only in that enclave.
+    If one source is only for some enclaves, these are compared.  Two exports are compared in all
+    their enclaves, as are two enclaves; an enclave and an export only in that enclave.
 
     Args:
         sides: the kind and the ``scope`` of each source, as in `RightsSource`.
@@ -928,7 +928,7 @@ class RecordedRights:
             digest: the SHA-256 of its current permissions document, in hexadecimal.
 
         Raises:
-            KeystoreError: it is not the last document that the ledger records for the enclave.
+            KeystoreError: the document is not the last one that the ledger records for the enclave.
         """
         recorded = self._ledger_part(name)
         last, trust = recorded.last.get(name), ""

@@ -127,7 +127,7 @@ def select_to_revoke(
 
 
 def _possible_enclaves(keystore: Keystore, fleet: Fleet, robots: Sequence[str]) -> Sequence[str]:
-    """Return all enclaves that could be those of ``robots``, and perhaps others.
+    """Return all enclaves that may belong to ``robots``, and perhaps others.
 
     In a keystore with an index, these are the enclaves in the folders of the robots, and those that
     the ledger has with the name of a robot or such a folder in their paths.

@@ -129,7 +129,7 @@ def present_settings(keystore: Keystore) -> PresentSettings:
     """Return the settings that are in force in a keystore.
 
     Raises:
-        KeystoreError: it is not a keystore, or its governance cannot be used.
+        KeystoreError: the folder is not a keystore, or its governance cannot be used.
         DocumentError: its settings are malformed, and the ledger has no earlier settings.
     """
     keystore.check()

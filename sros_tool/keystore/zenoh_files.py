@@ -90,7 +90,7 @@ from sros_tool.zenoh.key_expressions import KeyExpressions, TooManyExpressions, 
 
 
 class ZenohFault(Enum):
-    """What can be wrong with the Zenoh configurations of an enclave, by its stable id."""
+    """The faults that the Zenoh configurations of an enclave can have, by stable id."""
 
     MISSING = "missing"
     UNREADABLE = "unreadable"
@@ -216,7 +216,7 @@ def _read(folder: Path, file: str, state: OpenedEnclave) -> Configuration | Zeno
 
 
 def _before_revocation_clause(configuration: Configuration, state: OpenedEnclave) -> str:
-    """Return a clause if a configuration with others' rights is older than a revocation, or ""."""
+    """Return a clause if rights of others in a configuration predate a revocation, or ""."""
     data = state.files.get(CRL_FILE)
     if configuration.mode is Mode.CLIENT or data is None:
         return ""
@@ -305,7 +305,7 @@ class ZenohDocuments:
 
 @dataclass(frozen=True, slots=True)
 class ZenohChange:
-    """What a transaction changes in the enclaves of a keystore, as far as Zenoh depends on it.
+    """The changes of a transaction that the Zenoh configurations of a keystore depend on.
 
     ``issued`` are the new permissions of enclaves.  ``gone`` are the revoked enclaves, ``replaced``
     the enclaves whose earlier certificates are revoked.  ``recorded`` are the entries that the
@@ -324,7 +324,7 @@ NO_CHANGE = ZenohChange()
 
 
 class Drift(StrEnum):
-    """How a configuration differs from what the keystore should have."""
+    """The ways in which a configuration can differ from the one that the keystore should have."""
 
     MISSING = "missing"
     DIFFERS = "differs"
@@ -687,7 +687,7 @@ def enclaves_with_rights(keystore: Keystore, names: Collection[str]) -> set[str]
 
 
 class _RulesOfEnclave(NamedTuple):
-    """What other processes allow to an enclave, and what the enclave allows to the router.
+    """The rights that other processes give an enclave, and that the enclave gives the router.
 
     ``remote`` are the rights that other processes give to the enclave; ``rights`` are the same
     rights as a value, if more than one file needs them.  ``router`` are the rights that the enclave
@@ -929,7 +929,7 @@ def _are_exactly(
 
 
 def _announced_names(tokens: KeyExpressions, enclave: str) -> set[tuple[str, str, str]] | None:
-    """Return what graph tokens announce, as triples of domain, right and name.
+    """Return the announcements of graph tokens, as triples of domain, right and name.
 
     Right and name are "" for a node.  Returns None if a token is for another enclave.
     """
@@ -944,7 +944,7 @@ def _announced_names(tokens: KeyExpressions, enclave: str) -> set[tuple[str, str
 
 
 def _to_announce(stated_rights: Mapping[int, Sequence[StatedRight]]) -> set[tuple[str, str, str]]:
-    """Return what exact rights let an enclave announce, in the form of `_announced_names`."""
+    """Return the announcements that exact rights allow, in the form of `_announced_names`."""
     return {(str(domain), "", "") for domain in stated_rights} | {
         (str(domain), right, name)
         for domain, rights in stated_rights.items()

@@ -660,7 +660,7 @@ _UNUSUAL = re.compile(rb"[^A-Za-z0-9/_]")
 
 
 class CertificateForm(NamedTuple):
-    """What all certificate files of the same kind have in common.
+    """The parts that all certificate files of the same kind have in common.
 
     ``common`` is equal for files that differ only in the values of their own certificate, such as
     the key.  ``validity`` is the period in DER.

@@ -274,7 +274,7 @@ def _derivation(block: bytes) -> tuple[bool, list[int]]:
     For scrypt these are N, r and p, for others the rounds, perhaps with more after them.
 
     Raises:
-        ValueError, PkiError: it is damaged.
+        ValueError, PkiError: the block is damaged.
     """
     scheme = der.first_value(der.first_value(base64.b64decode(block)).content).content
     scrypt = der.encode(der.OID, der.encode_oid(_SCRYPT)) in scheme

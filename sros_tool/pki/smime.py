@@ -223,9 +223,9 @@ class Signature:
     def _verify(self, content: bytes, signer: x509.Certificate) -> bool:
         """Return whether the signature verifies, without using the cache of `is_intact`.
 
-        The kind of the key decides how.  OpenSSL ignores the algorithm that the message names, so
-        it accepts RSA-PSS only from keys that are only for RSA-PSS, and never Ed25519 (pk7_doit.c,
-        PKCS7_signatureVerify).
+        The kind of the key decides how it is verified.  OpenSSL ignores the algorithm that the
+        message names, so it accepts RSA-PSS only from keys that are only for RSA-PSS, and never
+        Ed25519 (pk7_doit.c, PKCS7_signatureVerify).
         """
         if self._signed_attributes and not self.digest_matches(content):
             return False

@@ -476,7 +476,7 @@ def read_token_file(data: bytes) -> TokenUri:
     The RMWs read its first word, so nothing may follow.
 
     Raises:
-        PkiError: it is not one PKCS#11 URI that sros and Fast DDS read alike.
+        PkiError: the file is not one PKCS#11 URI that sros and Fast DDS read alike.
     """
     text = data.decode("utf-8", "replace").removesuffix("\n")
     if len(data) > _MOST_BYTES or not text.startswith(_SCHEME) or len(text.split()) != 1:

@@ -6,14 +6,14 @@ node and no enclaves.
 The grammar follows the schema of ros2/sros2.  In addition every name is checked: a name that ROS
 does not allow is an error, because its author relies on that right or denial.
 
-Includes (``xi:include``) are read only from the folder of the policy and the folders below.  They
-give what the XInclude of libxml2 gives, or are refused.  Nodes of included documents are never
-moved into another document: a moved lxml node can crash Python.
+Includes (``xi:include``) are read only from the folder of the policy and the folders below.  An
+include has the result that the XInclude of libxml2 gives, or is refused.  Nodes of included
+documents are never moved into another document: a moved lxml node can crash Python.
 
 A processing instruction behind a name states how its messages have to be protected:
 ``<topic>scan<?sros protect="encrypt"?></topic>``.  The schema of ros2/sros2 allows no attribute and
-no element there, but processing instructions everywhere; its XSLT does not translate them, and
-writes them again.
+no element there, but processing instructions everywhere; its XSLT copies them without translating
+them.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ class Includer:
     def children(
         self, parent: etree._Element, place: IncludedFile
     ) -> Iterator[tuple[etree._Element, IncludedFile]]:
-        """Yield the child elements of ``parent``, and in place of an include its elements."""
+        """Yield the child elements of ``parent``, with included elements in place of includes."""
         return self._expanded(parent, place)
 
     def target(self, element: etree._Element, place: IncludedFile) -> Path:
@@ -178,8 +178,8 @@ class Includer:
                 f"Include '{place.file}' itself instead of the link.",
             )
         names = path.split("/")
-        up = next((index for index, name in enumerate(names) if name not in ("..", ".")), 0)
-        if "#" in href or "?" in href or ".." in names[up:]:
+        first_name = next((index for index, name in enumerate(names) if name not in ("..", ".")), 0)
+        if "#" in href or "?" in href or ".." in names[first_name:]:
             raise PolicyError(
                 f"{where}: the include of {_short(href)} is not a plain path",
                 "'#', '?', and '..' after the name of a folder can be understood in two ways.",
@@ -261,8 +261,8 @@ class Includer:
             )
         linked = bool(href) and Path(os.path.normpath(place.file.parent / unquote(href))) != file
         inner = IncludedFile(file, (*place.trail, step), linked)
-        found = self._expanded([target], inner)
-        yield from self._selected(found, pointer, where) if pointer else found
+        included = self._expanded([target], inner)
+        yield from self._selected(included, pointer, where) if pointer else included
 
     def _exists(self, file: Path) -> bool:
         if self.read is None:
@@ -287,18 +287,18 @@ class Includer:
                 "Write for example xpointer(/profile/*), xpointer(/policy/enclaves/*) or "
                 "xpointer(/policy/enclaves/enclave[@path='/talker']).",
             )
-        found: Iterable[tuple[etree._Element, IncludedFile]] = roots
+        selected: Iterable[tuple[etree._Element, IncludedFile]] = roots
         for depth, step in enumerate(steps):
             if depth:
-                found = (child for parent in found for child in self.children(*parent))
-            found = [child for child in found if _matches_step(child[0], step)]
-        if not found:
+                selected = (child for parent in selected for child in self.children(*parent))
+            selected = [child for child in selected if _matches_step(child[0], step)]
+        if not selected:
             raise PolicyError(
                 f"{where}: the xpointer {_short(pointer)} selects nothing",
                 "The included file has no element at this path.",
                 "Write the path from the root element of the included file.",
             )
-        return list(found)
+        return list(selected)
 
 
 COMMON = "common"
@@ -324,13 +324,13 @@ def _missing_remedy(file: Path) -> str:
 _ITEMS = frozenset(kind.removesuffix("s") for kind in RIGHTS)
 _INSTRUCTION = "sros"
 _EXAMPLE = 'Write for example <topic>scan<?sros protect="encrypt"?></topic>.'
-_PROTECT = re.compile(r"""protect\s*=\s*(?:"(?P<one>[^"]*)"|'(?P<other>[^']*)')\s*\Z""")
+_PROTECT = re.compile(r"""protect\s*=\s*(?:"(?P<double>[^"]*)"|'(?P<single>[^']*)')\s*\Z""")
 
 
 def _check_instructions(root: etree._Element, file: Path) -> None:
     """Raise `PolicyError` if a processing instruction for sros is outside of a name."""
-    around = (*root.itersiblings(preceding=True), *root.itersiblings())
-    for instruction in (*around, *root.iter(etree.PI)):
+    outside = (*root.itersiblings(preceding=True), *root.itersiblings())
+    for instruction in (*outside, *root.iter(etree.PI)):
         if not isinstance(instruction, etree._ProcessingInstruction):
             continue
         parent = instruction.getparent()
@@ -410,8 +410,8 @@ def read_policy(
             raise PolicyError(
                 f"'{path}' holds no policy", "", "Name a policy, or a folder of them."
             )
-        every = join_policies([read_policy(file, placeholders=placeholders) for file in files])
-        return replace(every, file=str(path))
+        joined = join_policies([read_policy(file, placeholders=placeholders) for file in files])
+        return replace(joined, file=str(path))
     return _Reader(path, content, placeholders=placeholders, policy_files=policy_files).policy()
 
 
@@ -467,7 +467,7 @@ class _Reader:
         if len(blocks) == 1 and blocks[0][0].tag in _EARLIER_BLOCKS:
             raise PolicyError(
                 f"{where}: the policy has <{blocks[0][0].tag}> in place of <enclaves>",
-                f"That is an earlier format than the version {version} that the policy names.",
+                f"The policy names version {version}, but its content has an earlier format.",
                 self._conversion_remedy(),
             )
         blocks = [self._expect(child, at, "enclaves") for child, at in blocks]
@@ -582,8 +582,8 @@ class _Reader:
         node, ns = element.get("node", ""), element.get("ns", "")
         sampled = self._sample(node, element, place, several=False)
         try:
-            found = check_namespace(self._sample(ns, element, place, several=False))
-            ns = ns.removesuffix("/") if has_placeholder(ns) else found
+            checked = check_namespace(self._sample(ns, element, place, several=False))
+            ns = ns.removesuffix("/") if has_placeholder(ns) else checked
         except InvalidNameError as error:
             raise self._invalid_name_error(error, ns, "namespace", element, place) from error
         if sampled and ("/" in sampled or "~" in sampled or expression_problem(sampled)):
@@ -634,21 +634,21 @@ class _Reader:
             )
         item = kind.removesuffix("s")
         items = self._read_children(element, place)
-        named: dict[Level | None, list[tuple[str, int]]] = {}
+        by_level: dict[Level | None, list[tuple[str, int]]] = {}
         for child, at in items:
             name = self._name(*self._expect(child, at, item), node)
-            named.setdefault(self._read_protection(child, at), []).append(
+            by_level.setdefault(self._read_protection(child, at), []).append(
                 (name, child.sourceline or 0)
             )
-        if not named:
+        if not by_level:
             raise PolicyError(
                 f"{self._place_text(element, place)}: <{kind}> names no {item}",
                 "",
                 f"Remove the element, or name one: <{item}>NAME</{item}>.",
             )
         whole = all(at.file == place.file for _, at in items)  # names can be included one by one
-        for level, found in named.items():
-            names, lines = tuple(name for name, _ in found), tuple(line for _, line in found)
+        for level, members in by_level.items():
+            names, lines = tuple(name for name, _ in members), tuple(line for _, line in members)
             source = self._source_of(element, place)
             yield Group(kind, tuple(rights), names, level, source, lines if whole else ())
 
@@ -657,12 +657,12 @@ class _Reader:
         if not len(element):
             return None
         where = self._place_text(element, place)
-        only = element[0]
+        instruction = element[0]
         if (
             len(element) > 1
-            or not isinstance(only, etree._ProcessingInstruction)
-            or only.target != _INSTRUCTION
-            or only.tail
+            or not isinstance(instruction, etree._ProcessingInstruction)
+            or instruction.target != _INSTRUCTION
+            or instruction.tail
         ):
             raise PolicyError(
                 f"{where}: the processing instructions of a name are not valid",
@@ -671,12 +671,12 @@ class _Reader:
                 "one would leave the name without protection.",
                 _EXAMPLE,
             )
-        found = _PROTECT.match((only.text or "")[:_MAX_LENGTH].lstrip())
-        word = (found["one"] or found["other"] or "") if found else ""
+        stated = _PROTECT.match((instruction.text or "")[:_MAX_LENGTH].lstrip())
+        word = (stated["double"] or stated["single"] or "") if stated else ""
         if word not in PROTECT:
             raise PolicyError(
-                f"{where}: <?sros {_short(only.text or '')[1:-1]}?> is not a protection",
-                "It can be " + " or ".join(f'protect="{each}"' for each in PROTECT) + ".",
+                f"{where}: <?sros {_short(instruction.text or '')[1:-1]}?> is not a protection",
+                "It can be " + " or ".join(f'protect="{level}"' for level in PROTECT) + ".",
                 _EXAMPLE,
             )
         return PROTECT[word]
@@ -765,10 +765,10 @@ class _Reader:
         self, element: etree._Element, place: IncludedFile, tag: str
     ) -> tuple[etree._Element, IncludedFile]:
         if element.tag != tag:
-            found = tag_of(element)
-            elsewhere = f", or move it into <{found}s>" if found in _ITEMS else ""
+            actual = tag_of(element)
+            elsewhere = f", or move it into <{actual}s>" if actual in _ITEMS else ""
             raise PolicyError(
-                f"{self._place_text(element, place)}: <{found}> found, but <{tag}> expected",
+                f"{self._place_text(element, place)}: <{actual}> found, but <{tag}> expected",
                 "",
                 f"Write <{tag}> in its place{elsewhere}."
                 if tag in _ITEMS
@@ -796,7 +796,7 @@ class _Reader:
                 raise PolicyError(
                     f"{where}: <{tag_of(element)}> has no attribute {_short(name)}",
                     "",
-                    f"It has {known}." if known else "It has none: remove it.",
+                    f"It has {known}." if known else "Remove the attribute: this element has none.",
                 )
         for name in required:
             if name not in present:
@@ -816,7 +816,7 @@ class _Reader:
 
 
 def _meant_attribute(right: str, value: str) -> str:
-    """Return the attribute that is meant where ``value`` is neither ALLOW nor DENY."""
+    """Return the attribute that a user meant who wrote an invalid ``value``, such as "allow"."""
     meant = value.strip().upper()
     words = [meant] if meant in _QUALIFIERS else list(_QUALIFIERS)
     return " or ".join(f'{right}="{word}"' for word in words)
@@ -860,7 +860,7 @@ class PrintedConversion(NamedTuple):
     enclaves: Sequence[str]
     """Paths of the enclaves in the converted policy."""
     left_out: Sequence[str]
-    """Profiles that cannot be converted, with the reason; with any, the exit status is 1."""
+    """Profiles that cannot be converted, with the reason; if there are any, the status is 1."""
     output: Path | None
     """Path of the file that was written, or null."""
     dry_run: DryRun
@@ -1168,11 +1168,11 @@ def join_policies(policies: Sequence[Policy]) -> Policy:
     """
     enclaves: dict[str, Enclave] = {}
     for enclave in (enclave for policy in policies for enclave in policy.enclaves):
-        other = enclaves.setdefault(enclave.path, enclave)
-        if other.source != enclave.source:
+        earlier = enclaves.setdefault(enclave.path, enclave)
+        if earlier.source != enclave.source:
             raise PolicyError(
                 f"{enclave.source}: enclave {enclave.path} is in another policy, too",
-                f"The other one is at {other.source}.",
+                f"The other one is at {earlier.source}.",
                 "Name only policies of one robot, and state each enclave in one of them.",
             )
     fallbacks = tuple(fallback for policy in policies for fallback in policy.fallbacks)
@@ -1206,7 +1206,8 @@ def is_policy(name: str, content: bytes, shown: str) -> bool:
     ``shown`` is the file's name in errors.
 
     Raises:
-        DocumentError: that is unclear, or the file is a policy and only its name denies it.
+        DocumentError: the file looks like a policy, but its name does not end with ``.xml``; or it
+            is not valid XML.
     """
     if name.lower().endswith(".xml"):
         return parse(content, shown, instructions=True).tag == "policy"
@@ -1215,7 +1216,7 @@ def is_policy(name: str, content: bytes, shown: str) -> bool:
         raise DocumentError(
             f"{shown} looks like a policy, but its name does not end with .xml",
             "In a folder, sros reads only policies whose names end with .xml.",
-            "Name it .xml, or move it out of the folder.",
+            "Give it a name that ends with .xml, or move it out of the folder.",
         )
     return False
 
@@ -1238,10 +1239,10 @@ def _files_below(folder: Path) -> Iterator[Path]:
                 "Name a policy in it.",
             )
         folders[:] = sorted(name for name in folders if name != ".git")  # no file of a repository
-        for each in (Path(parent, name) for name in folders):
-            if each.is_symlink():
+        for link in (Path(parent, name) for name in folders):
+            if link.is_symlink():
                 raise DocumentError(
-                    f"'{each}' is a link to a folder, and not followed",
+                    f"'{link}' is a link to a folder, and not followed",
                     "The policies in it would not count.",
                     "Name that folder itself, or remove the link.",
                 )

@@ -351,8 +351,8 @@ class Merged:
     """A policy file after a merge: its new content, the added rights, and the contradictions.
 
     Without additions ``document`` is the unchanged content of the file.  ``instances`` are texts on
-    the enclaves that have a node in several namespaces only since the merge, and ``shared`` on
-    those whose nodes have other names than the nodes that the merge adds.
+    the enclaves that have a node in several namespaces only since the merge, and ``shared`` texts
+    on enclaves whose nodes have other names than the nodes that the merge adds.
     """
 
     document: bytes

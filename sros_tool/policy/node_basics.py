@@ -31,11 +31,11 @@ def _basics() -> Rules:
 
 
 class NodeRights:
-    """Which of the rights of some enclaves are those that their own nodes need to start.
+    """The rights of some enclaves that their own nodes need to start.
 
     The services of a node count only if the enclave may serve all of them, and no other enclave may
     serve one of them: with such a right, a process can pose as another enclave's node.  A right to
-    serve those of nodes of any name, which an enclave without a policy has, is not compared.
+    serve the services of nodes of any name, which an enclave without a policy has, is not compared.
     """
 
     def __init__(self, rights: Iterable[Right]) -> None:

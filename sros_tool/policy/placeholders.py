@@ -102,7 +102,7 @@ def check_path(path: Parts) -> None:
     """Check that an enclave path stands for one enclave, or one for each robot of a group.
 
     Raises:
-        ValueError: it does not; the message is a sentence.
+        ValueError: the path does not; the message is a sentence.
     """
     found = placeholders_of(path)
     if plural := next((part for part in found if part.plural), None):

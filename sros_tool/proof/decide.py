@@ -201,7 +201,7 @@ def _confirm(requirement: Requirement, witness: Witness, world: World) -> None:
     """Check that the engine of the world decides on each use of a witness as the witness says.
 
     Raises:
-        AssertionError: it does not.
+        AssertionError: the engine decides otherwise.
     """
     if isinstance(requirement, Protected):
         return
@@ -542,7 +542,7 @@ def _witness_against_not_both(
 
 
 def _with_anybody(uses: Mapping[str, Sequence[Use]], world: World) -> Mapping[str, Sequence[Use]]:
-    """Return uses in which each enclave has those of processes without an identity, too.
+    """Return uses in which each enclave also has the uses of processes without an identity.
 
     A process that has an enclave's files can run without them.
     """

@@ -729,7 +729,7 @@ class AccessByVendors:
 
 
 def _joined_access(accesses: Sequence[Access]) -> _Access:
-    """Return what several permissions, which an enclave can all use, give together."""
+    """Return the access that several permissions give an enclave that can use all of them."""
     return _Access(
         {verb: NameSet.union([access.topics(verb) for access in accesses]) for verb in _VERBS},
         lambda verb, topic: any(access.decide(verb, topic).outcome.ok for access in accesses),

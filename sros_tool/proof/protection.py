@@ -467,7 +467,8 @@ def _routers_limit_names(network: ZenohNetwork) -> bool:
 def _network(side: AccessSource, other: AccessSource) -> ZenohNetwork | None:
     """Return the Zenoh network of a side, or None if neither side says anything about routers.
 
-    The settings of the side state it; else its fleet, with the settings of the other side.
+    The network is from the settings of the side, else from its fleet and the settings of the other
+    side.
     """
     if side.later is not None:
         return side.later.zenoh

@@ -261,11 +261,11 @@ class Repository:
         return self.commit(name) if name == "HEAD" else self.exact_commit(name)
 
     def merged_into(self, merge: str) -> str:
-        """Return the id of a merge commit's first parent: the branch that was merged into.
+        """Return the id of a merge commit's first parent, on the branch that was merged into.
 
         Raises:
             UsageError: ``merge`` is not a full id.
-            DocumentError: it is not a merge, or not in the repository.
+            DocumentError: the commit is not a merge, or not in the repository.
         """
         if not _HASH.match(merge):
             raise UsageError(f"'{merge}' is not the full id of a commit")

@@ -1,4 +1,4 @@
-"""Requirements on the access of enclaves, their TOML file, and what a new version of it drops.
+"""Requirements on the access of enclaves, their TOML file, and requirements that a change drops.
 
 A requirement is a table of the file, such as::
 
@@ -8,8 +8,8 @@ A requirement is a table of the file, such as::
     why = "Commands meet in one place."
 
 Names are absolute ROS names, with the wildcards of policies; enclaves are names or patterns, as for
-``--match``, and those that a list excepts have ``!`` before them.  The class of a kind says what it
-demands.
+``--match``, and ``!`` before a name excepts an enclave from a list.
+The class of each kind says what such a requirement demands.
 
 Names and enclaves can have the placeholders of policies, which a fleet fills in.  A table with
 ``{robot}`` or ``{namespace}`` stands for a requirement for each robot; ``{robots}`` and
@@ -64,7 +64,7 @@ _LEVELS = {"sign": Level.SIGN, "encrypt": Level.ENCRYPT}
 class RobotNames(NamedTuple):
     """The names that a name with ``{robots}`` or ``{namespaces}`` stands for, one for each robot.
 
-    ``own`` is that of the requirement's own robot; ``pattern`` has ``{other}`` for another robot;
+    ``own`` is the name for the requirement's robot; ``pattern`` has ``{other}`` for another robot;
     ``group`` is "" for the whole fleet.
     """
 
@@ -196,9 +196,9 @@ def demand(requirement: Requirement) -> str:
     enclaves_text = partial(_enclaves_text, of_robots=requirement.of_robots)
     match requirement:
         case Only(rights=rights, enclaves=enclaves):
-            but = [name[len(EXCEPT) :] for name in enclaves if name.startswith(EXCEPT)]
-            if but and {*enclaves} == {"*", *(EXCEPT + name for name in but)}:
-                return f"{_listed_names(but)} may not {_rights_text(rights)}"
+            excepted = [name[len(EXCEPT) :] for name in enclaves if name.startswith(EXCEPT)]
+            if excepted and {*enclaves} == {"*", *(EXCEPT + name for name in excepted)}:
+                return f"{_listed_names(excepted)} may not {_rights_text(rights)}"
             return f"only {enclaves_text(enclaves)} may {_rights_text(rights)}"
         case Nobody(rights=rights):
             return f"nobody may {_rights_text(rights)}"
@@ -208,8 +208,8 @@ def demand(requirement: Requirement) -> str:
             return f"at most {most} enclave{'' if most == 1 else 's'} may {_rights_text(rights)}"
         case Widest(rights=rights, enclaves=enclaves):
             if not any(names for _, names in rights):
-                what = _rights_text(rights).replace(" nothing", "")
-                return f"no wildcard may let {enclaves_text(enclaves)} {what}"
+                rights_text = _rights_text(rights).replace(" nothing", "")
+                return f"no wildcard may let {enclaves_text(enclaves)} {rights_text}"
             return f"wildcards may let {enclaves_text(enclaves)} only {_rights_text(rights)}"
         case NothingBut(rights=rights, enclaves=enclaves):
             return f"{enclaves_text(enclaves)} may do nothing but {_rights_text(rights)}"
@@ -219,8 +219,10 @@ def demand(requirement: Requirement) -> str:
             shown = _listed_names([f"{kind.removesuffix('s')} {name}" for kind, name in names])
             return f"{shown} has to be {'encrypted' if level is Level.ENCRYPT else 'signed'}"
         case Apart(sources=sources, targets=targets, through=through):
-            past = f" except through {enclaves_text(through)}" if through else ""
-            return f"{enclaves_text(sources)} must not influence {enclaves_text(targets)}{past}"
+            exception = f" except through {enclaves_text(through)}" if through else ""
+            return (
+                f"{enclaves_text(sources)} must not influence {enclaves_text(targets)}{exception}"
+            )
         case _:
             raise AssertionError(requirement)
 
@@ -236,19 +238,31 @@ def _rights_text(rights: RightNames, link: str = "or") -> str:
 
 def _enclaves_text(enclaves: Iterable[str], of_robots: Iterable[RobotNames]) -> str:
     """Return a list of enclaves in words, with its exceptions."""
-    every = list(enclaves)
-    excepted = [name.removeprefix(EXCEPT) for name in every if name.startswith(EXCEPT)]
-    names = [name for name in every if not name.startswith(EXCEPT)]
+    entries = list(enclaves)
+    excepted = [name.removeprefix(EXCEPT) for name in entries if name.startswith(EXCEPT)]
+    names = [name for name in entries if not name.startswith(EXCEPT)]
     shown = list(names)
-    for of in of_robots:
-        if of.own in excepted and of.names.count(of.own) == 1 and {*of.names} <= {*shown}:
-            robots = f"the other robots of {of.group}" if of.group else "all other robots"
-            shown[shown.index(of.names[0])] = f"{of.pattern} of {robots}"
-            shown = [name for name in shown if name not in of.names]
-            names.remove(of.own)
-    # An exception is said already, unless it is one from other names, too.
-    own = {of.own for of in of_robots} - {*names}
-    excepted = [e for e in excepted if e not in own or any(overlap(e, name) for name in names)]
+    for robot_names in of_robots:
+        if (
+            robot_names.own in excepted
+            and robot_names.names.count(robot_names.own) == 1
+            and {*robot_names.names} <= {*shown}
+        ):
+            robots = (
+                f"the other robots of {robot_names.group}"
+                if robot_names.group
+                else "all other robots"
+            )
+            shown[shown.index(robot_names.names[0])] = f"{robot_names.pattern} of {robots}"
+            shown = [name for name in shown if name not in robot_names.names]
+            names.remove(robot_names.own)
+    # "All other robots" already names the exception of the own robot, unless other names need it.
+    own = {robot_names.own for robot_names in of_robots} - {*names}
+    excepted = [
+        enclave
+        for enclave in excepted
+        if enclave not in own or any(overlap(enclave, name) for name in names)
+    ]
     text = _listed_names(shown)
     return f"{text} (but not {_listed_names(excepted)})" if excepted else text
 
@@ -295,15 +309,15 @@ def read_all_requirements(
 def parse_requirements(
     data: bytes, file: str, fleet: FleetSource = _no_fleet
 ) -> tuple[Requirement, ...]:
-    """Return the requirements in a TOML document, which errors and sources call ``file``.
+    """Return the requirements in a TOML document; ``file`` is its name in errors and sources.
 
     Raises:
         DocumentError: a part of it is not valid.
     """
-    stated = _stated_tables(data, file)
-    filled = (table for one in stated for table in _filled_tables(one, fleet))
+    unfilled_tables = _stated_tables(data, file)
+    filled = (table for unfilled in unfilled_tables for table in _filled_tables(unfilled, fleet))
     requirements = []
-    left = _MOST_PAIRS
+    pairs_left = _MOST_PAIRS
     for table in filled:
         requirement = _READERS[table.kind](table)
         requirements.append(requirement)
@@ -314,8 +328,8 @@ def parse_requirements(
                 "",
                 "Name a group of robots, as in {robot:carriers}, or divide the file.",
             )
-        left -= _pairs(requirement)
-        if left < 0:
+        pairs_left -= _pairs(requirement)
+        if pairs_left < 0:
             raise DocumentError(
                 f"{requirement.source}: the requirements up to this line compare more than "
                 f"{_MOST_PAIRS} pairs of names",
@@ -333,7 +347,7 @@ def _stated_tables(data: bytes, file: str) -> list[_Table]:
     tables: list[_Table] = []
     for kind, requirements in document.items():
         if kind not in _READERS:
-            line = next((n for n, each in _headers(text) if each == kind), 0)
+            line = next((number for number, name in _headers(text) if name == kind), 0)
             raise DocumentError(
                 f"{Source(file, line)}: {_short(kind)} is not a kind of requirement",
                 f"The kinds are {', '.join(_READERS)}.",
@@ -367,8 +381,10 @@ def _pairs(requirement: Requirement) -> int:
     """Return how many pairs of names have to be compared for a requirement with two lists."""
     match requirement:
         case NotBoth(first=first, second=second):
-            one, other = (sum(len(names) for _, names in each) for each in (first, second))
-            return one * other
+            first_count, second_count = (
+                sum(len(names) for _, names in rights) for rights in (first, second)
+            )
+            return first_count * second_count
         case Apart(sources=sources, targets=targets):
             return len(sources) * len(targets)
         case _:
@@ -382,12 +398,12 @@ _KEY = re.compile(r"[ \t]*([A-Za-z0-9_-]+)[ \t]*=")
 def _headers(text: str) -> Iterator[tuple[int, str]]:
     """Yield line number and name of each line that begins a TOML table."""
     for number, line in enumerate(text.split("\n"), 1):
-        if found := _HEADER.match(line):
-            yield number, found[1]
+        if header := _HEADER.match(line):
+            yield number, header[1]
 
 
 def _places(text: str) -> dict[str, list[tuple[int, dict[str, int]]]]:
-    """Map each kind of requirement to its tables: the line of the table, and those of its keys."""
+    """Map each kind of requirement to its tables: pairs of a table's line and its keys' lines."""
     places: dict[str, list[tuple[int, dict[str, int]]]] = {}
     keys: dict[str, int] = {}
     for number, line in enumerate(text.split("\n"), 1):
@@ -416,13 +432,13 @@ class _Table:
         Raises:
             DocumentError: a key of the table is not in ``keys``.
         """
-        every = (*keys, *_WORDS)
+        known_keys = (*keys, *_WORDS)
         for key in self.values:
-            if key not in every:
+            if key not in known_keys:
                 raise self.error(
                     key,
                     f"{_short(key)} is not a key of [[{self.kind}]]",
-                    (f"There are {', '.join(every)}."),
+                    (f"There are {', '.join(known_keys)}."),
                 )
         texts = {key: self.text(key) if key in self.values else "" for key in _WORDS}
         robots = {"robot": self.robot, "of_robots": self.of_robots}
@@ -446,7 +462,7 @@ class _Table:
         if (
             not isinstance(value, list)
             or not least <= len(value) <= _MOST_TEXTS
-            or not all(isinstance(each, str) for each in value)
+            or not all(isinstance(text, str) for text in value)
         ):
             raise self.error(
                 key,
@@ -508,7 +524,7 @@ class _Table:
                 case str():
                     return new_names(value)[0]
                 case list():
-                    return [one for part in value for one in new_names(part)]
+                    return [name for part in value for name in new_names(part)]
                 case dict():
                     return {key: with_new_names(part) for key, part in value.items()}
                 case _:
@@ -520,16 +536,16 @@ class _Table:
         }
         return replace(self, values=values)
 
-    def error(self, key: str, what: str, why: str, remedy: str = "") -> DocumentError:
+    def error(self, key: str, problem: str, why: str, remedy: str = "") -> DocumentError:
         place = Source(self.source.file, self.lines.get(key, self.source.line))
-        return DocumentError(f"{place}: {what}", why, remedy)
+        return DocumentError(f"{place}: {problem}", why, remedy)
 
 
 # ── placeholders ───────────────────────────────────────────────────────────────────────────
 
 
 def _filled_tables(table: _Table, fleet: FleetSource) -> Iterator[_Table]:
-    """Yield a table with its placeholders filled in: once, or for each of the robots it is about.
+    """Yield a table with its placeholders filled in, for each robot if they stand for one robot.
 
     Raises:
         DocumentError: there is no fleet, or a placeholder is not valid or has no value.
@@ -545,21 +561,23 @@ def _filled_tables(table: _Table, fleet: FleetSource) -> Iterator[_Table]:
         raise table.error(
             used[singular[-1]],
             f"{' and '.join(map(str, singular))} are of different groups",
-            "In one table, they stand for the same robot.",
+            "In one table, {robot} and {namespace} always stand for the same robot.",
             "Write a table for each group.",
         )
     if not singular:
         yield table.with_names(partial(_filled_names, members=members))
         return
     for robot in members[groups[0] if groups else ""]:
-        own = table.with_names(partial(_filled_names, members=members, robot=robot))
+        filled = table.with_names(partial(_filled_names, members=members, robot=robot))
         words = {
-            key: _filled_words(own.values[key], singular, robot)
+            key: _filled_words(filled.values[key], singular, robot)
             for key in _WORDS
-            if key in own.values
+            if key in filled.values
         }
         of_robots = tuple(_plural_names(table, members, robot))
-        yield replace(own, values={**own.values, **words}, robot=robot.name, of_robots=of_robots)
+        yield replace(
+            filled, values={**filled.values, **words}, robot=robot.name, of_robots=of_robots
+        )
 
 
 def _placeholders(table: _Table) -> dict[Placeholder, str]:
@@ -568,17 +586,17 @@ def _placeholders(table: _Table) -> dict[Placeholder, str]:
     for key, value in table.values.items():
         for name in filter(has_placeholder, () if key in _WORDS else _names_in(value)):
             try:
-                found = placeholders_of(parts_of(name.removeprefix(EXCEPT)))
+                placeholders = placeholders_of(parts_of(name.removeprefix(EXCEPT)))
             except ValueError as error:
                 text = f"{_short(name)} is not valid in {key}"
                 raise table.error(key, text, str(error)) from None
-            if isinstance(value, str) and any(placeholder.plural for placeholder in found):
+            if isinstance(value, str) and any(placeholder.plural for placeholder in placeholders):
                 raise table.error(
                     key,
                     f"{_short(name)} is not valid in {key}",
                     "It stands for several names, but only one can be here.",
                 )
-            used |= dict.fromkeys(found, key)
+            used |= dict.fromkeys(placeholders, key)
     return used
 
 
@@ -636,17 +654,20 @@ def _filled_names(
         parts = fill(parts, robot.name, robot.namespace)
     plural = placeholders_of(parts)
     filled = (
-        [fill(parts, each.name, each.namespace, plural=True) for each in members[plural[0].group]]
+        [
+            fill(parts, member.name, member.namespace, plural=True)
+            for member in members[plural[0].group]
+        ]
         if plural
         else [parts]
     )
-    return [begin + "".join(map(str, each)) for each in filled]
+    return [begin + "".join(map(str, name_parts)) for name_parts in filled]
 
 
 def _plural_names(
     table: _Table, members: Mapping[str, Sequence[Robot]], robot: Robot
 ) -> Iterator[RobotNames]:
-    """Yield what each name with a plural placeholder in a table stands for."""
+    """Yield the names that each name with a plural placeholder in a table stands for."""
     values = [value for key, value in table.values.items() if key not in _WORDS]
     for name in filter(has_placeholder, _names_in(values)):
         if name.startswith(EXCEPT):
@@ -664,16 +685,16 @@ def _plural_names(
 def _filled_words(text: object, used_placeholders: Iterable[Placeholder], robot: Robot) -> object:
     """Return the name or reason of a requirement with the values of a robot.
 
-    ``used_placeholders`` are the placeholders in the names of the requirement, which tell the
-    group.
+    ``used_placeholders`` are the placeholders in the names of the requirement; they tell the group
+    of the robot.
     """
     if not isinstance(text, str):
         return text
     groups = {"", *(placeholder.group for placeholder in used_placeholders)}
-    for (value, own), group in product(
+    for (value, robot_value), group in product(
         (("robot", robot.name), ("namespace", robot.namespace)), groups
     ):
-        text = text.replace(str(Placeholder(value, group=group)), own)
+        text = text.replace(str(Placeholder(value, group=group)), robot_value)
     return text
 
 
@@ -840,18 +861,25 @@ def dropped_requirements(
 
     All other requirements of ``before`` hold wherever all requirements of ``after`` hold.
     """
-    now = [(part, whole) for whole in after for part in _parts(whole)]
-    kept_as_they_are = {_only_demand(part) for part, _ in now}  # most are, and it is fast
+    new_parts = [
+        (part, new_requirement) for new_requirement in after for part in _parts(new_requirement)
+    ]
+    new_demands = {_only_demand(part) for part, _ in new_parts}  # a fast test for equal parts
     dropped = []
     for requirement in before:
         parts = tuple(_parts(requirement))
         if all(
-            _only_demand(part) in kept_as_they_are or any(_implies(each, part) for each, _ in now)
+            _only_demand(part) in new_demands
+            or any(_implies(new_part, part) for new_part, _ in new_parts)
             for part in parts
         ):
             continue
-        kept = (whole for each, whole in now if any(_is_alike(each, part) for part in parts))
-        dropped.append(DroppedRequirement(requirement, tuple(dict.fromkeys(kept))))
+        remaining = (
+            new_requirement
+            for new_part, new_requirement in new_parts
+            if any(_is_alike(new_part, part) for part in parts)
+        )
+        dropped.append(DroppedRequirement(requirement, tuple(dict.fromkeys(remaining))))
     return tuple(dropped)
 
 
@@ -860,8 +888,8 @@ def dropped_findings(
 ) -> list[Finding]:
     """Return a finding for each requirement that ``after`` does not fully demand.
 
-    Those of one table for several robots are one finding.  ``file`` is the path of the requirements
-    ``after``.
+    The requirements that one table makes for several robots share a finding.  ``file`` is the path
+    of the requirements ``after``.
     """
     tables: dict[tuple[Source, bool], list[DroppedRequirement]] = {}
     for dropped in dropped_requirements(before, after):
@@ -869,11 +897,11 @@ def dropped_findings(
     return [
         DROPPED.found(
             ": ".join(filter(None, (first.name, first.demand))),
-            first.text() + _other_robots_text([other.requirement.robot for other in others]),
+            first.text() + _other_robots_text([other.requirement.robot for other in same_table]),
             file,
             related=(RelatedPlace("required before", first.file, first.line or None),),
         )
-        for first, *others in tables.values()
+        for first, *same_table in tables.values()
     ]
 
 
@@ -891,11 +919,11 @@ def _parts(requirement: Requirement) -> Iterator[Requirement]:
     match requirement:
         case Widest(rights=rights, enclaves=enclaves):
             for right in rights:
-                for some in _single_enclaves(enclaves):
-                    yield replace(requirement, rights=(right,), enclaves=some)
+                for single in _single_enclaves(enclaves):
+                    yield replace(requirement, rights=(right,), enclaves=single)
         case NothingBut(enclaves=enclaves):
-            for some in _single_enclaves(enclaves):
-                yield replace(requirement, enclaves=some)
+            for single in _single_enclaves(enclaves):
+                yield replace(requirement, enclaves=single)
         case NotBoth(first=first, second=second):
             for right in _single_rights(first):
                 for other in _single_rights(second):
@@ -932,7 +960,7 @@ def _single_rights(rights: RightNames) -> Iterator[tuple[str, tuple[str, ...]]]:
 
 
 def _only_demand(part: Requirement) -> Requirement:
-    """Return a requirement without its place and words, to compare what it demands."""
+    """Return a requirement without its place, name and reason, to compare demands."""
     return replace(part, source=_NOWHERE, name="", why="", robot="")
 
 
@@ -959,14 +987,18 @@ def _implies(new: Requirement, old: Requirement) -> bool:
             )
         case NothingBut(), NothingBut():
             return _enclaves_within(old.enclaves, new.enclaves) and all(
-                any(right == one and _patterns_within(names, some) for one, some in old.rights)
+                any(
+                    right == old_right and _patterns_within(names, old_names)
+                    for old_right, old_names in old.rights
+                )
                 for right, names in new.rights
                 if names
             )
         case NotBoth(), NotBoth():
+            pairs = ((new.first[0], old.first[0]), (new.second[0], old.second[0]))
             return all(
-                one[0] == other[0] and covers(one[1][0], other[1][0])
-                for one, other in ((new.first[0], old.first[0]), (new.second[0], old.second[0]))
+                new_right == old_right and covers(new_name, old_name)
+                for (new_right, (new_name,)), (old_right, (old_name,)) in pairs
             )
         case Protected(), Protected():
             ((kind, name),), ((old_kind, old_name),) = new.names, old.names
@@ -990,16 +1022,22 @@ def _right_within(part: RightsRequirement, wide: RightsRequirement) -> bool:
 
 def _patterns_within(narrow: Iterable[str], wide: Sequence[str]) -> bool:
     """Return whether each pattern of ``narrow`` is covered by a pattern of ``wide``."""
-    return all(any(covers(one, name) for one in wide) for name in narrow)
+    return all(any(covers(wide_pattern, name) for wide_pattern in wide) for name in narrow)
 
 
 def _enclaves_within(narrow: Sequence[str], wide: Sequence[str]) -> bool:
     """Return whether all enclaves of the list ``narrow`` are in the list ``wide``."""
-    ours, others = ([name[1:] for name in of if name.startswith(EXCEPT)] for of in (narrow, wide))
-    some = [name for name in narrow if not name.startswith(EXCEPT)]
-    more = [name for name in wide if not name.startswith(EXCEPT)]
-    free = (e for e in others if any(overlap(e, name) for name in some))
-    return _patterns_within(some, more) and _patterns_within(free, ours)
+    narrow_excepted, wide_excepted = (
+        [name[1:] for name in enclaves if name.startswith(EXCEPT)] for enclaves in (narrow, wide)
+    )
+    narrow_names = [name for name in narrow if not name.startswith(EXCEPT)]
+    wide_names = [name for name in wide if not name.startswith(EXCEPT)]
+    still_excepted = (
+        enclave for enclave in wide_excepted if any(overlap(enclave, name) for name in narrow_names)
+    )
+    return _patterns_within(narrow_names, wide_names) and _patterns_within(
+        still_excepted, narrow_excepted
+    )
 
 
 def _is_alike(new: Requirement, old: Requirement) -> bool:
@@ -1008,14 +1046,15 @@ def _is_alike(new: Requirement, old: Requirement) -> bool:
         return False
     match new, old:
         case Widest(), Widest():
-            same = new.rights[0][0] == old.rights[0][0]
-            return same and overlap(new.enclaves[0], old.enclaves[0])
+            same_right = new.rights[0][0] == old.rights[0][0]
+            return same_right and overlap(new.enclaves[0], old.enclaves[0])
         case NothingBut(), NothingBut():
             return overlap(new.enclaves[0], old.enclaves[0])
         case NotBoth(), NotBoth():
+            pairs = ((new.first[0], old.first[0]), (new.second[0], old.second[0]))
             return all(
-                one[0] == other[0] and overlap(one[1][0], other[1][0])
-                for one, other in ((new.first[0], old.first[0]), (new.second[0], old.second[0]))
+                new_right == old_right and overlap(new_name, old_name)
+                for (new_right, (new_name,)), (old_right, (old_name,)) in pairs
             )
         case Must(), Must() if new.enclave != old.enclave:
             return False
@@ -1026,7 +1065,7 @@ def _is_alike(new: Requirement, old: Requirement) -> bool:
             ((kind, name),), ((old_kind, old_name),) = new.names, old.names
             return kind == old_kind and overlap(name, old_name)
         case Apart(), Apart():
-            same = overlap(new.sources[0], old.sources[0])
-            return same and overlap(new.targets[0], old.targets[0])
+            same_sources = overlap(new.sources[0], old.sources[0])
+            return same_sources and overlap(new.targets[0], old.targets[0])
         case _:
             raise AssertionError(old)

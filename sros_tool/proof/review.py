@@ -82,7 +82,7 @@ _OK, _FOUND, _UNDECIDED = 0, 1, 2
 
 @dataclass(frozen=True, slots=True)
 class ReviewRequest:
-    """What to review; paths are relative to the top of the repository.
+    """The input of a review; paths are relative to the top of the repository.
 
     ``head`` is the commit to review, ``base`` the commit to compare with ("": none). With
     ``allow_new_access``, new access and unreviewed policies are shown but do not make the review
@@ -110,8 +110,8 @@ class ReviewRequest:
 class AccessChange:
     """Access that HEAD allows and BASE does not.
 
-    ``undenied`` are denials that HEAD drops, of names that it does not allow either: promises to
-    users who merge the policy with others.
+    ``undenied`` are denials that HEAD drops without allowing their names: users who merge the
+    policy with others may rely on them.
     """
 
     before: AccessSource
@@ -125,7 +125,7 @@ class RightsChange:
     """How the rights of all reviewed policies in HEAD differ from those in BASE.
 
     ``absolute`` and ``relative`` are rights that are new only for users who put the node into
-    another namespace: absolute names that do not move with it, and relative ones that do.
+    another namespace: absolute names that do not move with the node, and relative names that do.
     """
 
     before: RightsSource
@@ -171,7 +171,8 @@ class ReviewStep:
     ``kind`` is "files", "policy", "requirements", "requirements-before", "new-access", "rights",
     "keystore" or "expiry"; ``subject`` is the path that the step is about.  If the result is an
     error, it says why the step could not be decided.  ``allowed``: the step found something that
-    the request allows, so that its status is 0.  ``fleet`` are the robots of what was examined.
+    the request allows, so that its status is 0.  ``fleet`` are the robots of the examined policy or
+    keystore.
     """
 
     kind: str
@@ -907,8 +908,7 @@ _SOMEWHERE = f"/n{secrets.token_hex(8)}"
 def _fixed_or_moving_names(before: AccessSource, after: AccessSource) -> Iterator[PlacedRight]:
     """Yield the rights in ``after`` that are new only for nodes in another namespace.
 
-    That is because a name there is absolute now, or relative.  Of denials, those are yielded that
-    deny less there.
+    Their names became absolute, or relative.  Denials that deny less there are yielded, too.
     """
     of_before, of_after = (
         [*chain.from_iterable(map(_moved_rights, source.enclaves.values()))]
@@ -930,7 +930,7 @@ def _fixed_or_moving_names(before: AccessSource, after: AccessSource) -> Iterato
 
 
 def _moved_rights(enclave: Enclave) -> Iterator[tuple[PlacedRight, Right]]:
-    """Yield each right of an enclave, and what it is for a node in another namespace."""
+    """Yield each right of an enclave, and the same right for a node in another namespace."""
 
     def elsewhere(profile: Profile) -> Profile:
         return replace(profile, ns=f"{_SOMEWHERE}{profile.ns}".rstrip("/"))

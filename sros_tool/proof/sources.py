@@ -191,7 +191,7 @@ def load_side(path: Path, fleet: Fleet | None = None) -> AccessSource:
     """Read one side of a comparison: also a folder of policies, or ``git:REVISION:PATH``.
 
     Raises:
-        SrosError: it cannot be read, DDS would refuse a part of it, or a part of it cannot be
+        SrosError: the side cannot be read, DDS would refuse a part of it, or a part cannot be
             compared.
     """
     if str(path).startswith(PREFIX):
@@ -334,7 +334,8 @@ def _common_governance(root: Path, folders: Iterable[Path]) -> Governance:
     """Return the governance of a keystore, after a check that all enclaves have the same one.
 
     Raises:
-        DocumentError: an enclave has another one, such as an earlier one with less protection.
+        DocumentError: an enclave has another governance, such as an earlier one with less
+            protection.
     """
     wanted = smime.parse(read_bytes(root / GOVERNANCE_P7S, "governance document")).document
     same: set[bytes] = set()
@@ -354,11 +355,11 @@ def _common_governance(root: Path, folders: Iterable[Path]) -> Governance:
 
 
 def _exported_governance(root: Path, folders: Iterable[Path]) -> Governance:
-    """Return the governance of the enclaves of an export, after verifying that of each enclave.
+    """Return the governance of the enclaves of an export, after verifying each enclave's.
 
     Raises:
-        DocumentError: enclaves have different ones, or an enclave lacks a file without which no
-            node starts in it.
+        DocumentError: enclaves have different governances, or an enclave lacks a file without
+            which no node starts in it.
     """
     enclaves: dict[Governance, Path] = {}
     for folder in folders:

@@ -1,4 +1,4 @@
-"""Proposals for requirements: what holds today, for a fleet with placeholders for its robots."""
+"""Proposals for requirements that hold today; for a fleet, with placeholders for its robots."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def suggest(
 ) -> tuple[Requirement, ...]:
     """Propose requirements that hold in all worlds, by the allowed ``rights``.
 
-    What holds for each robot of ``fleet``, or of one of its groups, is proposed once, with
-    placeholders.
+    A requirement that holds for each robot of ``fleet``, or of one of its groups, is proposed once,
+    with placeholders.
 
     Raises:
         DocumentError: there are too many wildcards to decide a requirement.
@@ -76,7 +76,7 @@ def _joined_requirement(requirement: Requirement, other: Requirement) -> Require
 
 
 class _Stated:
-    """Which enclaves state each right to a name, and the wildcards of each right."""
+    """The enclaves that state each right to a name, and the wildcards of each right."""
 
     def __init__(self, rights: Iterable[Right]) -> None:
         self.users: dict[tuple[str, str], set[str]] = defaultdict(set)
@@ -121,7 +121,7 @@ def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
 
 
 def _unused_services(stated_rights: _Stated) -> Iterator[Nobody]:
-    """Yield requirements that nobody calls the services that change nodes but are unused."""
+    """Yield requirements that nobody calls unused services that change nodes."""
     last = {name.rpartition("/")[2] for name in stated_rights.names("reply") if name.count("/") > 1}
     for each in sorted(last.difference(READING_SERVICES)):
         yield Nobody(source=_NOWHERE, rights=(("request", (f"*/{each}",)),))

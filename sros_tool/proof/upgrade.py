@@ -206,7 +206,7 @@ def check_upgrade(
         path: the policy or keystore.
         later: the distribution after the update.
         circumstances: the moment, the ROS domain, and other conditions.
-        present: the distribution before it; by default those that the keystore states.
+        present: the distribution before the update; by default those that the keystore states.
         here: the distribution that is sourced, if the keystore states none.
         vendor: the only DDS vendor that is used, of any release, or ``zenoh``; "" for all.
 

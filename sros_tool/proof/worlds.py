@@ -315,7 +315,8 @@ class World:
         nothing.  ``fitting_others`` maps an enclave to others whose permissions it can use as well.
         These count for what it may do, but not for what it must be able to do.  ``crossing`` is
         what passes between several Zenoh routers; None if all enclaves reach each other.
-        ``open_topics`` are what processes without an identity may write and read; None for nothing.
+        ``open_topics`` are the topics that processes without an identity may write and read, or
+        None.
         """
         self.title = title
         self.confirm_own = confirm
@@ -450,7 +451,7 @@ class World:
         return self.crossing.router_of.get(enclave, "") if self.crossing else ""
 
     def written_by(self, enclave: str, excluded_names: NameSet) -> Written:
-        """Return what an enclave may write, except ``excluded_names`` (equal in all calls)."""
+        """Return topics that an enclave may write, without ``excluded_names`` (always the same)."""
         if enclave not in self._written:
             names = self.side(True).of.get(enclave, NameSet()) - excluded_names
             around = names.around()
@@ -638,7 +639,7 @@ def _topics(key: str, domain: int, begin: str) -> NameSet:
 def zenoh_message(topic: str, domain: int, *, writes: bool) -> list[tuple[Flow, Message, str]]:
     """Return flow, message and key of the messages by which a process writes or reads a topic.
 
-    A topic without a ROS name has none.
+    A topic without a ROS name has no messages.
     """
     begin = topic[:2]
     end = _ENDS.get(begin)

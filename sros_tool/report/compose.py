@@ -402,8 +402,8 @@ def _marked_rights(
 def _neutral_edge(edge: Edge, unseen: frozenset[str], observed: NamesOfRights) -> Edge:
     """Return ``edge`` marked BOTH if nothing shows whether it was used.
 
-    That is so for a denial, for an enclave in ``unseen``, and for a wildcard drawn as a name of
-    which a name is in ``observed``.
+    That is so for a denial, for an enclave in ``unseen``, and for a wildcard drawn as a name that
+    matches a name in ``observed``.
     """
     neutral = edge.qualifier is not ALLOW or edge.enclave in unseen
     neutral = neutral or (is_expression(edge.name) and observed.match(edge))

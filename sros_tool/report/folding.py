@@ -337,7 +337,7 @@ class _Draft:
             yield self._kind(drawn), units, edge
 
     def _stated_edges(self) -> Iterator[Edge]:
-        """Yield the rights as they are stated which the picture shows otherwise, or not at all.
+        """Yield, as they are stated, the rights that the picture changes or does not show.
 
         These are wildcards; in a picture with a focus, all rights.
         """
@@ -686,7 +686,7 @@ def _unfolded(picture: Picture) -> Folding:
 
 
 def units_of(paths: Sequence[str], robots: Mapping[str, Robot]) -> list[DrawnUnit]:
-    """Return the units of enclaves: their ``robots``, else what looks alike by its paths."""
+    """Return the units of enclaves: their ``robots``, else units with similar paths."""
     return list(_robots(paths, robots) if robots else _guessed_units(paths))
 
 
@@ -747,7 +747,7 @@ def _group_by_first_part(paths: Iterable[tuple[str, str]]) -> dict[str, dict[str
 
 
 def _roles(picture: Picture) -> Mapping[str, tuple[object, ...]]:
-    """Map enclaves to what they are in the focus of a picture: sender, receiver, number of hops."""
+    """Map enclaves to their roles in the focus of a picture: sender, receiver, number of hops."""
     roles_of: dict[str, list[object]] = defaultdict(list)
     for number, focus in enumerate(picture.focus):
         roles_of[focus.name].append((number, "focus"))

@@ -420,7 +420,7 @@ def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
 
 
 def _who_for_single_names(picture: Picture, name: Name, *, sends: bool) -> str:
-    """Return what is said of a wildcard if enclaves may use only known names of it on one side."""
+    """Return a remark on a wildcard of which enclaves may use only known names on one side."""
     single = (
         edge
         for edge in picture.edges

@@ -365,7 +365,7 @@ class PicturedUse(NamedTuple):
     name: str
     """The absolute ROS name."""
     by: str = ""
-    """The wildcard that allows it, or an empty string."""
+    """The wildcard that allows the use, or an empty string."""
 
 
 class PicturedViolation(NamedTuple):

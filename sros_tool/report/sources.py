@@ -84,7 +84,7 @@ _AUTHORITY_FILES = "*_ca.cert.pem"
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """What a picture has to show: one source, or two sources to compare, and options.
+    """The content of a picture: one source, or two sources to compare, and options.
 
     ``sources`` are paths of policies, permissions, enclaves, keystores or observations;
     ``observed`` are paths of observations to compare with a single source.  ``template`` is the

@@ -137,8 +137,8 @@ class Process:
     def domain(self) -> str:
         """The ROS domain that the process names, as a number.
 
-        rcl reads it as strtoul(3) does, such as 0x0.  What is no number, or none of 64 bits, is
-        quoted text that is safe to print.
+        rcl reads it as strtoul(3) does, such as 0x0.  Text that is no number of 64 bits is returned
+        in quotes, safe to print.
         """
         named = self.environment.get(DOMAIN) or "0"
         number = _DOMAIN_NUMBER.fullmatch(named)
@@ -459,8 +459,8 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
 def _forked_by(folder: int, command: tuple[str, ...]) -> tuple[int, tuple[str, ...]]:
     """Return the id and command of the first process of a program; (0, ()) if it is this one.
 
-    A fork has the command of its parent.  A child of Python's ``multiprocessing`` has one that
-    only its parent can start (CPython, ``multiprocessing/spawn.py`` and ``forkserver.py``).
+    A fork has the command of its parent.  A child of Python's ``multiprocessing`` has a command
+    that only its parent can start (CPython, ``multiprocessing/spawn.py`` and ``forkserver.py``).
     """
     first: tuple[int, tuple[str, ...]] = (0, ())
     with suppress(OSError):
@@ -528,7 +528,7 @@ _LIBRARY_FILE = re.compile(rf"lib({'|'.join(map(re.escape, map(bytes.decode, _PR
 
 
 class ProcessOrigin(NamedTuple):
-    """How a process was started: each part is empty if it has none, has ended, or hides it.
+    """How a process was started: each part is empty if the process lacks or hides it, or ended.
 
     ``unit`` is its systemd system service, ``folder`` its working directory, ``launch`` the
     command of the ``ros2 launch`` that started it, or that it is, and ``container`` the id of its
@@ -728,8 +728,9 @@ class ProcessEnclave:
     def is_of(self, keystore: Path) -> bool:
         """Return whether this is an enclave of a keystore of this machine, by whatever path.
 
-        The folder of the enclave decides, or that of the keystore: links, ``..`` and the mounts of
-        a container give a folder other paths.  Of a folder that is not there, the path decides.
+        The folder of the enclave decides, or the folder of the keystore: links, ``..`` and the
+        mounts of a container give a folder other paths.  For a folder that does not exist, the path
+        decides.
         """
         own = keystore / "enclaves" / self.name.strip("/")
         for path, folder in zip((keystore, own), self.folders, strict=False):

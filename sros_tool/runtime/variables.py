@@ -30,7 +30,7 @@ def domain_from(environment: Mapping[str, str]) -> int | None:
     """Return ROS_DOMAIN_ID as a number, or None if it is unset or empty.
 
     Raises:
-        UsageError: It is not a domain id; rcl would not start either.
+        UsageError: The value is not a domain id; rcl would not start either.
     """
     text = environment.get(DOMAIN, "")
     if not text:
@@ -105,6 +105,6 @@ def domain_of(environment: Mapping[str, str]) -> int:
     """Return the domain that ROS_DOMAIN_ID names, or 0 if it is not set.
 
     Raises:
-        UsageError: It is not a domain id.
+        UsageError: The value is not a domain id.
     """
     return domain_from(environment) or 0

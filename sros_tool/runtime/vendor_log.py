@@ -2,17 +2,17 @@
 
 Fast DDS writes coloured text to standard output, Cyclone DDS writes to its log sink or to standard
 error.  With ROS_SECURITY_LOG_FILE, Fast DDS writes the reasons of refusals to that file instead, in
-another form.  Each text was seen in a real log of Fast DDS 2.9.1, 2.14.5 or 3.6.2 (Permissions.cpp,
-SecurityManager.cpp, PKIDH.cpp), Cyclone DDS 0.10.2 (access_control.c, authentication.c,
-q_omg_security.c), or rcl of Jazzy.
+another format.  Each text was seen in a real log of Fast DDS 2.9.1, 2.14.5 or 3.6.2
+(Permissions.cpp, SecurityManager.cpp, PKIDH.cpp), Cyclone DDS 0.10.2 (access_control.c,
+authentication.c, q_omg_security.c), or rcl of Jazzy.
 
-rmw_zenoh prints what is a warning or worse for nodes, and what is informative for its router;
+rmw_zenoh prints warnings and errors of nodes, and also informative messages of its router;
 RUST_LOG=zenoh=debug makes a process say why a connection failed, and RUST_LOG=zenoh=trace which
-messages access control drops.  Each text was seen in a log of Zenoh 1.10.2, but for those of
-rmw_zenoh_cpp, which are from its source.
+messages access control drops.  Each text was seen in a log of Zenoh 1.10.2; texts of
+rmw_zenoh_cpp are from its source code.
 
-To add a vendor, add its rows to `LOG_TEXTS`, the text that it puts around a reason to `_FRAME`,
-and its words for writers and readers to `DIRECTIONS`.
+To add a vendor, add its rows to `LOG_TEXTS`, the text that it puts around a reason to
+`_AROUND_REASON`, and its words for writers and readers to `DIRECTIONS`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from sros_tool.faults import Fault
 
 
 class Refused(Enum):
-    """What a log message says that DDS Security refused."""
+    """The object that DDS Security refused, according to a log message."""
 
     ALL_SECURITY = auto()
     """Every secured participant: DDS Security is not built in."""
@@ -48,8 +48,8 @@ class LogText(NamedTuple):
 
     ``pattern`` is searched in a line without colours; its groups are fields such as ``path``,
     ``domain`` and ``topic``.  ``cause`` and ``remedy`` may use these fields in braces; ``cause`` is
-    "" if the text alone does not show a cause.  ``faults`` are faults of an enclave that can cause
-    the text, to look for in the enclave; ``unseen`` is the remedy if the enclave has none of them.
+    "" if the text alone does not show a cause.  ``faults`` are the faults of an enclave that can
+    cause the text; ``unseen`` is the remedy if the enclave has none of these faults.
 
     ``vagueness`` is 0 for a text that names a cause, and higher for less specific texts: of all
     texts of a process, only those with the lowest value count.  ``refuses`` is None if the text
@@ -108,19 +108,23 @@ _FILES = (
 )
 _KEY = (Fault.KEY_ENCRYPTED, Fault.KEY_MALFORMED)
 _SIGNATURE = (Fault.SIGNATURE, Fault.NOT_SIGNED)
-_GRANT = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_VALID, Fault.PERMISSIONS_SUBJECT)
+_GRANT = (
+    Fault.PERMISSIONS_EXPIRED,
+    Fault.PERMISSIONS_NOT_YET_VALID,
+    Fault.PERMISSIONS_SUBJECT,
+)
 _DOCUMENT = (Fault.PERMISSIONS_MALFORMED, Fault.GOVERNANCE_MALFORMED)
-_ALL = (
+_ALL_FAULTS = (
     *_CERTIFICATE, Fault.CERTIFICATE_MALFORMED, *_CA, *_CRL, *_FILES, *_KEY, Fault.KEY_MISMATCH,
     *_SIGNATURE, *_GRANT, *_DOCUMENT, Fault.GOVERNANCE_DOMAIN, Fault.PERMISSIONS_DOMAIN,
 )  # fmt: skip
 
-_CHECK = "`sros explain KEYSTORE ENCLAVE --log LOG` finds the cause in the enclave."
-_FILE = "If ROS_SECURITY_LOG_FILE names a file, run `sros explain --log FILE` with it."
-_CHECK_OR_FILE = f"{_CHECK} {_FILE}"
+_EXPLAIN_REMEDY = "`sros explain KEYSTORE ENCLAVE --log LOG` finds the cause in the enclave."
+_LOG_FILE_REMEDY = "If ROS_SECURITY_LOG_FILE names a file, run `sros explain --log FILE` with it."
+_EXPLAIN_OR_LOG_FILE = f"{_EXPLAIN_REMEDY} {_LOG_FILE_REMEDY}"
 _RENEW = "Renew the enclave: `sros renew KEYSTORE ENCLAVE`."
 _SIGN = "Sign the permissions again: `sros create_permission KEYSTORE ENCLAVE POLICY`."
-_SIGN_ONE = (
+_SIGN_DOCUMENT = (
     f"`sros explain KEYSTORE ENCLAVE --log LOG` names the document. {_SIGN} Restore a governance "
     "from a backup: every enclave depends on it."
 )
@@ -128,7 +132,7 @@ _READABLE = (
     "Allow the user that runs the node to read it, and to enter the folders above it: `ls -lL "
     "{path}`, run as that user, shows whether this works."
 )
-_HAND_OVER = (
+_MAKE_READABLE_FOR_USER = (
     "As the user that runs the node, run `sros check KEYSTORE`: it names what this user cannot "
     "read. If the folder is an export, give it to that user: `sudo chown -R USER KEYSTORE`. If it "
     "has the CA keys, which no node should be able to read, export the enclave into a folder of "
@@ -208,7 +212,7 @@ LOG_TEXTS: tuple[LogText, ...] = (
         r"filesystem error: [\w ]{1,40}: Permission denied "
         r"\[(?P<path>[^\]]*/(?:key\.p11|[a-z_.]+\.(?:pem|p7s)))\]",
         "the user that runs this process may not read {path}, or enter one of the folders above it",
-        _HAND_OVER,
+        _MAKE_READABLE_FOR_USER,
     ),
     _log_text(
         "enclave-missing", _ROS,
@@ -333,17 +337,17 @@ LOG_TEXTS: tuple[LogText, ...] = (
     _log_text(
         "signature", _CYCLONE, r"PKCS7_signatureVerify:digest failure",
         "governance.p7s or permissions.p7s was changed after it was signed",
-        _SIGN_ONE, _SIGNATURE,
+        _SIGN_DOCUMENT, _SIGNATURE,
     ),
     _log_text(
         "signer", _CYCLONE, r"PKCS7_verify:certificate verify error",
         "governance.p7s or permissions.p7s was signed by another CA than the permissions CA "
-        "next to it", f"Use the files of one keystore together. {_SIGN_ONE}", _SIGNATURE,
+        "next to it", f"Use the files of one keystore together. {_SIGN_DOCUMENT}", _SIGNATURE,
     ),
     _log_text(
         "not-signed", _CYCLONE, r"SMIME_read_ASN1_ex:no content type|SMIME_read_ASN1",
         "governance.p7s or permissions.p7s is plain XML or damaged, and not a signed document",
-        _SIGN_ONE, _SIGNATURE,
+        _SIGN_DOCUMENT, _SIGNATURE,
     ),
     _log_text(
         "permissions-expired", _CYCLONE, r"Permissions validity period expired(?P<when>[^)]*\))?",
@@ -387,7 +391,7 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "participant", _CYCLONE, r"rmw_create_node: failed to create (?:DomainParticipant|domain)",
         "the process could not join its domain, and this line does not say whether DDS Security, "
         "the network interface or the domain is the reason: Cyclone DDS says it in an earlier "
-        "line, on standard error", _CHECK, _ALL, vagueness=2,
+        "line, on standard error", _EXPLAIN_REMEDY, _ALL_FAULTS, vagueness=2,
     ),
     # ── Fast DDS, meeting peers ────────────────────────────────────────────────────────────
     _log_text(
@@ -459,13 +463,13 @@ LOG_TEXTS: tuple[LogText, ...] = (
         r"|PKIDH::validate_local_identity :\s*\Z",
         "the identity is refused, and the message gives no reason: the certificate or its CA is "
         "out of date, from another CA, damaged or revoked, or crl.pem is out of date or damaged",
-        _CHECK, (*_CERTIFICATE, Fault.CERTIFICATE_MALFORMED, *_CA, *_CRL),
+        _EXPLAIN_REMEDY, (*_CERTIFICATE, Fault.CERTIFICATE_MALFORMED, *_CA, *_CRL),
     ),
     _log_text(
         "ca", _FAST, r"Error '(?P<number>\d+)' verifying CA certificate"
         r"(?: for \S.*?: (?P<why>[a-z][\w ,()-]*?))?(?= \(\S+:\d+\)|\Z)",
         "the first certificate of a CA's file is not accepted (OpenSSL's error {number}: {why})",
-        _CHECK, (*_CA, Fault.CERTIFICATE_MALFORMED),
+        _EXPLAIN_REMEDY, (*_CA, Fault.CERTIFICATE_MALFORMED),
         refuses=Refused.PARTICIPANT,
     ),
     _log_text(
@@ -501,20 +505,20 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "signature", _FAST, r"PKCS7 data verification failed",
         "governance.p7s or permissions.p7s was changed, or signed by another CA than the "
         "permissions CA next to it; the message does not say which",
-        _SIGN_ONE, _SIGNATURE,
+        _SIGN_DOCUMENT, _SIGNATURE,
         refuses=Refused.PARTICIPANT,
     ),
     _log_text(
         "not-signed", _FAST, r"Input data has not PKCS7 S/MIME format",
         "governance.p7s or permissions.p7s is not a signed document: plain XML, or damaged; the "
-        "message does not say which", _SIGN_ONE, _SIGNATURE,
+        "message does not say which", _SIGN_DOCUMENT, _SIGNATURE,
         refuses=Refused.PARTICIPANT,
     ),
     _log_text(
         "grant", _FAST, r"Not found the identity subject name in permissions file",
         "one of three causes: the permissions have expired, are not valid yet, or have no grant "
         "for this subject name. Fast DDS reads their dates in the local time of the host",
-        _CHECK, _GRANT,
+        _EXPLAIN_REMEDY, _GRANT,
         refuses=Refused.PARTICIPANT,
     ),
     _log_text(
@@ -563,16 +567,17 @@ LOG_TEXTS: tuple[LogText, ...] = (
         r"|Participant is not allowed with its own permissions file"
         r"|SecurityManager::init :\s*\Z|Cryptography plugin not configured",
         "the process may not join; Fast DDS 2.14 gives the reason in another line, or in the file "
-        "of ROS_SECURITY_LOG_FILE, and neither is in this log", _CHECK_OR_FILE, _ALL,
-        unseen=_FILE, vagueness=1,
+        "of ROS_SECURITY_LOG_FILE, and neither is in this log", _EXPLAIN_OR_LOG_FILE, _ALL_FAULTS,
+        unseen=_LOG_FILE_REMEDY, vagueness=1,
     ),
     _log_text(
         "participant", _FAST, r"Cannot create participant due to initialization error"
         r"|Problem creating RTPSParticipant|failed to create participant",
         "the process may not join, and this log gives no reason: Fast DDS 2.6 and 2.9 log "
         "nothing about signatures, expired permissions and subjects, later releases log them on "
-        "standard output or in the file of ROS_SECURITY_LOG_FILE", _CHECK_OR_FILE, _ALL,
-        unseen=_FILE, vagueness=2,
+        "standard output or in the file of ROS_SECURITY_LOG_FILE",
+        _EXPLAIN_OR_LOG_FILE, _ALL_FAULTS,
+        unseen=_LOG_FILE_REMEDY, vagueness=2,
     ),
     _log_text(
         "service", _ROS, r"(?:could not|failed to) create (?:service|client)"
@@ -675,7 +680,7 @@ UNKNOWN = LogText(
 )
 """The meaning of a line that looks like a DDS Security message but is not in `LOG_TEXTS`."""
 
-_NAMED = (
+_NAME_ENCLAVE = (
     "start the process with `sros run KEYSTORE ENCLAVE -- COMMAND`, or name its enclave in "
     "ROS_SECURITY_ENCLAVE_OVERRIDE or `--ros-args --enclave`. Do not create an enclave /: every "
     "process that names none would run in it."
@@ -684,7 +689,7 @@ NO_ENCLAVE = _log_text(
     "no-enclave", _ROS, "",
     "no enclave is named for this process, so it looked for the files of the enclave /, and the "
     "keystore has none",
-    f"Name one: {_NAMED}",
+    f"Name one: {_NAME_ENCLAVE}",
     refuses=Refused.PARTICIPANT,
 )  # fmt: skip
 """The meaning of `files-missing` in a process that named no enclave."""
@@ -693,11 +698,11 @@ RUNS_OPEN = _log_text(
     "no enclave is named for this process: unless the keystore has an enclave /, it RUNS UNSECURED "
     "if ROS_SECURITY_STRATEGY is not exactly Enforce, without any further message; with Enforce it "
     "does not start",
-    f"If it runs, stop it. Then {_NAMED}", vagueness=4,
+    f"If it runs, stop it. Then {_NAME_ENCLAVE}", vagueness=4,
 )  # fmt: skip
 """The meaning of rcl's line about the enclave /, in a log without an error after it."""
 
-_STYLES = (
+_LINE_FORMATS = (
     (Vendor.CYCLONE, re.compile(r"\A\d+\.\d+ \[\d*\]\s+\S+: ")),
     (
         Vendor.FAST,
@@ -713,7 +718,7 @@ def style_of(line: str) -> Vendor | None:
 
     ``line`` has no label of its process any more.
     """
-    return next((vendor for vendor, style in _STYLES if style.search(line)), None)
+    return next((vendor for vendor, style in _LINE_FORMATS if style.search(line)), None)
 
 
 # ── the lines around a text ────────────────────────────────────────────────────────────────
@@ -829,15 +834,15 @@ def plain_refusal(line: str) -> str:
     A line without a message gives the name of the failed function; only an empty line gives "".
     """
     line = " ".join(plain_text(line).split())
-    if words := " ".join(_FRAME.sub("", line).split()):
+    if words := " ".join(_AROUND_REASON.sub("", line).split()):
         return words
     function = _FUNCTION.search(line)
-    return _NO_REASON.format(function[1].replace("_", " ") + " failed") if function else line
+    return _WITHOUT_REASON.format(function[1].replace("_", " ") + " failed") if function else line
 
 
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
-_FRAME = re.compile(
+_AROUND_REASON = re.compile(
     # Fast DDS: time, `[SECURITY Error]`, source position, and function.
     r"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d[.\d]* (?=\[)|\[SECURITY\w* (?:Error|Warning)\]\s*"
     r"|\s*\([^()\s]+\.(?:cpp|h|hpp|ipp):\d+\)|\s*-> Function \w+\Z|, at \S+\.(?:cpp|c):\d+"
@@ -850,20 +855,20 @@ _FRAME = re.compile(
 )
 """The text that vendors put around the reason of a refusal, such as times and positions."""
 
-_NO_REASON = "{}, and Fast DDS gives no reason"
+_WITHOUT_REASON = "{}, and Fast DDS gives no reason"
 _FUNCTION = re.compile(r"(?:-> Function |::)(\w+)(?: :)?\s*\Z")
 """The failed function, in a line of Fast DDS without a message."""
 
 
 # ── Zenoh ────────────────────────────────────────────────────────────────────────────────────────
 
-_RUN = "Start it in its enclave: `sros run KEYSTORE ENCLAVE -- COMMAND`."
+_RUN_IN_ENCLAVE = "Start it in its enclave: `sros run KEYSTORE ENCLAVE -- COMMAND`."
 _RUN_PEER = "Start that process in its enclave: `sros run KEYSTORE ENCLAVE -- COMMAND`."
-_SAME = (
+_SAME_KEYSTORE = (
     "Give both sides enclaves of the same keystore, and restart both after each stage of `sros "
     "rotate_ca KEYSTORE`; `sros inspect` shows the CA of each."
 )
-_WRITTEN = "Let `sros zenoh KEYSTORE` write the file, and do not edit it."
+_WRITE_AGAIN = "Let `sros zenoh KEYSTORE` write the file, and do not edit it."
 
 ZENOH_IDS = "zenoh-"
 """Prefix of the ids of Zenoh's log texts."""
@@ -887,7 +892,7 @@ _ZENOH_TEXTS: tuple[LogText, ...] = (
         "foreign-ca", r"zenoh_link\S*: received fatal alert: UnknownCA"
         r"|invalid peer certificate: UnknownIssuer",
         "a PEER was refused, or refused this process: their certificates are of different CAs",
-        _SAME,
+        _SAME_KEYSTORE,
     ),
     _zenoh_text(
         "not-tls", r"zenoh_link\S*: received corrupt message of type InvalidContentType",
@@ -917,7 +922,7 @@ _ZENOH_TEXTS: tuple[LogText, ...] = (
         "a PEER closed the connection: it does not accept the certificate of this process "
         "({alert}); most often it compares the name of the endpoint with it "
         "(verify_name_on_connect), but certificates of enclaves name no host",
-        f"Look at the configuration of the peer. {_WRITTEN}",
+        f"Look at the configuration of the peer. {_WRITE_AGAIN}",
     ),
     _zenoh_text(
         "no-subject", r"(?P<zid>[0-9a-f]{1,32}) did not match any configured ACL subject\. "
@@ -931,12 +936,12 @@ _ZENOH_TEXTS: tuple[LogText, ...] = (
         "no-subject-open", r"(?P<zid>[0-9a-f]{1,32}) did not match any configured ACL subject\. "
         r"Default permission `Allow`",
         "a PEER is connected, and may do everything: the default of access_control is to allow",
-        _WRITTEN,
+        _WRITE_AGAIN,
     ),
     # ── the side that connects ─────────────────────────────────────────────────────────────
     _zenoh_text(
         "no-certificate", r"received fatal alert: CertificateRequired",
-        "this process showed no certificate", _RUN,
+        "this process showed no certificate", _RUN_IN_ENCLAVE,
     ),
     _zenoh_text(
         "expired", r"received fatal alert: CertificateExpired",
@@ -945,18 +950,18 @@ _ZENOH_TEXTS: tuple[LogText, ...] = (
     ),
     _zenoh_text(
         "refused", r"received fatal alert: (?P<alert>\w{1,40})",
-        "the other side does not accept the certificate of this process ({alert})", _SAME,
+        "the other side does not accept the certificate of this process ({alert})", _SAME_KEYSTORE,
     ),
     _zenoh_text(
         "name", r"invalid peer certificate: certificate not valid for name (?P<name>\"[^\"]*\")",
         "this process compares {name} with the certificate of the other side "
         "(verify_name_on_connect), but certificates of enclaves name no host",
-        _WRITTEN,
+        _WRITE_AGAIN,
     ),
     _zenoh_text(
         "no-paths", r"Missing TLS (?P<what>private key|certificate)",
         "the configuration does not say where the {what} is: ZENOH_CONFIG_OVERRIDE is missing",
-        _RUN,
+        _RUN_IN_ENCLAVE,
     ),
     _zenoh_text(
         "key-mismatch", r"Bad certificate/key: keys may not be consistent",
@@ -966,17 +971,18 @@ _ZENOH_TEXTS: tuple[LogText, ...] = (
     _zenoh_text(
         "file", r"Invalid TLS (?P<what>[\w ]{1,40}?)(?: file)?: (?P<why>[^/]{1,80}?) at /",
         "the file of the {what} cannot be read: {why}",
-        f"Restore the file, or correct the path in ZENOH_CONFIG_OVERRIDE. {_RUN}",
+        f"Restore the file, or correct the path in ZENOH_CONFIG_OVERRIDE. {_RUN_IN_ENCLAVE}",
     ),
     _zenoh_text(
         "tcp-to-tls", r"Unable to connect to configured peer (?P<endpoint>tcp/\S+)! Read error on "
         r"TCP link .{1,120}early eof",
-        "the other side closed a connection without TLS to {endpoint}: it listens with TLS", _RUN,
+        "the other side closed a connection without TLS to {endpoint}: it listens with TLS",
+        _RUN_IN_ENCLAVE,
     ),
     _zenoh_text(
         "protocol", r"Unsupported protocol: (?P<protocol>\w{1,20})\. Supported protocols are",
         "an endpoint has the protocol {protocol}, which the configuration excludes",
-        "Write tls/HOST:PORT. " + _WRITTEN,
+        "Write tls/HOST:PORT. " + _WRITE_AGAIN,
     ),
     _zenoh_text(
         "not-there",
@@ -992,27 +998,27 @@ _ZENOH_TEXTS: tuple[LogText, ...] = (
     _zenoh_text(
         "rules", r"Access control not enabled due to: (?P<why>.{1,200}?) at /",
         "access_control is not valid, so the session does not open: {why}",
-        f"`sros check FILE` examines it. {_WRITTEN}",
+        f"`sros check FILE` examines it. {_WRITE_AGAIN}",
     ),
     _zenoh_text(
         "no-rules", r"Access control (?P<what>rules|subjects|policies) list is empty",
         "access_control has no {what}: no message passes",
-        f"`sros check FILE` examines it. {_WRITTEN}",
+        f"`sros check FILE` examines it. {_WRITE_AGAIN}",
     ),
     _zenoh_text(
         "setting", r"unknown field `(?P<field>[^`]{1,60})`, expected one of",
         "the configuration has a setting that this Zenoh does not have: {field}",
-        f"`sros check FILE` examines it. {_WRITTEN}",
+        f"`sros check FILE` examines it. {_WRITE_AGAIN}",
     ),
     _zenoh_text(
         "expression", r"Invalid Key Expr `(?P<key>[^`]{1,200})`: (?P<why>.{1,200}?) at /",
         "the key expression {key} is not valid ({why}), so the session does not open",
-        f"`sros check FILE` examines it. {_WRITTEN}",
+        f"`sros check FILE` examines it. {_WRITE_AGAIN}",
     ),
     _zenoh_text(
         "configuration", r"Invalid configuration file (?P<path>\S{1,300})",
         "rmw_zenoh does not accept the configuration {path}",
-        f"`sros check FILE` examines it. {_WRITTEN}",
+        f"`sros check FILE` examines it. {_WRITE_AGAIN}",
     ),
     # ── without a reason ───────────────────────────────────────────────────────────────────
     _zenoh_text(
@@ -1059,7 +1065,7 @@ _DENIED = re.compile(
     r"(?:Some\()?(?P<key>[^\s)]{1,1000})"
 )
 _NAME = re.compile(r"CertCommonName\((?P<name>[^)]{1,200})\)")
-_BOTH = "Declare/Undeclare"
+_DECLARED_OR_UNDECLARED = "Declare/Undeclare"
 
 
 def dropped_messages(lines: Iterable[tuple[int, str, str]]) -> Iterator[DroppedMessage]:
@@ -1078,7 +1084,7 @@ def dropped_messages(lines: Iterable[tuple[int, str, str]]) -> Iterator[DroppedM
         place = process, match["zid"], match["key"]
         if match["subject"] and (named := _NAME.search(match["subject"])):
             names[process, match["zid"]] = named["name"]
-        if match["message"].startswith(_BOTH):
+        if match["message"].startswith(_DECLARED_OR_UNDECLARED):
             declared.add(place)
         else:
             declarations.append((number, place, match))

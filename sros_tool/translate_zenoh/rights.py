@@ -137,7 +137,7 @@ def stated_rights(enclave: Enclave) -> tuple[StatedRight, ...]:
 
 
 def remote_rights(enclave: Enclave, domain: int) -> RemoteRights:
-    """Return what a process allows to processes of ``enclave`` in a ROS domain.
+    """Return the rights that a process gives processes of ``enclave`` in a ROS domain.
 
     `remote_of` does the same for several domains.
     """
@@ -353,7 +353,7 @@ def _names_of_expression(name: str, place: Source) -> list[str]:
     """Return the names of an expression, for each choice of its ``?`` and sets of characters.
 
     Raises:
-        PolicyError: they take more than `MOST_EXPRESSIONS`.
+        PolicyError: the names take more than `MOST_EXPRESSIONS`.
     """
     try:
         names = listed_expressions(name, MOST_EXPRESSIONS)

@@ -68,7 +68,7 @@ class AccessRule(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RemoteRights:
-    """What a remote process may send and receive if its certificate has this common name.
+    """The rights of remote processes whose certificate has this common name.
 
     A denial can turn a key with wildcards into a list of keys.  ``made_of`` has the original keys
     and what was subtracted from them, by the direction and message kinds of a rule.
@@ -295,7 +295,7 @@ def joined_rights(name: str, rights: Iterable[RemoteRights]) -> RemoteRights:
 
 
 class RightsBetween:
-    """What processes of two enclaves may send each other directly: only what both enclaves may.
+    """The messages that processes of two enclaves may exchange directly, by the rights of both.
 
     So a process that obeys its own rules never sends or receives more than its rights permit,
     whatever the other process does.

@@ -125,7 +125,7 @@ class TlsOptions:
 
 @dataclass(frozen=True, slots=True)
 class ConfigurationDocument:
-    """The configuration of a Zenoh process: what security depends on, with Zenoh's defaults.
+    """The configuration of a Zenoh process: settings for security, with Zenoh's defaults.
 
     ``protocols`` are the protocols that endpoints may have, None for all.  ``namespace`` is put
     before every key of the process.  ``lines`` maps paths of settings, such as "transport/link", to

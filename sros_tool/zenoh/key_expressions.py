@@ -288,7 +288,7 @@ _MOST_COMMON = 4096
 
 
 class TooManyExpressions(Exception):  # noqa: N818 - the caller makes an error of it
-    """What two key expressions share takes too many key expressions."""
+    """The common keys of two key expressions take too many key expressions."""
 
 
 def common(one: str, other: str) -> list[str]:

@@ -85,7 +85,7 @@ permissions."""
 
 
 class _Party:
-    """What an enclave trusts, and what it presents, of the identity and the permissions CA."""
+    """An enclave's certificates of both roles: the CAs that it trusts, and what it presents."""
 
     def __init__(self, certificate: x509.Certificate, trusted_cas: tuple[bytes, bytes]) -> None:
         self.certificate = certificate
@@ -93,7 +93,7 @@ class _Party:
         self.signer: x509.Certificate | None = None
 
     def accepts(self, other: _Party, role: int) -> bool:
-        """Return whether a node of this enclave accepts the CA of the other one in this role."""
+        """Return whether a node of this enclave accepts the other enclave's CA in this role."""
         shown = (other.certificate, other.signer)[role]
         return shown is not None and any(
             shown == authority or issued_by(shown, authority) for authority in self.trusted[role]
@@ -171,9 +171,9 @@ def _strangers(
 def _refused_roles(
     some: Sequence[_Party], others: Sequence[_Party], roles: range
 ) -> tuple[int, ...]:
-    """Return the roles in which all pairs of enclaves refuse each other; () if one pair does not.
+    """Return the roles in which all pairs of enclaves refuse each other.
 
-    It is () without a readable enclave, too.
+    () if one pair does not, or if no enclave can be read.
     """
     pairs = (
         tuple(role for role in roles if not (one.accepts(other, role) and other.accepts(one, role)))
@@ -295,7 +295,7 @@ class _Governed:
         return chain.from_iterable(self.domains)
 
     def meets(self, other: _Governed) -> bool:
-        """Return whether two enclaves may join one domain, also if that cannot be known."""
+        """Return whether two enclaves may join one domain; True if that is unknown."""
         return _domains_meet(self.first, other.first) or _domains_meet(self.domains, other.domains)
 
 
@@ -372,7 +372,7 @@ _MOST_SHOWN = 3
 def _differences_between(
     own: Governance, other: Governance
 ) -> tuple[Mismatch, tuple[tuple[str, str, str], ...]]:
-    """Return which communication fails between two, and the settings with both values."""
+    """Return which communication fails between two targets, and the settings with both values."""
     disturbed = mismatch(other, own)
     if not disturbed:
         return disturbed, ()

@@ -137,8 +137,8 @@ class EnclaveEvaluation(NamedTuple):
 
     ``enclave`` is the loaded enclave with its faults for these vendors; ``by_domain`` maps a ROS
     domain to the participant of each vendor.  ``portable`` says that the permissions have the
-    portable form that sros writes.  ``distributions`` are those of ROS 2 that the enclave is for,
-    or () for any.
+    portable form that sros writes.  ``distributions`` are the ROS 2 distributions that the enclave
+    is for, or () for any.
     """
 
     enclave: CheckedEnclave

@@ -139,7 +139,7 @@ class Refusal(NamedTuple):
 def choose_grant(
     traits: VendorTraits, permissions: Permissions, subject: str, *, moment: datetime, zone: tzinfo
 ) -> int | Refusal:
-    """Return the index of the grant that decides for ``subject``, or why there is none."""
+    """Return the index of the grant that decides for ``subject``, or why no grant does."""
     if not subject and traits.crashes_on_empty_subject:
         text = f"{traits.title} ends with an error at a certificate with an empty subject."
         return Refusal("empty-subject", text, Outcome.CRASHES)

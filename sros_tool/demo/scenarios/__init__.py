@@ -35,8 +35,9 @@ A scenario file is TOML: parties, rows, and the policy of their enclaves.
 ``expected`` is a status of the demo's table; the keys for the parties of a claim depend on it
 (`_PARTIES`).
 ``keystore = "foreign"`` gives a party the identity of another CA; ``variables`` is a table of
-environment variables, of those in `_VARIABLES`.  The name of a party is also that of its log.  A
-claim that something does not happen needs another claim or a control that something does happen.
+environment variables; `_VARIABLES` has the names that are allowed.  The log of a party has the
+party's name.  A claim that something does not happen needs another claim or a control that
+something does happen.
 """
 
 from __future__ import annotations

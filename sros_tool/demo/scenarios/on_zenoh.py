@@ -359,7 +359,7 @@ def _refused_connection_row(
 
 
 def _accepted_connection_row(name: str, keystore: KeystoreChoice, defence_removed: str) -> Row:
-    """Return a row in which such a process is heard, because a defence is missing."""
+    """Return a row in which a process in the name of the talker is heard, without a defence."""
     wide, _, listener = _topic_pair(keystore)
     party = _attacker("attacker", Role.TALKER, keystore, "talker")
     return _attempt_row(
@@ -685,7 +685,7 @@ _ROUTER_ROWS = tuple(
 
 
 def _far_router(keystore: KeystoreChoice) -> tuple[Party, Party]:
-    """Return both routers; the listener and the admin are at the far one, which starts first."""
+    """Return both routers; listener and admin connect to the far router, which starts first."""
     far = Identity(keystore, zenoh_forger.FAR_ROUTER)
     return Party("far router", Role.ROUTER, far), replace(_router(keystore), turn=1)
 
@@ -822,10 +822,10 @@ _WILDCARD_ROWS = (
 
 
 class _FalseToken(NamedTuple):
-    """A graph token that says more than the enclave of ``part``, which announces it, may.
+    """A graph token of the enclave of ``part`` that announces more than this enclave may.
 
-    ``announced`` is the enclave that it names instead of its own, "" for its own; ``role``
-    says whether ``topic`` is a topic or a service.
+    ``announced`` is the enclave that the token names ("": the enclave itself); ``role`` says
+    whether ``topic`` is a topic or a service.
     """
 
     attack: str

@@ -92,7 +92,7 @@ MESSAGE_OUTCOMES = ("kept", "unchanged", "older", "missing", "revoked", "refused
 
 
 class CollectedRequest(NamedTuple):
-    """A request for renewal, and what was done with it."""
+    """A request for renewal, and its outcome."""
 
     enclave: str
     """The enclave that the request is for; empty if the request cannot be read."""
@@ -108,7 +108,7 @@ class CollectedRequest(NamedTuple):
 
 
 class CollectedMessage(NamedTuple):
-    """What was done with the message of a robot."""
+    """The outcome of a robot's message."""
 
     robot: str
     """Name of the robot."""
@@ -131,7 +131,7 @@ class CollectedMessage(NamedTuple):
 
 
 class PublishedAnswers(NamedTuple):
-    """What was published after an inbox was taken in."""
+    """The releases that were published after an inbox was collected."""
 
     folder: Path
     """The publishing folder, as it was named."""
@@ -142,7 +142,7 @@ class PublishedAnswers(NamedTuple):
 
 
 class CollectedInbox(NamedTuple):
-    """The messages of an inbox, and what was done with them."""
+    """The messages of an inbox, and their outcomes."""
 
     keystore: NamedKeystore
     inbox: Path
@@ -197,7 +197,7 @@ def collect(
         dry_run: change nothing.
 
     Raises:
-        KeystoreError: the keystore has no fleet, or cannot be read; another process takes in
+        KeystoreError: the keystore has no fleet, or cannot be read; another process collects
             messages, too.
         DocumentError: ``restored`` names no robot of the fleet; the inbox is not a folder.
     """
@@ -383,7 +383,7 @@ def _read_message(inbox: Folder, robot: str) -> _File | None:
     """Return the message of a robot, without following a link; None if there is none.
 
     Raises:
-        _RefusedError: it is no regular file, too large, or cannot be read.
+        _RefusedError: the message is no regular file, is too large, or cannot be read.
     """
     path = f"{robot}/{MESSAGE_FILE}"
     try:
@@ -453,7 +453,7 @@ class _Verifier:
         """Return a robot's message, verified, and what to keep of it.
 
         Raises:
-            _RefusedError: it proves nothing.
+            _RefusedError: the message proves nothing.
         """
         remarks: list[str] = []
         last = None
@@ -549,7 +549,8 @@ class _Verifier:
         """Return the robot's enclave that the keystore issued the certificate to.
 
         Raises:
-            _RefusedError: the keystore did not issue it, it was revoked, or it is not the robot's.
+            _RefusedError: the certificate is not from this keystore, was revoked, or is not the
+                robot's.
         """
         validity = validity_of(signer)
         moment = min(max(self._now, validity.not_before), validity.not_after)
@@ -664,7 +665,7 @@ class _Renewals:
         """Return the outcome of a request, and why; a "renewed" one still has to be signed.
 
         Raises:
-            SrosError: it must not be signed.
+            SrosError: the request must not be signed.
         """
         name, keystore = request.name, self._keystore
         owner = robot_of(self._fleet, name)

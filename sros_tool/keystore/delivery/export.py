@@ -230,8 +230,8 @@ def exported_files(
 class ReleasedEnclave(NamedTuple):
     """The files of an enclave without its key, and what was found when they were evaluated.
 
-    ``not_valid`` is a clause on what is not valid now, or "".  Until ``until``, files with another
-    revocation list are as good as these if that list is good and does not revoke the enclave.
+    ``not_valid`` is a clause on what is not valid now, or "".  Until ``until``, these files also
+    work with another revocation list, if that list is valid and does not revoke the enclave.
     """
 
     files: Mapping[str, bytes]

@@ -250,10 +250,10 @@ def publish(
 
 
 def later_in_folder(keystore: Keystore) -> str:
-    """Return, as a clause, what shows that the publishing folder is newer than the keystore.
+    """Return a clause with evidence that the publishing folder is newer than the keystore.
 
-    "" if it is not later, or if this is unknown here.  Only metadata that keys of the keystore
-    signed counts.
+    "" if the folder is not newer, or if this is unknown here.  Only metadata that keys of the
+    keystore signed counts.
     """
     with suppress(SrosError, ValueError, OSError, KeyError, TypeError):
         if may_have_later_releases(keystore):

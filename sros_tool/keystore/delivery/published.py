@@ -60,7 +60,7 @@ class PublishedRelease(NamedTuple):
 
 
 def check_count(value: object, maximum: int = MOST_NUMBER) -> int:
-    """Return a number of a release or a version; raise `ValueError` if it is none."""
+    """Return the number of a release or a version; raise `ValueError` for any other value."""
     if type(value) is not int or not 1 <= value <= maximum:
         raise ValueError("a release number or version is no number, or is too high")
     return value
@@ -175,7 +175,7 @@ def may_have_later_releases(keystore: Keystore) -> bool:
 
 
 def later_revoked_serials(keystore: Keystore) -> frozenset[int]:
-    """Return what lists of the keystore in a publishing folder with later releases revoke."""
+    """Return the serials that the keystore's lists in a folder with later releases revoke."""
     serials: set[int] = set()
     seen: set[bytes] = set()
     if may_have_later_releases(keystore):

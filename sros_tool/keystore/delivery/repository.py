@@ -206,7 +206,7 @@ def _is_signed(
 
 @dataclass
 class Present:
-    """The metadata in a publishing folder, as its timestamp leads to it; empty without one."""
+    """The metadata in a publishing folder, as its timestamp names it; empty without a timestamp."""
 
     timestamp: Metadata[Timestamp] | None = None
     snapshot: Metadata[Snapshot] | None = None
@@ -312,7 +312,8 @@ def _read(
 class Composed(NamedTuple):
     """New metadata: the files in the order in which they have to be written.
 
-    ``versions`` and ``expires`` are those of all metadata, also of what stays, by name.
+    ``versions`` and ``expires`` map the names of all metadata, also of unchanged metadata, to
+    version and expiry.
     """
 
     files: Sequence[tuple[str, bytes]]
@@ -343,7 +344,7 @@ class Composer:
             present: what is in the publishing folder.
             signers: by role, the current one first.
             known: the versions that were published before, as far as the keystore knows.
-            least: what new versions have to be higher than.
+            least: a number that new versions have to exceed.
             expiry: how long new metadata is valid.
             now: the current time.
         """

@@ -71,7 +71,7 @@ class Authority:
         """The private key.
 
         Raises:
-            KeystoreError: it is that of a CA service.
+            KeystoreError: the key belongs to a CA service.
         """
         if self.own_key is None:
             raise KeystoreError(
@@ -307,7 +307,8 @@ def check_imported(
     """Return the CA certificate of ``key`` with its chain, after checking them.
 
     ``data`` holds the certificates of the CA and of its issuers as PEM, in any order; without a
-    ``key``, that of the CA is the first.  A fault that only some DDS vendors refuse becomes a note.
+    ``key``, the first certificate is the CA's.  A fault that only some DDS vendors refuse becomes a
+    note.
 
     Raises:
         PkiError: the CA cannot be the ``role`` CA.

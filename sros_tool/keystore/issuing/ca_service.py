@@ -168,10 +168,10 @@ class CaService:
 
 
 def _bounded_output(process: subprocess.Popen[bytes]) -> tuple[bytes | None, bytes]:
-    """Return the output of a program, up to a little too much, and the end of its errors.
+    """Return the output of a program, up to just above the limit, and the end of its errors.
 
-    The output is None if the program does not end in time.  In both cases it is ended, with what it
-    started.
+    The output is None if the program does not end in time.  In both cases the program and its child
+    processes are ended.
     """
     end, answer, errors, ended = time.monotonic() + _SECONDS, b"", b"", False
     assert process.stdout and process.stderr

@@ -179,7 +179,7 @@ class KeystoreChange:
         """Recover and lock the keystore.
 
         Raises:
-            KeystoreError: it is not a keystore, is busy, or cannot be read.
+            KeystoreError: the folder is not a keystore, is busy, or cannot be read.
         """
         if not self.dry_run:
             recover_keystore(self.root)
@@ -480,7 +480,7 @@ class KeystoreChange:
 
     @property
     def is_guess(self) -> bool:
-        """Whether certificates stand for those that a CA service would issue: in a dry run."""
+        """Whether certificates are placeholders for those of a CA service, as in a dry run."""
         return self.dry_run and bool(self._entries_of_ca_service())
 
     @property
@@ -501,8 +501,8 @@ class KeystoreChange:
         """Note certificates of a CA service that expire earlier than was asked.
 
         Raises:
-            KeystoreError: a serial number was there before: whoever revokes one certificate would
-                revoke the other one, too.
+            KeystoreError: a serial number was used before: a revocation would revoke both
+                certificates.
         """
         if not (issued := self._entries_of_ca_service()):
             return

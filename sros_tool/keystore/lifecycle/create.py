@@ -899,9 +899,10 @@ class _EnclaveMaker:
         return _EnclaveOutcome("completed" if completed else "kept", notes)
 
     def _may_have_others(self, name: str, certificate: x509.Certificate) -> bool:
-        """Return whether something else that was issued for an enclave may work, by the ledger.
+        """Return whether other files issued for an enclave may still work, by the ledger.
 
-        That is an earlier certificate, or other permissions for the subject of this one.
+        These are an earlier certificate, or other permissions for the subject of the current
+        certificate.
         """
         certificates, permissions = self._recorded_credentials.get(name, (set(), []))
         subject = subject_text(certificate.subject)

@@ -53,8 +53,8 @@ class ReplacedRights:
     gained: tuple[Right, ...]
     """Rights that were added, and denials that were taken away."""
     works_until: datetime | None
-    """When the last permissions of the enclave that the ledger has expire, in UTC, for whoever kept
-    them with their certificate; null if they no longer work."""
+    """Expiry, in UTC, of the enclave's last permissions in the ledger, which work for anyone who
+    kept them with their certificate; null if they no longer work."""
     lost_domains: str = ""
     """ROS domains, such as 0,7, for which the enclave no longer has permissions."""
     gained_domains: str = ""
@@ -70,7 +70,7 @@ class ReplacedRights:
     def lost_text(self, fleet: Fleet | None = None) -> str:
         """Return the rights and domains that are lost, as text; "" for none.
 
-        Rights to names that differ only in the robot of ``fleet`` are one.
+        Rights to names that differ only in the robot of ``fleet`` share an entry.
         """
         return self._text(self.lost, self.lost_domains, fleet)
 
@@ -136,10 +136,10 @@ def replaced_rights(
 
 
 class IssuedEarlier:
-    """When the certificates and permissions of enclaves expire that were issued before a change.
+    """The expiries of certificates and permissions that were issued before a change.
 
     ``lacks_some`` says whether the keystore is older than its robots, or was restored from a
-    backup, so that its ledger may lack some of them.
+    backup, so that its ledger may lack some of these files.
     """
 
     def __init__(self, keystore: Keystore, names: Collection[str]) -> None:

@@ -72,7 +72,7 @@ from sros_tool.validity import BACKDATE, Window, iso
 
 
 class Forgotten:
-    """What a keystore signed but does not know any more, as after a backup was restored.
+    """Files that a keystore signed but no longer knows, as after a backup was restored.
 
     An identity CA of the keystore signed these ``lists`` and ``certificates``, so they are true
     wherever they come from.  Certificates map serial numbers (hexadecimal) to ledger entries.
@@ -124,10 +124,10 @@ class Forgotten:
         return {serial: entry for serial, entry in self.certificates.items() if serial not in known}
 
     def add(self, document: bytes) -> bool:
-        """Add the lists in a PEM file that have more than is known; return whether any has.
+        """Add the lists in a PEM file that the keystore has to know; return whether there are any.
 
-        These revoke other certificates, or are not earlier than the keystore's, so that robots
-        would refuse its next list.
+        Such a list revokes other certificates, or is not earlier than the keystore's list, so that
+        robots would refuse the keystore's next list.
         """
         sha256 = hashlib.sha256(document).digest()
         if sha256 in self._seen:
@@ -257,7 +257,7 @@ class RevocationListSigner:
         self.present = self._list_if_authentic(keystore.revocation_list)
 
     def recipients(self) -> Sequence[str] | None:
-        """Return the enclaves that have the list already; None if perhaps not all have it.
+        """Return the enclaves that already have the list; None if some may lack it.
 
         In a keystore with an index, these are the enclaves that the ledger has, once a first list
         was signed: each enclave that is made later gets it.  In a rotation, files of all enclaves
@@ -489,8 +489,8 @@ class RevocationListSigner:
         """Return the list of the CA service, after verifying it.
 
         Raises:
-            KeystoreError: it was not given, the identity CA did not sign it, it is not later than
-                the current list, is not valid now, or does not revoke all ``serials``.
+            KeystoreError: the list was not given, the identity CA did not sign it, it is not later
+                than the current list, is not valid now, or does not revoke all ``serials``.
         """
         numbers = ", ".join(sorted(f"{serial:x}" for serial in serials)) or "nothing"
         remedy = (

@@ -227,9 +227,9 @@ def restore_revocations(
 def _replaced_keys(
     issued: Mapping[str, Entry], unknown: Mapping[str, Entry], reasons: Mapping[str, str]
 ) -> set[tuple[str, str]]:
-    """Return the enclaves and keys of ``issued`` certificates that were replaced with their key.
+    """Return enclave and key of each ``issued`` certificate that was replaced with its key.
 
-    ``unknown`` are certificates of after the backup; those without one in ``reasons`` are valid.
+    ``unknown`` are certificates from after the backup; they are valid unless ``reasons`` has them.
     """
     kept = {(of.enclave, of.key) for serial, of in unknown.items() if serial not in reasons}
     replaced = {(of.enclave, of.key) for s, of in issued.items() if reasons[s] == SUPERSEDED}
@@ -267,7 +267,7 @@ def _replaced_notes(root: Path, replaced: Mapping[str, bool]) -> Iterator[Note]:
 
 
 def _reasons_of_revoked(change: KeystoreChange, unknown: Mapping[str, Entry]) -> dict[str, str]:
-    """Map the serial numbers of certificates of revoked enclaves to the reasons of these."""
+    """Map serial numbers of revoked enclaves' certificates to the reasons of the revocations."""
     enclaves = {entry.enclave for entry in unknown.values()}
     reasons = {
         entry.enclave: entry.reason

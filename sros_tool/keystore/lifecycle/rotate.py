@@ -243,7 +243,7 @@ def _cut_off_error(
 
 
 def _refuse_edited(keystore: Keystore) -> None:
-    """Raise `KeystoreError` if settings or governance were edited: signing would undo that."""
+    """Raise `KeystoreError` if settings or governance were edited: signing would undo the edits."""
     root, governance = keystore.root, None
     with suppress(SrosError):  # signing it again reports it
         governance = keystore.governance
@@ -477,7 +477,8 @@ class _Rotator:
         """Add a note if the settings make a new CA expire before the old CA.
 
         Raises:
-            UsageError: it expires earlier, and the keystore has no settings, so nobody chose that.
+            UsageError: a new CA would expire earlier, and the keystore has no settings that choose
+                this.
         """
         if not (self._root / SETTINGS).exists():
             _check_later(old, new)
