@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from datetime import datetime
 from enum import Enum, auto
 from fnmatch import fnmatchcase
 from typing import NamedTuple
@@ -196,6 +197,7 @@ def explain_on_dds(
         *_not_a_topic_notes(answer, asked_enclave),
         *_similar_name_notes(answer),
         *(note_on_lacking_keys(copied) if copied else ()),
+        *_earlier_permissions_notes(answer, context.at),
     )
     what = Asked(enclave.name, question, context)
     if compared is Compared.VENDORS:
@@ -264,6 +266,14 @@ def _export_notes(answer: Answer) -> Iterator[Note]:
             f"the export is older than that policy: then `{answer.commands[-1]}` alone is enough."
         )
         yield Note("explain.exported", text)
+
+
+def _earlier_permissions_notes(answer: Answer, now: datetime) -> Iterator[Note]:
+    """Yield a note if earlier permissions of the enclave may allow what is denied."""
+    if (keystore := answer.enclave.keystore) and not answer.allowed:
+        from sros_tool.explain.earlier import note_on_earlier_permissions  # a yes needs none
+
+        yield from note_on_earlier_permissions(keystore, {answer.enclave.name}, now)
 
 
 def _other_type_notes(evaluator: Evaluator, answer: Answer, kind: str | None) -> Iterator[Note]:
@@ -550,10 +560,13 @@ class VendorOfKeystore(NamedTuple):
 
     def notes(self, outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
         """Yield notes on an export, which may lack enclaves, and on a copy without keys."""
-        from sros_tool.explain.who import note_on_export  # as in `outcomes`
+        from sros_tool.explain.earlier import note_on_earlier_permissions  # as in `outcomes`
+        from sros_tool.explain.who import note_on_export
 
         yield from note_on_export(self.keystore.root)
         refuse = remedy_in_keystore(self.keystore.root, f"Run {REFUSE_STRANGERS}.")
         yield from _note_on_anybody(outcomes, refuse)
+        denied = {outcome.enclave for outcome in outcomes if not outcome.allowed}
+        yield from note_on_earlier_permissions(self.keystore, denied, self.asking.at)
         if not all(outcome.stopped for outcome in outcomes):
             yield from note_on_lacking_keys(self.keystore)

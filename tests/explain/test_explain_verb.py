@@ -710,6 +710,21 @@ def test_who(keystore: Path) -> None:
     }
 
 
+def test_earlier_permissions_that_still_allow_it(keystore: Path, tmp_path: Path) -> None:
+    policy = tmp_path / "robot.xml"
+    policy.write_text(policy_text({ENCLAVE: publish("/other")}))
+    asked = ("publish", "/chatter")
+    assert "earlier-permissions" not in explain(keystore, OTHER, *asked).err
+    sros("create_permission", keystore, ENCLAVE, policy).ok()
+    for words in ((keystore, ENCLAVE), (keystore, "--who")):
+        denied = explain(*words, *asked)
+        assert denied.status == 1
+        assert f"note [explain.earlier-permissions]: {ENCLAVE}: earlier permissions" in denied.err
+    assert "earlier-permissions" not in explain(keystore, "--who", "publish", "/other").err
+    sros("renew", keystore, ENCLAVE, "--revoke-old").ok()
+    assert "earlier-permissions" not in explain(keystore, "--who", *asked).err
+
+
 def test_who_tells_wildcards_and_what_cannot_run(keystore: Path) -> None:
     sros("create_enclave", keystore, "/open").ok()
     BREAKAGES["certificate expired"](Enclave(keystore))
