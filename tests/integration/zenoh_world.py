@@ -239,11 +239,16 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
                 )
         graph = Graph(listener)
         until(lambda: "talker" in graph.nodes())
-        erasing = token(other, "/other", "talker", zid=str(talker.info.zid()))
-        erasing.undeclare()
+        talkers = (str(talker.info.zid()), "0", "%", "talker")
+
+        def erase() -> None:
+            token(other, "/other", "talker", zid=str(talker.info.zid())).undeclare()
+
+        erase()
+        if not rules:  # as for the attacks below
+            until(lambda: talkers not in graph.found, erase)
         kept.append(token(other, "/other", "other", "MP /elsewhere"))
         until(lambda: "other MP %elsewhere" in graph.announced())
-        erased = (str(talker.info.zid()), "0", "%", "talker")
         kept += [
             zenoh.ext.declare_advanced_publisher(
                 keeper, key("/map"), cache=zenoh.ext.CacheConfig(max_samples=1)
@@ -304,7 +309,7 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
             "nodes": sorted(seen),
             "graph": sorted(graph.nodes()),
             "announced": sorted(graph.announced()),
-            "erased": erased not in graph.found,
+            "erased": talkers not in graph.found,
             "history": sorted(late),
             "same_enclave": sorted(twin),
         }
