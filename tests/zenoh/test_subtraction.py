@@ -29,6 +29,9 @@ PARTS = ("a", "b", "ab", "ba", "aab", "az", "z", "_", "a9", "Z_b")
 NAMES = ["/" + "/".join(parts) for count in (1, 2, 3) for parts in product(PARTS, repeat=count)]
 NAMES += ["/" + "/".join(parts) for parts in product(("a", "b", "ab"), repeat=4)]
 
+SLOW = 1000
+"""Number of expressions that make a slow regular expression."""
+
 
 def forms(*names: str) -> frozenset[Chunks]:
     return frozenset(chunks for name in names for chunks in chunks_of(name))
@@ -84,7 +87,7 @@ def check(wide: list[str], denied: list[str], found: frozenset[Chunks]) -> None:
 def test_few_expressions_are_enough(wide: str, denied: list[str], most: int) -> None:
     found = subtract_all(forms(wide), forms(*denied))
     assert len(found) <= most
-    if len(found) < 1000:  # more of them make a slow regular expression
+    if len(found) < SLOW:
         check([wide], denied, found)
 
 
@@ -104,7 +107,7 @@ def test_what_no_list_says_is_refused(wide: str, denied: list[str], why: bool) -
 
 
 EXPRESSION = (
-    st.text("aab/**", min_size=1, max_size=6 if LONG else 5)
+    st.text("aab/**", min_size=1, max_size=6 if LONG else 4)
     .map(lambda text: re.sub(r"\*+", "*", f"/{text}"))
     .filter(lambda text: not expression_problem(text))
 )
@@ -117,7 +120,8 @@ def test_the_difference_is_exact_on_names_of_ros(wide: str, denied: list[str]) -
         found = subtract_all(forms(wide), forms(*denied))
     except CannotSubtract:
         return
-    check([wide], denied, found)
+    if LONG or len(found) < SLOW:
+        check([wide], denied, found)
 
 
 @settings(max_examples=2000 if LONG else 15, deadline=None)
@@ -148,7 +152,7 @@ def test_what_two_differences_share_is_exact(
             ("/*", [f"/x{number}" + "y" * 1900 for number in range(300)]),
             ("/*", [f"/*x{number}*/*y{number}" for number in range(300)]),
         ],
-        2,
+        1,
     ),
 )
 def test_a_hostile_policy_takes_no_unbounded_time(wide: str, denied: list[str]) -> None:
