@@ -37,6 +37,8 @@ from sros_tool.keystore.layout import (
     IDENTITY_CA_FILE,
     KEY_FILE,
     PERMISSIONS,
+    PERMISSIONS_CA_FILE,
+    PUBLIC,
     ROUTER_FILE,
     SESSION_FILE,
     enclave_path,
@@ -357,7 +359,7 @@ class ZenohEvaluator:
             _Outcome.REFUSED,
             own.problem,
             until=own.until,
-            unsigned=() if brief else self._unsigned_files(own),
+            unsigned=() if brief else self.unsigned_files(own),
         )
         if own.process is None:
             return answer
@@ -549,15 +551,20 @@ class ZenohEvaluator:
     def _is_verified(self, path: Path) -> bool:
         try:
             document = self.keystore.read(path, "Zenoh configuration")
-            authority = self.keystore.ca_certificate(PERMISSIONS)
+            authority = (
+                self.keystore.ca_certificate(PERMISSIONS)
+                if self.keystore.has(PUBLIC)
+                else self.keystore.certificate(path.with_name(PERMISSIONS_CA_FILE))  # an export
+            )
             return is_signed(path, document, authority, self.keystore.files)
         except SrosError:
             return False
 
-    def _unsigned_files(self, zenoh_file: ZenohFile) -> tuple[str, ...]:
+    def unsigned_files(self, *zenoh_files: ZenohFile) -> tuple[str, ...]:
+        """Return those of the files, and of the routers' files, that no permissions CA signed."""
         return tuple(
             f"{file.enclave}/{file.file}"
-            for file in dict.fromkeys((zenoh_file, *self.routers.values()))
+            for file in dict.fromkeys((*zenoh_files, *self.routers.values()))
             if file.process
             and not self._is_signed(enclave_path(self.root, file.enclave) / file.file)
         )
@@ -812,6 +819,18 @@ _ROUTERS_KEY = Note(
 )
 
 
+def _domains(keystore: Keystore, now: datetime) -> DomainSet:
+    """Return the ROS domains of a keystore; of an export, those of the governance of its enclaves.
+
+    Without any governance it is domain 0.
+    """
+    if keystore.has_all_enclaves:
+        return keystore.domains
+    governed = (keystore.enclave(name, now=now).domains() for name in keystore.names)
+    numbers = {number for domains in governed if domains for number in domains}
+    return DomainSet.of(*((number, number) for number in numbers or {0}))
+
+
 def _with_equal_rules(evaluator: ZenohEvaluator, domains: DomainSet) -> Iterator[DomainSet]:
     """Yield parts of ``domains``: the routers have the same rules for all domains of a part."""
     keys: dict[str, set[object]] = defaultdict(set)
@@ -856,12 +875,13 @@ class ZenohOfKeystore:
         self._keystore = keystore
         self._reason_text = why
         self._domain = asking.domain
-        first = asking.context(keystore.domains).domain
+        domains = _domains(keystore, asking.at)
+        first = asking.context(domains).domain
         evaluator = ZenohEvaluator(keystore, moment=asking.at, domain=first)
         self._evaluators = {first: evaluator}
         self._parts: Sequence[DomainSet] = (DomainSet.of((first, first)),)
         if asking.domain is None:
-            self._parts = tuple(_with_equal_rules(evaluator, keystore.domains))
+            self._parts = tuple(_with_equal_rules(evaluator, domains))
             for domain in (next(iter(part)) for part in self._parts):
                 if domain != first:
                     self._evaluators[domain] = ZenohEvaluator(
@@ -908,11 +928,12 @@ class ZenohOfKeystore:
         return WhoOnZenoh(str(question), "zenoh", self._reason_text, self._domain, shown, is_export)
 
     def notes(self, outcomes: Sequence[ZenohAnswer]) -> Iterator[Note]:
-        """Yield notes on an export, on the router's key, and on peers that its file decided for."""
+        """Yield notes on an export, the router's file and key, and peers for which its file decides."""
         from sros_tool.explain.who import note_on_export  # as in `outcomes`
 
         yield from note_on_export(self._keystore.root)
         yield from note_on_lacking_keys(self._keystore)
+        yield from _note_on_unsigned(next(iter(self._evaluators.values())).unsigned_files())
         if any(outcome.of_router and outcome.allowed for outcome in outcomes):
             yield _ROUTERS_KEY
         if any(outcome.mode is Mode.PEER for outcome in outcomes):
@@ -1064,9 +1085,13 @@ def _notes(answer: ZenohAnswer, stated: Answer, outdated: Sequence[str] | None) 
         )
         text += "settings and all its enclaves: the answer follows the files as they are."
         yield Note("explain.zenoh-not-compared", text)
-    if answer.unsigned:
+    yield from _note_on_unsigned(answer.unsigned)
+
+
+def _note_on_unsigned(files: Sequence[str]) -> Iterator[Note]:
+    if files:
         text = (
-            f"the permissions CA has not signed {', '.join(answer.unsigned)}: anyone who can write "
+            f"the permissions CA has not signed {', '.join(files)}: anyone who can write to it can "
+            "give rights, because Zenoh verifies no signature."
         )
-        text += "to it can give rights, because Zenoh verifies no signature."
         yield Note("explain.zenoh-unsigned", text)

@@ -292,6 +292,21 @@ def test_a_copy_without_keys_is_answered_as_if_they_were_there(keystore: Path) -
         assert "note [explain.without-keys]: no enclave in" in said.err
 
 
+def test_an_export_is_answered_by_its_own_cas(keystore: Path, tmp_path: Path) -> None:
+    export = tmp_path / "export"
+    sros("distribute_key", keystore, "--all", export).ok()
+    questions = (("/talker", "publish", "/chatter"), ("--who", "publish", "/chatter"))
+    for words in questions:
+        said = explain(export, *words, "--vendor", "zenoh").ok()
+        assert "zenoh-unsigned" not in said.err
+    assert "note [explain.export]" in said.err
+    with (export / "enclaves/router/router.json5").open("a") as file:
+        file.write(" ")
+    for words in questions:
+        said = explain(export, *words, "--vendor", "zenoh").ok()
+        assert "CA has not signed /router/router.json5: anyone who can write" in said.err
+
+
 def test_a_file_that_zenoh_does_not_accept(keystore: Path) -> None:
     (keystore / "enclaves/router/router.json5").write_text('{"mode": "router\x1b"}')
     shown = explain(keystore, "/talker", "publish", "/chatter", "--vendor", "zenoh")
