@@ -928,7 +928,7 @@ class ZenohOfKeystore:
         return WhoOnZenoh(str(question), "zenoh", self._reason_text, self._domain, shown, is_export)
 
     def notes(self, outcomes: Sequence[ZenohAnswer]) -> Iterator[Note]:
-        """Yield notes on an export, the router's file and key, and peers for which its file decides."""
+        """Yield notes on an export, the router's file and key, and peers that it decided for."""
         from sros_tool.explain.who import note_on_export  # as in `outcomes`
 
         yield from note_on_export(self._keystore.root)
