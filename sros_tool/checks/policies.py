@@ -629,22 +629,36 @@ def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
 
 
 def _check_parameters_of_others(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
-    """Yield findings about parameter services of nodes that the enclave does not have."""
-    own = {
+    """Yield findings about parameter services of nodes that the enclave does not have.
+
+    A wildcard for nodes of the enclave is such a finding if it matches a node of another enclave.
+    """
+    nodes = {
         enclave.path: {expand("~", profile.ns, profile.node) for profile in enclave.all_profiles()}
         for enclave in checked_policy.policy.enclaves
     }
     for statement in checked_policy.statements:
         enclave, name = statement.right.enclave, statement.name
         node, _, service = name.rpartition("/")
-        if (
-            statement.allows
-            and statement.right.right == "reply"
-            and service in PARAMETER_SERVICES
-            and not any(covers(each, node) for each in own[enclave])
-        ):
+        reply = statement.allows and statement.right.right == "reply"
+        if not (reply and service in PARAMETER_SERVICES):
+            continue
+        if not any(covers(own, node) for own in nodes[enclave]):
             text = f"may serve {name}, and has no node {node}"
             yield statement.found(OTHER_NODES_PARAMETERS, text)
+        elif is_expression(node):
+            others = (
+                (other, path)
+                for path, theirs in nodes.items()
+                for other in sorted(theirs - nodes[enclave])
+                if path != enclave and not is_expression(other) and covers(node, other)
+            )
+            for other, path in islice(others, 1):
+                text = f"may serve {name}, also as the node {other} of {path}"
+                yield statement.found(OTHER_NODES_PARAMETERS, text, _NAME_THE_NODES)
+
+
+_NAME_THE_NODES = "Name the nodes of this enclave in place of the wildcard."
 
 
 @dataclass(slots=True)
@@ -1066,6 +1080,14 @@ DUPLICATE = FindingKind(
     "ros2/sros2 0.13 (create_permission, generate_artifacts).",
     "Join the two into one <enclave>.",
 )
+IN_TWO_FILES = FindingKind(
+    "policy.enclave-in-two-files",
+    WARNING,
+    "an enclave that two policies define",
+    "The policies count as those of one robot: verbs that take rights from both refuse them.",
+    "sros.",
+    "Define the enclave in one of them; check the policies of each robot by themselves.",
+)
 FALLBACK = FindingKind(
     "policy.include-fallback",
     WARNING,
@@ -1141,9 +1163,20 @@ def findings_in(policies: Sequence[Policy], distribution: str = "") -> Iterator[
     if len(checked) > 1:
         enclaves = tuple(enclave for policy in policies for enclave in policy.enclaves)
         checked = [_CheckedPolicy(replace(policies[0], enclaves=enclaves), distribution)]
+        yield from _enclaves_of_two_policies(enclaves)
     for checked_policy in checked:
         for check in _CHECKS_TOGETHER:
             yield from check(checked_policy)
+
+
+def _enclaves_of_two_policies(enclaves: Iterable[Enclave]) -> Iterator[Finding]:
+    """Yield a finding for each enclave that two policies state at different places."""
+    stated: dict[str, Enclave] = {}
+    for enclave in enclaves:
+        earlier = stated.setdefault(enclave.path, enclave)
+        if earlier.source != enclave.source:
+            text = f"{enclave.path} is defined here and at {earlier.source}"
+            yield IN_TWO_FILES.found(enclave.path, text, enclave.source.file, enclave.source.line)
 
 
 def policy_file_findings(

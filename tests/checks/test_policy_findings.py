@@ -27,6 +27,7 @@ from tests.support.harness import sros, with_includes
 FOUND_OTHERWISE = {
     "policy.malformed",
     "policy.duplicate-enclave",
+    "policy.enclave-in-two-files",
     "policy.include-fallback",
     "policy.redundant-include",
     "portable.enclave-names",
@@ -185,6 +186,15 @@ def test_enclave_names(tmp_path: Path) -> None:
     assert "portable.enclave-names" not in ids(tmp_path, twin)
 
 
+def test_a_wildcard_for_nodes_that_matches_a_node_of_another_enclave(tmp_path: Path) -> None:
+    own = enclave("").replace('node="n"', 'node="bas?"')
+    other = enclave("", "/b").replace('node="n"', 'node="base"')
+    posing = {each.text for each in findings(tmp_path, policy(own, other)) if "also" in each.text}
+    assert "may serve /bas?/set_parameters, also as the node /base of /b" in str(posing)
+    assert len(posing) == len(PARAMETERS)
+    assert "policy.other-nodes-parameters" not in ids(tmp_path, policy(own, enclave("", "/b")))
+
+
 def test_malformed(tmp_path: Path) -> None:
     good = policy(enclave(topics("publish", "a")))
     assert ids(tmp_path, good) == set()
@@ -200,6 +210,11 @@ def test_duplicate_enclaves(tmp_path: Path) -> None:
     found = findings(tmp_path, twice)
     assert [(each.id, each.line) for each in found] == [("policy.duplicate-enclave", 6)]
     assert ids(tmp_path, policy(enclave(""), enclave("", "/b"))) == set()
+    one, other = tmp_path / "policy.xml", tmp_path / "other.xml"
+    other.write_text(policy(enclave("", "/c"), enclave("")))
+    (second,) = (each for each in policy_file_findings(one, other) if "two-files" in each.id)
+    assert (second.file, second.line) == (str(other), 6)
+    assert second.text == f"/a is defined here and at {one}:{HEAD - 1}"
 
 
 INCLUDE = '<xi:include href="{}" xpointer="xpointer(/profile/*)">{}</xi:include>'
