@@ -255,7 +255,8 @@ def _check_dates_here(name: str, keystore: Keystore, vendor: Vendor, context: Jo
             f"a process cannot run in enclave {name} in this time zone",
             f"{answer.decision.text.removesuffix('.')}.",
             "Set the time zone of the process to UTC (`TZ=UTC`), or sign permissions that are "
-            "valid for longer.",
+            "valid for longer: `sros update_keystore KEYSTORE --set permissions.validity=2d "
+            f"--allow-looser`, then `sros renew KEYSTORE {quote(name)}`.",
         )
 
 

@@ -148,7 +148,9 @@ LOCAL_TIME = FindingKind(
     'Fast DDS reads the dates of permissions in local time, and says "Not found the identity '
     'subject name in permissions file".',
     "Fast DDS 2.6 to 3.6 (mktime); tested.",
-    "Run `sros renew KEYSTORE ENCLAVE`, or let the host run in UTC.",
+    "Let the host run in UTC, or renew the enclave (`sros renew KEYSTORE ENCLAVE`). If its "
+    "permissions are valid for less than a day, lengthen that first, with `sros update_keystore "
+    "KEYSTORE --set permissions.validity=2d --allow-looser`.",
     vendors=FAST_DDS,
 )
 CHARACTER_CLASS = FindingKind(
