@@ -189,6 +189,9 @@ def explain_on_dds(
     beside = _zenoh_decision(enclave, question, context)
     is_on_robot = enclave.state is not None and enclave.state.key_on_robot
     copied = enclave.keystore if answer.counts_key and not is_on_robot else None
+    refuse = f"Run {REFUSE_STRANGERS}."
+    if enclave.keystore:
+        refuse = remedy_in_keystore(enclave.keystore.root, refuse)
     notes = (
         *taken,
         *_provenance_notes(answer),
@@ -198,6 +201,7 @@ def explain_on_dds(
         *_similar_name_notes(answer),
         *(note_on_lacking_keys(copied) if copied else ()),
         *_earlier_permissions_notes(answer, context.at),
+        *_note_on_anybody(_anybody_may(evaluator, question), refuse),
     )
     what = Asked(enclave.name, question, context)
     if compared is Compared.VENDORS:
@@ -439,17 +443,22 @@ def _title(vendor: Vendor, why: str) -> str:
 def _outcome(evaluator: Evaluator, name: str, question: Question) -> VendorOutcome:
     answer = evaluator.answer(question)
     expression = answer.decision.expression or ""
-    access = evaluator.access
-    opened = access.topics_of_unauthenticated() if access else None
-    parts = question.parts
-    anybody = opened is not None and bool(parts) and all(part.topic in opened for part in parts)
+    anybody = _anybody_may(evaluator, question)
     return VendorOutcome(
         name, answer.outcome, answer.reason, answer.text, expression, anybody=anybody
     )
 
 
-def _note_on_anybody(outcomes: Sequence[VendorOutcome], remedy: str) -> Iterator[Note]:
-    if any(outcome.anybody for outcome in outcomes):
+def _anybody_may(evaluator: Evaluator, question: Question) -> bool:
+    """Return whether processes without an identity may do it, by the enclave's governance."""
+    access = evaluator.access
+    opened = access.topics_of_unauthenticated() if access else None
+    parts = question.parts
+    return opened is not None and bool(parts) and all(part.topic in opened for part in parts)
+
+
+def _note_on_anybody(anybody: bool, remedy: str) -> Iterator[Note]:
+    if anybody:
         text = (
             "processes without an identity may do it, too: the governance admits them, and does "
             f"not protect the name. {remedy}"
@@ -495,7 +504,8 @@ class VendorOfPolicy(NamedTuple):
 
     def notes(self, outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
         """Yield a note if processes without an identity have the right, too."""
-        return _note_on_anybody(outcomes, f"Change the template, or run {REFUSE_STRANGERS}.")
+        anybody = any(outcome.anybody for outcome in outcomes)
+        return _note_on_anybody(anybody, f"Change the template, or run {REFUSE_STRANGERS}.")
 
 
 class VendorOfKeystore(NamedTuple):
@@ -565,7 +575,7 @@ class VendorOfKeystore(NamedTuple):
 
         yield from note_on_export(self.keystore.root)
         refuse = remedy_in_keystore(self.keystore.root, f"Run {REFUSE_STRANGERS}.")
-        yield from _note_on_anybody(outcomes, refuse)
+        yield from _note_on_anybody(any(outcome.anybody for outcome in outcomes), refuse)
         denied = {outcome.enclave for outcome in outcomes if not outcome.allowed}
         yield from note_on_earlier_permissions(self.keystore, denied, self.asking.at)
         if not all(outcome.stopped for outcome in outcomes):

@@ -208,6 +208,8 @@ def test_who_may_what_counts_processes_without_an_identity(tmp_path: Path) -> No
         refuse = f"`sros update_keystore {keystore} --set protection.allow_unauthenticated"
         who = sros("explain", keystore, "--who", "publish", "/nobodys", "--vendor", vendor)
         assert (who.status, refuse in who.err) == ((0, True) if is_open else (1, False))
+        single = sros("explain", keystore, "/a", "publish", "/x", "--vendor", vendor).ok()
+        assert (refuse in single.err) is is_open
     table = sros("view", keystore, "--format", "markdown").ok().out
     assert "| topic `/x` | everybody, even without an identity, `/a` |" in table
 
