@@ -39,10 +39,9 @@ from sros_tool.errors import DocumentError, SrosError, UnavailableError, UsageEr
 from sros_tool.explain.audit import DeniedRight, audit, audited_enclaves
 from sros_tool.files import policies_dir, remove_file, replace_file
 from sros_tool.folders import Folder, make_folders, remove_folders
-from sros_tool.graph.learn import common_parts, is_tool, stable_name
+from sros_tool.graph.learn import common_parts, is_tool, name_as_written, stable_name
 from sros_tool.graph.observation import (
-    PUBLISH,
-    SUBSCRIBE,
+    Endpoint,
     Observation,
     ObservedNode,
     make_observation,
@@ -61,7 +60,7 @@ from sros_tool.keystore.participant import JoinContext
 from sros_tool.keystore.reader import FilesReadOnce, Keystore, open_enclave
 from sros_tool.keystore.selection import revocation_of
 from sros_tool.keystore.template import load_template
-from sros_tool.names import is_expression
+from sros_tool.names import expand, is_expression
 from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.merge import merge_into
@@ -1055,11 +1054,23 @@ class OpenRobot:
         self.observed = observed
         replace_file(self.processes, f"{json.dumps(as_plain(observed), indent=2)}\n".encode())
 
+    def _observed_nodes(self) -> tuple[ObservedNode, ...]:
+        """Return the nodes that were observed, with the enclaves and names that they had then."""
+        try:
+            return observation_from_json(json.loads(read_bytes(self.seen, "observation"))).nodes
+        except (ValueError, TypeError, KeyError) as error:
+            raise DocumentError(
+                f"'{self.seen}' is not an observation",
+                f"{error}",
+                "Watch the robot again: --for 1m.",
+            ) from error
+
     def _observation(self, *, all_nodes: bool = False) -> Observation:
         """Return the nodes that were observed, in the enclaves that the policy has now.
 
-        A node whose profile was moved to another enclave is in that one; a node without an enclave
-        is left out, unless ``all_nodes``.
+        A node whose profile was moved to another enclave is in that one, and a renamed node has its
+        new name.  A node without an enclave is left out.  With ``all_nodes``, it stays, and all
+        nodes have the names that they had.
         """
         enclaves = read_policy(self.policy).enclaves
         names = {enclave.path for enclave in enclaves}
@@ -1068,24 +1079,39 @@ class OpenRobot:
             for enclave in enclaves
             for profile in enclave.all_profiles()
         }
-        try:
-            nodes = []
-            for node in observation_from_json(
-                json.loads(read_bytes(self.seen, "observation"))
-            ).nodes:
-                if names.issuperset(node.enclaves):
-                    nodes.append(node)
-                elif place := moved.get((node.ns, stable_name(node.name))):
-                    nodes.append(replace(node, enclaves=place))
-                elif all_nodes:
-                    nodes.append(node)
-            return make_observation(nodes)
-        except (ValueError, TypeError, KeyError) as error:
-            raise DocumentError(
-                f"'{self.seen}' is not an observation",
-                f"{error}",
-                "Watch the robot again: --for 1m.",
-            ) from error
+        renamed, nodes = {} if all_nodes else self._renamed_nodes(), []
+        for node in self._observed_nodes():
+            if new := renamed.get(_node_name(node)):
+                nodes.append(_under_name(node, *new))
+            elif names.issuperset(node.enclaves):
+                nodes.append(node)
+            elif place := moved.get((node.ns, stable_name(node.name))):
+                nodes.append(replace(node, enclaves=place))
+            elif all_nodes:
+                nodes.append(node)
+        return make_observation(nodes)
+
+    def _renamed_nodes(self) -> dict[str, tuple[str, str]]:
+        """Map observed nodes to the namespace and name that the policy gives them now.
+
+        A node was renamed if it alone of its enclave has no profile any more, and one profile of
+        that enclave alone is for a node that was not observed.
+        """
+        nodes = self._observed_nodes()
+        _, without = self._divide_by_profile(nodes)
+        known = {_node_name(node) for node in nodes}
+        renamed = {}
+        for enclave in read_policy(self.policy).enclaves:
+            old = {_node_name(node) for node in without if enclave.path in node.enclaves}
+            new = {
+                (profile.ns, profile.node)
+                for profile in enclave.all_profiles()
+                if expand("~", profile.ns, profile.node) not in known
+                and not is_expression(f"{profile.ns}{profile.node}")
+            }
+            if len(old) == len(new) == 1:
+                renamed[old.pop()] = new.pop()
+        return renamed
 
     def _variables(self, enclave: str, rmw: str = "") -> dict[str, str]:
         """Return the environment of an enclave of the export."""
@@ -1463,7 +1489,7 @@ class OpenRobot:
                     return [Proof(_CLAIM, False, why)]
                 break
             time.sleep(0.2)
-        nodes, without_profile = self._divide_by_profile(self._observation().nodes)
+        nodes, _ = self._divide_by_profile(self._observation().nodes)
         not_here = self._not_here
         # A laptop may be away; a computer whose nodes were seen has to be seen again.
         may_be_away = not_here - {node.enclaves[0] for node in nodes}
@@ -1474,23 +1500,37 @@ class OpenRobot:
         for what, names in ((state, missing), ("of other machines", sorted(not_here))):
             if names:
                 proof = proof._replace(reason=f"{proof.reason}; {what}: {', '.join(names)}")
-        talk = self._proof_of_talk(before, away)
-        if without_profile and not talk.fails:
-            left_out = first_few(sorted(map(_node_name, without_profile)), _MOST_NAMES)
-            why = "the policy has no profile for them any more"
-            talk = talk._replace(reason=f"{talk.reason}; not compared, as {why}: {left_out}")
+        talk = self._proof_of_talk(before, away, running)
+        talk = talk._replace(reason=f"{talk.reason}{self._renamed_text(fails=talk.fails)}")
         if talk.fails and (compared := sorted(not_here.difference(away))):
             options = " ".join(f"--without {name}" for name in compared)
             talk = talk._replace(reason=f"{talk.reason}; if they may be away, add {options}")
         silence = self._proof_of_silence(before, hears=talk.holds is not None)
         return [proof, self._proof_of_files(), *self._proof_of_requirements(), talk, silence]
 
+    def _renamed_text(self, *, fails: bool) -> str:
+        """Return which nodes were compared under new names, and which ones not at all, as text."""
+        renamed, text = self._renamed_nodes(), ""
+        if renamed:
+            names = [f"{old} as {expand('~', *renamed[old])}" for old in sorted(renamed)]
+            text = f"; compared under a new name: {first_few(names, _MOST_NAMES)}"
+            if fails:
+                text += " (if it is another node, remove what it does not use from its profile)"
+        _, without = self._divide_by_profile(self._observed_nodes())
+        left = {_node_name(node) for node in without if not is_tool(node)} - renamed.keys()
+        if left and not fails:
+            close = f"sros close {shlex.quote(str(self.folder))}"
+            text += (
+                "; not compared, as the policy has no profile for them any more: "
+                f"{first_few(sorted(left), _MOST_NAMES)} (if they have new names, they are compared"
+                f" when the open robot was watched again: {close} --undo, {close} --for 1m)"
+            )
+        return text
+
     def _divide_by_profile(
         self, nodes: Iterable[ObservedNode]
     ) -> tuple[list[ObservedNode], list[ObservedNode]]:
         """Divide nodes into those with a profile in the policy, and those without."""
-        if not self.policy.exists():
-            return [*nodes], []
         profiles = [
             profile
             for enclave in read_policy(self.policy).enclaves
@@ -1645,10 +1685,13 @@ class OpenRobot:
         said = f"{counted(number, 'enclave')}, and no open process in domain {self.domain}"
         return Proof(_CLAIM, True, f"{said}{''.join(guests)}")
 
-    def _proof_of_talk(self, before: Observation, missing: Sequence[str]) -> Proof:
+    def _proof_of_talk(
+        self, before: Observation, missing: Sequence[str], running: RunningProcesses
+    ) -> Proof:
         """Compare what an observer in an enclave sees now with what was seen before.
 
-        Processes of the enclaves ``missing`` do not run.
+        Processes of the enclaves ``missing`` do not run; ``running`` are those of the other
+        enclaves at the beginning of the proof.
         """
         denied = self._denied_rights()
         words = ("audit", str(self._rights), "--keystore", str(self.export), "--enclave", _OBSERVER)
@@ -1660,15 +1703,13 @@ class OpenRobot:
                 status, value = self._status_and_json(step)
             except UnavailableError as error:
                 return Proof(_TALK, None, f"{error}")
+            now = observation_from_json(value)
+            lost = _lost_endpoints(before, now, denied)
             wrong = {
-                "gone": _lost_endpoints(before, observation_from_json(value), denied),
                 "denied": [f"{right['enclave']} {right['name']}" for right in value["denied"]],
                 "refused": [refused["enclave"] for refused in value["refused"]],
-                "not seen": [
-                    self._unseen_text(unseen["node"], unseen["enclave"])
-                    for unseen in value["unseen"]
-                    if unseen["enclave"] not in missing
-                ],
+                **self._unseen_nodes(value, before, lost, missing, running),
+                "gone": [f"{node} {endpoint}" for node in lost for endpoint in lost[node]],
                 "not judged": value["unjudged"],
                 "not done": ["the ROS graph kept changing"] if status else [],
             }
@@ -1678,7 +1719,7 @@ class OpenRobot:
                 but = f", but for {counted(len(denied), 'right')} that the policy denies now"
                 seen = f"{number} with {before.endpoint_count} endpoints as before"
                 left = f", without {', '.join(missing)}" if missing else ""
-                _, others = self._divide_by_profile(observation_from_json(value).nodes)
+                _, others = self._divide_by_profile(now.nodes)
                 known = {*map(_node_name, before.nodes)}
                 new = sorted(
                     f"{_node_name(node)} in {' or '.join(node.enclaves) or 'no enclave'}"
@@ -1688,6 +1729,40 @@ class OpenRobot:
                 more = f"; new, without a profile: {first_few(new, _MOST_NAMES)}" if new else ""
                 return Proof(_TALK, True, f"{seen}{left}{but if denied else ''}{more}")
         return Proof(_TALK, False, reason)
+
+    def _unseen_nodes(
+        self,
+        audited: Mapping[str, Any],
+        before: Observation,
+        lost: Mapping[str, Sequence[str]],
+        missing: Sequence[str],
+        running: RunningProcesses,
+    ) -> dict[str, list[str]]:
+        """Return the nodes that were not seen, as text: those of ended processes, and others."""
+        seen = {*map(_node_name, observation_from_json(audited).nodes)}
+        unseen = {(node["node"], node["enclave"]) for node in audited["unseen"]}
+        unseen |= {
+            (name, node.enclaves[0])
+            for node in before.nodes
+            if (name := _node_name(node)) in lost and name not in seen
+        }
+        pids = {process.pid for process in ProcessTable().look(self._shell.now()).processes}
+        ended = {
+            enclave.name: process.label
+            for process, enclave in self._secured(running)
+            if process.pid not in pids
+        }
+        texts: dict[str, list[str]] = {"ended while the proof ran": [], "not seen": []}
+        for node, enclave in sorted(unseen):
+            if enclave in ended:
+                text = (
+                    f"{node or enclave} ({ended[enclave]}; start it again, or, if it does not "
+                    f"always run, add --without {enclave})"
+                )
+                texts["ended while the proof ran"].append(text)
+            elif enclave not in missing:
+                texts["not seen"].append(self._unseen_text(node, enclave))
+        return texts
 
     def _unseen_text(self, node: str, enclave: str) -> str:
         """Return a node that an enclave has a profile for, and what to do if it does not exist."""
@@ -1777,24 +1852,38 @@ def _text(lines: Iterable[str]) -> str:
 
 def _lost_endpoints(
     before: Observation, now: Observation, denied: Iterable[DeniedRight]
-) -> list[str]:
-    """Return the endpoints, as text, that nodes had before and lack now, unless ``denied``."""
+) -> dict[str, list[str]]:
+    """Map nodes to the endpoints, as text, that they had before and lack now, unless ``denied``."""
     expected = {*_endpoints(before.nodes)} - {
-        f"{node} {way} {topic}"
+        (node, f"{way} {topic}")
         for right in denied
         for node in right.nodes
         for topic, way in right.endpoints
     }
-    return sorted(expected - {*_endpoints(now.nodes)})
+    lost: dict[str, list[str]] = {}
+    for node, endpoint in sorted(expected - {*_endpoints(now.nodes)}):
+        lost.setdefault(node, []).append(endpoint)
+    return lost
 
 
 def _node_name(node: ObservedNode) -> str:
     return f"{node.ns.rstrip('/')}/{stable_name(node.name)}"
 
 
-def _endpoints(nodes: Iterable[ObservedNode]) -> Iterator[str]:
+def _under_name(node: ObservedNode, ns: str, name: str) -> ObservedNode:
+    """Return a node under another name, with the topics that a policy then gives it."""
+
+    def under_name(topic: str) -> str:
+        prefix, ros_name = topic[:2], topic[2:]
+        if not ros_name.startswith("/"):  # a DDS topic without a ROS name
+            return topic
+        return f"{prefix}{expand(name_as_written(ros_name, node.ns, node.name), ns, name)}"
+
+    endpoints = {Endpoint(under_name(topic), way) for topic, way in node.endpoints}
+    return replace(node, ns=ns, name=name, endpoints=frozenset(endpoints))
+
+
+def _endpoints(nodes: Iterable[ObservedNode]) -> Iterator[tuple[str, str]]:
     for node in nodes:
-        name = _node_name(node)
-        for way in (PUBLISH, SUBSCRIBE):
-            for topic in node.publish if way == PUBLISH else node.subscribe:
-                yield f"{name} {way} {topic.replace(node.name, stable_name(node.name))}"
+        for topic, way in node.endpoints:
+            yield _node_name(node), f"{way} {topic.replace(node.name, stable_name(node.name))}"

@@ -530,7 +530,17 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     assert "add --without /listener --without /talker\n" in robot.close("--proof", status=1).out
 
 
-def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
+def ended_before_the_audit(robot: Robot, enclave: str) -> Any:
+    """What runs verbs, and lets the process of an enclave end when the audit begins."""
+
+    def run(words: Any, live: bool, run: Any = close._run) -> Any:
+        robot.absent |= {enclave} if words[0] == "audit" else set()
+        return run(words, live)
+
+    return run
+
+
+def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     robot.units = UNITS
     robot.close()
     robot.close("--apply")
@@ -560,15 +570,18 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
     assert "in domain 0; process 5 (guest) runs open in domain 7\n" in robot.close("--proof").out
     robot.more = ()
     robot.remaining = (TALKER,)
-    assert (
-        "no: everything that talked can still talk: gone: /listener "
-        in robot.close("--proof", status=1).out
-    )
+    lost = "no: everything that talked can still talk: "
+    assert f"{lost}not seen: /listener (if it is g" in robot.close("--proof", status=1).out
+    with monkeypatch.context() as patched:
+        patched.setattr(close, "_run", ended_before_the_audit(robot, "/listener"))
+        stopped = "/listener (process 4712 (run); start it again, or, if it does not always run, "
+        said = robot.close("--proof", status=1).out
+    robot.absent = set()
+    assert f"{lost}ended while the proof ran: {stopped}add --without /listener)\n" in said
+    robot.remaining = (TALKER, ros_node("listener", LISTENER[3])[:4] + (EVENTS,))
+    assert f"{lost}gone: /listener publish r" in robot.close("--proof", status=1).out
     robot.remaining = (TALKER, LISTENER, ros_node("guest", "05"))
-    assert (
-        "no: everything that talked can still talk: denied: /guest "
-        in robot.close("--proof", status=1).out
-    )
+    assert f"{lost}denied: /guest " in robot.close("--proof", status=1).out
     robot.remaining = (TALKER, LISTENER)
     robot.nodes = (*robot.nodes, ("/", "/", "spy", "03", ["subscribe rt/chatter"]))
     assert (
@@ -696,29 +709,37 @@ def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
     robot.close("--apply")
 
 
-def test_a_renamed_node_is_accepted_and_a_new_one_is_named(robot: Robot) -> None:
+def test_a_renamed_node_is_compared_and_a_new_one_is_named(robot: Robot) -> None:
     """Or a robot whose node got another name could never be proved closed again."""
     robot.units, of = UNITS, LISTENER[3]
-    robot.nodes = (TALKER, LISTENER, ros_node("rear_camera", of))
+    robot.nodes = (TALKER, LISTENER, ros_node("rear_camera", of, "publish rt/rear_camera/image"))
     robot.close()
     policy = robot.folder / "robot/policy.xml"
     policy.write_text(policy.read_text().replace('node="rear_camera"', 'node="stern_camera"'))
-    robot.close()
-    robot.remaining = (
-        TALKER,
-        LISTENER,
-        ros_node("stern_camera", of),
-        ("/", "/", "ghost_node", of, ["publish rt/rosout"]),
-    )
+    assert "used when sros watched, and denied now" not in robot.close().out
+    stern_camera = ros_node("stern_camera", of, "publish rt/stern_camera/image")
+    ghost = ("/", "/", "ghost_node", of, ["publish rt/rosout"])
+    robot.remaining = (TALKER, LISTENER, stern_camera, ghost)
     said = robot.close("--apply").out
-    assert "yes: everything that talked can still talk: 2 nodes with 36 endpoints as before" in said
-    assert "not compared, as the policy has no profile for them any more: /rear_camera\n" in said
-    assert "; new, without a profile: /ghost_node in /listener; not" in said
+    talk = "everything that talked can still talk: "
+    assert f"yes: {talk}3 nodes with 54 endpoints as before; new, without a profile: /gho" in said
+    renamed = "compared under a new name: /rear_camera as /stern_camera"
+    assert f"/ghost_node in /listener; {renamed}\n" in said
+    robot.remaining = (TALKER, LISTENER, ros_node("stern_camera", of))
+    said = robot.close("--proof", status=1).out
+    assert f"no: {talk}gone: /stern_camera publish rt/stern_camera/image; {renamed} (if it" in said
     robot.remaining = (TALKER, LISTENER)
     said = robot.close("--proof", status=1).out
-    assert (
-        "no: everything that talked can still talk: not seen: /stern_camera (if it is gone" in said
-    )
+    assert f"no: {talk}not seen: /stern_camera (if it is gone" in said
+    copied = re.sub(r'( *<profile ns="/" node=")stern(.*?</profile>)', r"\1stern\2\n\1bow\2",
+                    policy.read_text(), flags=re.DOTALL)  # fmt: skip
+    policy.write_text(copied)
+    robot.close()
+    bow_camera = ros_node("bow_camera", of, "publish rt/bow_camera/image")
+    robot.nodes, robot.remaining = (), (TALKER, LISTENER, stern_camera, bow_camera)
+    said = robot.close("--proof").out
+    assert "policy has no profile for them any more: /rear_camera (if they have new names, " in said
+    assert "watched again: sros close robot --undo, sros close robot --for 1m)\n" in said
 
 
 def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None:
@@ -787,7 +808,7 @@ def test_a_program_that_starts_its_nodes_has_one_enclave(
     assert "talk: 2 nodes with 36 endpoints as before\n" in robot.close("--proof").out
     robot.remaining = (LISTENER,)
     said = robot.close("--proof", status=1).out
-    assert "no: everything that talked can still talk: gone: /talker publish r" in said
+    assert "no: everything that talked can still talk: not seen: /talker (if it" in said
 
 
 def test_a_program_that_gives_its_processes_their_enclaves(
@@ -1066,7 +1087,9 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     assert "talk: 2 nodes with 36 endpoints as before\n" in ended.out
     robot.remaining = (TALKER,)
     said = robot.close("--proof", status=1).out
-    assert "gone: /listener" in said and "; if they may be away, add --without /listener\n" in said
+    assert (
+        "not seen: /listener" in said and "; if they may be away, add --without /listener\n" in said
+    )
     ended = robot.close("--proof", "--without", "/listener")
     assert "talk: 1 node with 18 endpoints as before, without /listener\n" in ended.out
     sros("create_enclave", "robot/keystore", "/operator/look", cwd=robot.folder).ok()
