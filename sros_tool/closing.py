@@ -19,10 +19,11 @@ import shutil
 import stat
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from datetime import datetime, tzinfo
 from itertools import chain
@@ -111,6 +112,8 @@ _DROP_IN, COMMANDS, _SERVICES = "sros-close.conf", "commands.txt", "compose.yaml
 _RESTART_SECONDS, _START_SECONDS = 30.0, 3.0
 """How long processes may take until they run in their enclaves: restarted by sros, or by hand."""
 _TRIES = 3
+_LOOK_SECONDS = 1.0
+"""How often processes are looked at while the robot is watched; shorter ones can be missed."""
 
 
 class Shell(NamedTuple):
@@ -136,7 +139,8 @@ class ClosedProcess(NamedTuple):
     enclave: str
     """The enclave of the process."""
     pid: int
-    """Its id; 0 if it is restarted by hand, and no process with its command runs any more."""
+    """Its id; 0 if it ended while sros watched, or is restarted by hand, and no process with its
+    command runs any more."""
     command: Sequence[str]
     """Its command with the arguments."""
     folder: str
@@ -176,7 +180,7 @@ class ClosedProcess(NamedTuple):
 
         The command may have the argument for the enclave that ``sros run`` adds.  A process that
         may run, but could not be examined, keeps its id, and so does a process that its unit
-        restarts.
+        restarts; a process that ended while sros watched has none.
         """
         own = _without_enclave_argument(self.command, self.enclave)
         programs = [process.program for process in running.processes]
@@ -184,7 +188,7 @@ class ClosedProcess(NamedTuple):
             pid for pid, words in programs if _without_enclave_argument(words, self.enclave) == own
         ]
         unseen = {process.pid for process in running.unseen}
-        if self.unit or running.hidden or self.pid in unseen or self.pid in pids:
+        if (self.unit and self.pid) or running.hidden or self.pid in unseen or self.pid in pids:
             return self
         return self._replace(pid=pids[0] if pids else 0)
 
@@ -417,18 +421,21 @@ def assign(
     running: Iterable[Process],
     domain: int,
     process_ids: Mapping[str, int] | None = None,
+    origins: Mapping[int, ProcessOrigin] | None = None,
 ) -> ObservedProcesses:
-    """Return the enclave of each running process, by the nodes that the graph shows of it.
+    """Return the enclave of each process, by the nodes that the graph shows of it.
 
     Processes of other domains or networks are left out.  ``process_ids`` maps participants of
-    Cyclone DDS to the process ids that they state.
+    Cyclone DDS to the process ids that they state; ``origins`` has what started each process, and
+    None is for processes that run now.
     """
     left = {
         process.pid: process
         for process in running
         if _is_in_domain(process, domain) and not process.is_daemon
     }
-    origins = {pid: process_origin(pid) for pid in left}
+    if origins is None:
+        origins = {pid: process_origin(pid) for pid in left}
     programs = {process.program[0]: origins[pid].unit for pid, process in left.items()}
     units = Counter(programs.values())
     assigned: list[ClosedProcess] = []
@@ -897,7 +904,9 @@ class OpenRobot:
             self._check_open()
             made = make_folders(self.folder)
         self._shell.say(f"+ {step.command}")
-        status, output, messages = self._shell.run(step.words, bool(step.into))
+        meanwhile: _SeenProcesses = {}
+        with self._looking(meanwhile) if watches else nullcontext():
+            status, output, messages = self._shell.run(step.words, bool(step.into))
         if watches and status:
             remove_folders(made)
             raise UnavailableError(
@@ -917,7 +926,30 @@ class OpenRobot:
             return "findings", f"findings of `{step.command}`{mend}"
         if step.into:
             replace_file(step.into, output.encode())
-        return "done", self._keep_processes(output) if watches else ""
+        return "done", self._keep_processes(output, meanwhile) if watches else ""
+
+    @contextmanager
+    def _looking(self, seen: _SeenProcesses) -> Iterator[None]:
+        """Put into ``seen`` the processes that run in this context, with what started them."""
+        table, over = ProcessTable(), threading.Event()
+
+        def look() -> None:
+            while True:
+                for process in table.look(self._shell.now()).processes:
+                    before, origin = seen.get(process.command, (process, None))
+                    if before.pid != process.pid or origin is None:
+                        origin = process_origin(process.pid)
+                    seen[process.command] = process, origin
+                if over.wait(_LOOK_SECONDS):
+                    return
+
+        looking = threading.Thread(target=look)
+        looking.start()
+        try:
+            yield
+        finally:
+            over.set()
+            looking.join()
 
     def _say(self, text: str) -> None:
         for line in text.splitlines():
@@ -956,10 +988,11 @@ class OpenRobot:
     def _is_neighbour(self, process: Process) -> bool:
         return _is_in_domain(process, self.domain)
 
-    def _keep_processes(self, document: str) -> str:
+    def _keep_processes(self, document: str, meanwhile: _SeenProcesses) -> str:
         """Write which process has which nodes, and the policy of the observer.
 
-        Return, as a sentence, which of the observed rights an earlier policy lacks.
+        ``meanwhile`` are the processes that ran while sros watched.  Return, as a sentence, which
+        of the observed rights an earlier policy lacks.
         """
         replace_file(self.observer, (policies_dir() / "observer.xml").read_bytes())
         nodes = [node for node in self._observation(all_nodes=True).nodes if not is_tool(node)]
@@ -970,7 +1003,13 @@ class OpenRobot:
         stayed = [node for node in nodes if node.participant not in learned["ended"]]
         observed = assign(stayed, running, self.domain, process_ids)
         ended = {node.enclaves[0] for node in nodes} - {node.enclaves[0] for node in stayed}
-        processes = [_as_its_unit_starts(process) for process in observed.processes]
+        now = {process.command for process in running}
+        of_ended = _ended_processes(
+            [node for node in nodes if node.enclaves[0] in ended],
+            [meanwhile[command] for command in meanwhile.keys() - now],
+            observed,
+        )
+        processes = [_as_its_unit_starts(process) for process in (*observed.processes, *of_ended)]
         observed = observed._replace(processes=processes, ended=sorted(ended))
         seen_here = {process.enclave for process in processes}
         not_here = (self._not_here - seen_here).union(self._named_elsewhere)
@@ -1324,8 +1363,8 @@ class OpenRobot:
         if not dry_run:
             write_units(_SYSTEMD, files, changes)
         secured = prepared.secured
-        open_units = [unit for enclave, unit in observed.units.items() if not secured.get(enclave)]
-        self._restart(sorted({*open_units}), dry_run=dry_run)
+        open_units = {unit for enclave, unit in observed.units.items() if not secured.get(enclave)}
+        self._restart(observed, open_units, dry_run=dry_run)
         done = [FileChange(action, str(_SYSTEMD / path)) for path, action in changes.items()]
         by_hand = dry_run or prepared.left_by_hand
         proofs = () if by_hand else self._proofs(prepared, _RESTART_SECONDS)
@@ -1335,9 +1374,15 @@ class OpenRobot:
         now = self._closing()
         return prepared._replace(proofs=proofs, changes=total, secured=now.secured, new=now.new)
 
-    def _restart(self, units: Sequence[str], *, dry_run: bool) -> None:
-        """Let systemd read its units again, and restart some.  Raises `SrosError`."""
-        for words in [["daemon-reload"], ["restart", *units]] if units else []:
+    def _restart(self, observed: ObservedProcesses, units: set[str], *, dry_run: bool) -> None:
+        """Let systemd read its units again, and restart some.  Raises `SrosError`.
+
+        Units whose processes ended by themselves are restarted only if they run.
+        """
+        idle = {process.unit for process in observed.processes if not process.pid}
+        verbs = {"restart": units - idle, "try-restart": units & idle}
+        restarts = [[verb, *sorted(of_verb)] for verb, of_verb in verbs.items() if of_verb]
+        for words in [["daemon-reload"], *restarts] if units else []:
             command = ["systemctl", *words]
             self._shell.say(f"{'would run:' if dry_run else '+'} {shlex.join(command)}")
             try:
@@ -1378,7 +1423,7 @@ class OpenRobot:
             if not dry_run:
                 remove_file(path)
         of_drop_ins = {path.parent.name.removesuffix(".d") for path in drop_ins}
-        self._restart(sorted({*observed.units.values()} | of_drop_ins), dry_run=dry_run)
+        self._restart(observed, {*observed.units.values()} | of_drop_ins, dry_run=dry_run)
         changes = [FileChange("remove", str(path)) for path in drop_ins]
         closing = self._closing()._replace(dry_run=dry_run, changes=changes)
         return closing._replace(problems=[*self._texts_to_open(observed)])
@@ -1801,10 +1846,33 @@ def _closed_process(process: Process, enclave: str) -> ClosedProcess:
     return known._replace(command=_without_enclave_argument(known.command, enclave))
 
 
+_SeenProcesses = dict[tuple[str, ...], tuple[Process, ProcessOrigin]]
+
+
 def _needs_enclave_argument(process: ClosedProcess) -> bool:
     """Return whether the command must name the enclave, which others look for on Zenoh."""
     is_node = bool(process.rmw) and process.enclave != _ROUTER
     return is_node and named_enclave(process.command) != process.enclave
+
+
+def _ended_processes(
+    nodes: Iterable[ObservedNode],
+    seen: Iterable[tuple[Process, ProcessOrigin]],
+    observed: ObservedProcesses,
+) -> list[ClosedProcess]:
+    """Return the last process of each enclave of nodes that ended while sros watched.
+
+    ``observed`` are the processes that stayed; a unit that starts one of them starts it alone.
+    """
+    origins = {process.pid: origin for process, origin in seen}
+    known = {*observed.units.values()}
+    ended = assign(nodes, [process for process, _ in seen], observed.domain, {}, origins)
+    last = {process.enclave: process for process in ended.processes}
+    return [
+        process._replace(pid=0, unit="" if process.unit in known else process.unit)
+        for process in last.values()
+        if process.known_by != "elimination"  # many tools end while sros watches
+    ]
 
 
 def _as_its_unit_starts(process: ClosedProcess) -> ClosedProcess:

@@ -190,7 +190,8 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
     for process in closed.observed.processes:
         how = "by its launch, by hand" if process.launch else "by hand"
         how = "by Docker Compose, by hand" if process.container else how
-        how = f"--apply restarts {process.unit}" if process.unit else how
+        restarts = "restarts" if process.pid else "adds a drop-in to"
+        how = f"--apply {restarts} {process.unit}" if process.unit else how
         if closed.secured.get(process.enclave):
             how = "closed"
         elif process.enclave in closed.secured:
@@ -200,6 +201,8 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
         if not process.pid:
             runs = process.enclave in closed.secured
             pid = "started by another command than observed" if runs else "not running as observed"
+            ended = process.enclave in closed.observed.ended and not runs
+            pid = "has ended" if ended else pid
         nodes = _nodes(policy, process.enclave)
         echo(f"  {process.enclave}: {pid}{nodes}: {how}")
     export = shlex.quote(str(robot.export.absolute()))

@@ -578,7 +578,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         said = robot.close("--proof", status=1).out
     robot.absent = set()
     assert f"{lost}ended while the proof ran: {stopped}add --without /listener)\n" in said
-    robot.remaining = (TALKER, ros_node("listener", LISTENER[3])[:4] + (EVENTS,))
+    robot.remaining = (TALKER, (*ros_node("listener", LISTENER[3])[:4], EVENTS))
     assert f"{lost}gone: /listener publish r" in robot.close("--proof", status=1).out
     robot.remaining = (TALKER, LISTENER, ros_node("guest", "05"))
     assert f"{lost}denied: /guest " in robot.close("--proof", status=1).out
@@ -832,23 +832,41 @@ def test_a_program_that_gives_its_processes_their_enclaves(
     assert said.count("pumps.py") == 1
 
 
-def test_a_tool_that_ended_while_sros_watched(
-    robot: Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tool = ros_node("tool", "010f0000070000000000", "publish rt/map")
-    run, left = close._run, f'"ended": ["{tool[3]}0000"]'
+def test_tools_that_ended_while_sros_watched(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The commands of those that sros saw running are known then."""
+    tool, look, job = (
+        ros_node(name, f"010f00000{number}0000000000", f"publish rt/{name}")
+        for number, name in enumerate(("tool", "look", "job"), 7)
+    )
+    library = frozenset({"libfastrtps"})
+    seen = {7: ("/opt/tool", "a b"), 9: ("/opt/job",), 10: ("ros2", "topic", "list")}
+    origins = {9: ProcessOrigin("job.service", "/opt")}
+    monkeypatch.setattr(
+        closing, "process_origin", lambda pid: origins.get(pid, ProcessOrigin("", "/opt"))
+    )
+    run, left = close._run, json.dumps([f"{node[3]}0000" for node in (tool, look, job)])
 
     def ran(words: Any, live: bool) -> tuple[int, str, str]:
+        robot.more = tuple(
+            Process(pid, command, {}, datetime.now(UTC), libraries=library)
+            for pid, command in seen.items()
+        )
         status, output, messages = run(words, live)
-        return status, output.replace('"ended": []', left), messages
+        robot.more = ()
+        return status, output.replace('"ended": []', f'"ended": {left}'), messages
 
     monkeypatch.setattr(close, "_run", ran)
-    robot.nodes = (TALKER, LISTENER, tool)
+    robot.nodes = (TALKER, LISTENER, tool, look, job)
     ended = robot.close("--for", "1s")
-    run_it = f"sros run {robot.folder / 'robot/export'} /tool -- COMMAND\n"
-    assert f"  /tool: has ended, start it with: {run_it}" in ended.out
+    run_it = f"sros run {robot.folder / 'robot/export'}"
+    assert f"  /look: has ended, start it with: {run_it} /look -- COMMAND\n" in ended.out
+    assert "  /tool: has ended: by hand\n" in ended.out
+    assert "  /job: has ended: --apply adds a drop-in to job.service\n" in ended.out
     commands = (robot.folder / "robot/start/commands.txt").read_text()
-    assert f"# /tool has ended: COMMAND is what starts it\n{run_it}" in commands
+    assert f"# /look has ended: COMMAND is what starts it\n{run_it} /look -- COMMAND" in commands
+    assert f"# /tool\ncd /opt && {run_it} /tool -- /opt/tool 'a b'\n" in commands
+    robot.close("--apply", "--without", "/look", "--without", "/tool", status=1)
+    assert robot.restarts == ["daemon-reload", "try-restart job.service"]
 
 
 def test_a_policy_with_an_error_closes_nothing(robot: Robot) -> None:
