@@ -909,10 +909,11 @@ class OpenRobot:
             status, output, messages = self._shell.run(step.words, bool(step.into))
         if watches and status:
             remove_folders(made)
+            others = self._in_other_domains(ProcessTable().look(self._shell.now()))
             raise UnavailableError(
-                "there is no robot to close: no node was observed",
-                "",
-                "Start the robot open, and run this again.",
+                f"there is no robot to close: no node was observed in domain {self.domain}",
+                f"{others}." if others else "",
+                f"{'Otherwise start' if others else 'Start'} the robot open, and run this again.",
             )
         if status or (step.guards and output):
             self._say("" if step.into else f"{output}{messages}")
@@ -988,6 +989,19 @@ class OpenRobot:
     def _is_neighbour(self, process: Process) -> bool:
         return _is_in_domain(process, self.domain)
 
+    def _in_other_domains(self, running: RunningProcesses) -> str:
+        """Return the processes of other ROS domains, with the commands that close them, or ""."""
+        domains: dict[str, list[str]] = {}
+        for process in running.processes:
+            if not (self._is_neighbour(process) or process.network or process.is_daemon):
+                domains.setdefault(process.domain, []).append(process.label)
+        folder = "ANOTHER_FOLDER" if self.observed else shlex.quote(str(self.folder))
+        return "; ".join(
+            f"in domain {domain}, not {self.domain}, runs {first_few(labels, _MOST_NAMES)}: "
+            f"to close it, sros close {folder} --domain {domain}"
+            for domain, labels in sorted(domains.items())
+        )
+
     def _keep_processes(self, document: str, meanwhile: _SeenProcesses) -> str:
         """Write which process has which nodes, and the policy of the observer.
 
@@ -996,7 +1010,8 @@ class OpenRobot:
         """
         replace_file(self.observer, (policies_dir() / "observer.xml").read_bytes())
         nodes = [node for node in self._observation(all_nodes=True).nodes if not is_tool(node)]
-        running = ProcessTable().look(self._shell.now()).processes
+        table = ProcessTable().look(self._shell.now())
+        running = table.processes
         of_cyclone = [process.pid for process in running if "libddsc" in process.libraries]
         process_ids = _process_ids_of_cyclone(of_cyclone, self.domain)
         learned = json.loads(document)
@@ -1030,6 +1045,8 @@ class OpenRobot:
                 )
         number = counted(len(processes), "process", "processes")
         self._shell.say(f"saw {counted(len(nodes), 'node')} in {number} of this machine")
+        if others := self._in_other_domains(table):
+            self._shell.say(others)
         if os.path.lexists(self.seen_again):  # of an earlier watch
             remove_file(self.seen_again)
         lacking = learned["added"] if learned["dry_run"] else ()
@@ -1643,6 +1660,8 @@ class OpenRobot:
         if may_end := [name for name in absent if name not in {*are_open, *self._without}]:
             options = " ".join(f"--without {name}" for name in may_end)
             reasons.append(f"if it does not always run, add {options}")
+        if absent and (in_others := self._in_other_domains(running)):
+            reasons.append(in_others)
         for why in dict.fromkeys(why for _, why in wrong.values()):
             named = ", ".join(
                 f"{name} (process {wrong[name][0].pid})"

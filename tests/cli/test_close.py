@@ -705,7 +705,9 @@ def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
     assert "would not be heard any more (accept: --partial)" in robot.close("--apply", status=1).out
     assert robot.restarts == []
     robot.more = (replace(robot.more[0], pid=6, environment={"ROS_DOMAIN_ID": "1"}),)
-    assert "process 6" not in robot.close("--for", "1s").out
+    ended, in_1 = robot.close("--for", "1s"), "in domain 1, not 0, runs process 6 (other): to cl"
+    assert "process 6" not in ended.out and in_1 in ended.err
+    assert f"; {in_1}ose it, sros close ANOTHER_FOLDER --d" in robot.close("--proof", status=1).out
     robot.close("--apply")
 
 
@@ -916,8 +918,12 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
     robot.more = (Process(5, ("rmw_zenohd",), {}, datetime.now(UTC)),)
     assert "speaks Zenoh" in robot.close(status=2).err
     assert not (robot.folder / "robot").exists()
-    robot.more, robot.nodes = (), ()
-    assert "no node was observed" in robot.close(status=2).err
+    robot.more, robot.nodes = (Process(5, ("a",), {"ROS_DOMAIN_ID": "7"}, datetime.now(UTC)),), ()
+    ended = robot.close(status=2)
+    there = "in domain 7, not 0, runs process 5 (a): to close it, sros close robot --domain 7"
+    assert f"to close: no node was observed in domain 0. {there}. Otherwise start the" in ended.err
+    robot.more = ()
+    assert "no node was observed in domain 0. Start the robot open" in robot.close(status=2).err
     assert not (robot.folder / "robot").exists()
     (robot.folder / "robot").mkdir()  # by somebody else: it stays
     assert "has no watched robot" in robot.close("--proof", status=2).err
