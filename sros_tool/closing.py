@@ -38,6 +38,7 @@ from sros_tool.checks.requirements import VIOLATED
 from sros_tool.enclave_environment import loadable_environment
 from sros_tool.errors import DocumentError, SrosError, UnavailableError, UsageError
 from sros_tool.explain.audit import DeniedRight, audit, audited_enclaves
+from sros_tool.explain.explanation import likely_meaning
 from sros_tool.files import policies_dir, remove_file, replace_file
 from sros_tool.folders import Folder, make_folders, remove_folders
 from sros_tool.graph.learn import common_parts, is_tool, name_as_written, stable_name
@@ -1049,25 +1050,46 @@ class OpenRobot:
             self._shell.say(others)
         if os.path.lexists(self.seen_again):  # of an earlier watch
             remove_file(self.seen_again)
-        lacking = learned["added"] if learned["dry_run"] else ()
-        if not lacking:
-            return ""
-        self._write_seen(nodes)
-        policy, seen = shlex.quote(str(self.policy)), shlex.quote(str(self.seen_again))
-        add = f"sros merge_policy {policy} {seen} --in-place"
-        rights = [f"{right['enclave']} {right['right']} {right['name']}" for right in lacking]
-        return (
-            f"'{self.policy}' stays as it is, and lacks {counted(len(rights), 'right')} seen now "
-            f"({first_few(rights, _MOST_NAMES)}); if a process should not have them, stop it, and "
-            f"run `sros close {shlex.quote(str(self.folder))}`; if they are right, add them: {add}"
-        )
+        return self._lacking_text(learned["added"], nodes) if learned["dry_run"] else ""
 
-    def _write_seen(self, nodes: Iterable[ObservedNode]) -> None:
-        """Write the rights that nodes use as a policy of its own."""
+    def _lacking_text(
+        self, lacking: Sequence[Mapping[str, str]], nodes: Iterable[ObservedNode]
+    ) -> str:
+        """Return, as a sentence, which rights of nodes the policy lacks; "" if it lacks none.
+
+        Writes the rights that the nodes use as a policy of its own.
+        """
         from sros_tool.graph.learn import draft, learn, write  # only after another watch
 
+        if not lacking:
+            return ""
         common = common_parts(self.folder, policies_dir())
-        write(draft(self.seen_again, learn(make_observation(nodes), common), common))
+        learned = learn(make_observation(nodes), common)
+        write(draft(self.seen_again, learned, common))
+        used, stated = policy_rights(learned.policy()), policy_rights(read_policy(self.policy))
+        rights, meanings = [], []
+        for value in lacking:
+            right = Right(value["enclave"], ALLOW, value["right"], value["name"])
+            rights.append(f"{right.enclave} {right.right} {right.name}")
+            named = (
+                other
+                for other in stated
+                if (other.enclave, other.qualifier) == (right.enclave, ALLOW)
+                and not is_expression(other.name)
+            )
+            if meaning := likely_meaning(right, used, named):
+                meanings.append(meaning)
+        folder, file = shlex.quote(str(self.folder)), shlex.quote(str(self.policy))
+        add = f"sros merge_policy {file} {shlex.quote(str(self.seen_again))} --in-place"
+        first = (
+            f"{first_few(meanings, _MOST_NAMES)}; then restart it with that, and watch again: sros "
+            f"close {folder} --for 1m; otherwise, " * bool(meanings)
+        )
+        return (
+            f"'{self.policy}' stays as it is, and lacks {counted(len(rights), 'right')} seen now "
+            f"({first_few(rights, _MOST_NAMES)}); {first}if a process should not have them, stop "
+            f"it, and run `sros close {folder}`; if they are right, add them: {add}"
+        )
 
     def _shared_program_texts(self) -> Iterator[str]:
         """Yield a text for each program whose processes would all run in one enclave."""
@@ -1770,7 +1792,10 @@ class OpenRobot:
             now = observation_from_json(value)
             lost = _lost_endpoints(before, now, denied)
             wrong = {
-                "denied": [f"{right['enclave']} {right['name']}" for right in value["denied"]],
+                "denied": [
+                    f"{right['enclave']} {right['right']} {right['name']}: {right['reason']}"
+                    for right in value["denied"]
+                ],
                 "refused": [refused["enclave"] for refused in value["refused"]],
                 **self._unseen_nodes(value, before, lost, missing, running),
                 "gone": [f"{node} {endpoint}" for node in lost for endpoint in lost[node]],

@@ -33,6 +33,11 @@ PARAMETER_SERVICES = (
 NODE_SERVICES = (*PARAMETER_SERVICES, "get_type_description")
 """All services that a node of ROS 2 Jazzy offers under its own name, as ``~/NAME``."""
 
+GLOBAL_TOPICS = frozenset(
+    ("/bond", "/clock", "/diagnostics", "/parameter_events", "/rosout", "/tf", "/tf_static")
+)
+"""Topics that packages use with a leading slash, so that they stay the same in any namespace."""
+
 _NODE_SERVICE = re.compile(rf"(?P<node>/.+)/(?:{'|'.join(NODE_SERVICES)})\Z")
 
 

@@ -47,6 +47,7 @@ from sros_tool.names import (
     ACTION_SEPARATOR,
     ACTION_SERVICES,
     ACTION_TOPICS,
+    GLOBAL_TOPICS,
     GOAL,
     NODE_SERVICES,
     PARAMETER_SERVICES,
@@ -259,7 +260,6 @@ SEVERAL_INSTANCES = FindingKind(
 _LONGEST = 247
 _DIGIT_FIRST = re.compile(r"/(?:[0-9]|\[[0-9-]+\])")
 _DDS_PREFIX = re.compile(r"/?(?:rt|rq|rr|rs)/")
-_GLOBAL_TOPICS = ("/rosout", "/parameter_events", "/clock", "/tf", "/tf_static", "/diagnostics")
 _ALL = re.compile(r"/?[*?]*\*[*?]*\Z")
 _ASKING_SIDE = {offering: asking for asking, offering in OFFERING_SIDE.items()}
 
@@ -292,7 +292,7 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
 
     def is_alone(statement: _Statement, other: str) -> bool:
         name = statement.name
-        if not statement.allows or is_expression(name) or name in _GLOBAL_TOPICS:
+        if not statement.allows or is_expression(name) or name in GLOBAL_TOPICS:
             return False
         # The other side may name the whole action.
         return not sides[other].meets(name) and not action_part(name)[1]
@@ -468,7 +468,7 @@ def _kind_of_ros_name(statement: _Statement) -> str:
             name.rpartition("/")[2] in NODE_SERVICES or action_part(name)[1] in ACTION_SERVICES
         )
         return "services" if is_service else ""
-    return "topics" if name in _GLOBAL_TOPICS or action_part(name)[1] in ACTION_TOPICS else ""
+    return "topics" if name in GLOBAL_TOPICS or action_part(name)[1] in ACTION_TOPICS else ""
 
 
 def _broad_right_findings(statement: _Statement) -> Iterator[Finding]:

@@ -522,11 +522,15 @@ def _judge(process: Sequence[ObservedNode], enclave: str, enclaves: AuditedEncla
     if not join.allowed:
         return _Judgement((), join.decision.clause)
     return _Judgement(
-        tuple(right for node in process for right in _denied_rights(node, enclave, evaluator))
+        tuple(
+            right for node in process for right in _denied_rights(node, process, enclave, evaluator)
+        )
     )
 
 
-def _denied_rights(node: ObservedNode, enclave: str, evaluator: Evaluator) -> Iterator[DeniedRight]:
+def _denied_rights(
+    node: ObservedNode, process: Sequence[ObservedNode], enclave: str, evaluator: Evaluator
+) -> Iterator[DeniedRight]:
     parts = tuple(Part(AccessVerb(e.direction), e.topic) for e in sorted(node.endpoints))
     if not parts:
         return
@@ -536,9 +540,11 @@ def _denied_rights(node: ObservedNode, enclave: str, evaluator: Evaluator) -> It
         for part, decision in answer.parts
         if not decision.outcome.ok
     }
-    used = dict(_rights_of(node, enclave))
-    named = named_rights(answer) if decisions else ()
-    for right, needed in used.items():
+    if not decisions:
+        return
+    used = {right for other in process for right, _ in _rights_of(other, enclave)}
+    named = named_rights(answer)
+    for right, needed in _rights_of(node, enclave):
         endpoints = tuple(endpoint for endpoint in needed if endpoint in decisions)
         if endpoints:
             by_rule = [

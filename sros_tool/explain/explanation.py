@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from pathlib import Path
 from shlex import quote
@@ -46,7 +47,13 @@ from sros_tool.keystore.layout import (
     is_original_keystore,
 )
 from sros_tool.keystore.participant import LoadedEnclave, plan_enclave
-from sros_tool.names import NODE_SERVICES, is_expression, nodes_served
+from sros_tool.names import (
+    GLOBAL_TOPICS,
+    NODE_SERVICES,
+    is_expression,
+    node_of_service,
+    nodes_served,
+)
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source
 from sros_tool.policy.rights import Right, order, profile_rights
 from sros_tool.terminal import log_step
@@ -372,18 +379,17 @@ _ALIKE = 0.9
 """Lowest similarity (`difflib` ratio, 0 to 1) that counts as a typing error in a ROS name."""
 
 
-def likely_names(answer: Answer) -> tuple[str, ...]:
+def likely_names(answer: Answer, *, or_only: bool = False) -> tuple[str, ...]:
     """Return at most three allowed names that may be meant instead of the denied name.
 
     For a service that every node offers, they are the same services of the enclave's nodes.  For
     any other name, they are names with the same last part (a forgotten remapping), or else names
-    with a similar spelling.
+    with a similar spelling, or else, with ``or_only``, the only name of its kind.
     """
     question = answer.question
     names = {right.name for right in named_rights(answer) if right.right == question.right}
-    return _similar_names(
-        question.name, names - {question.name}, is_service=question.type == "service"
-    )
+    is_service = question.type == "service"
+    return _similar_names(question.name, names - {question.name}, is_service, or_only=or_only)
 
 
 def likely_meaning(right: Right, used: Collection[Right], named: Iterable[Right]) -> str:
@@ -400,8 +406,11 @@ def likely_meaning(right: Right, used: Collection[Right], named: Iterable[Right]
             kind = "an action" if other.kind == "actions" else "a service"
             return f"the policy has it as {kind} ({other.right})"
     names = {other.name for other in others if other.right == right.right}
-    similar = _similar_names(right.name, names, is_service=right.kind == "services")
-    return f"perhaps the policy means {' or '.join(similar)}" if similar else ""
+    similar = _similar_names(right.name, names, right.kind == "services", or_only=True)
+    meaning = f"perhaps the policy means {' or '.join(similar)}" if similar else ""
+    if len(similar) == 1 and right.kind != "actions":
+        meaning += f" (the node may lack its remapping: -r {right.name}:={similar[0]})"
+    return meaning
 
 
 def named_rights(answer: Answer) -> tuple[Right, ...]:
@@ -411,7 +420,9 @@ def named_rights(answer: Answer) -> tuple[Right, ...]:
     return tuple(sorted(named, key=order))
 
 
-def _similar_names(name: str, names: Collection[str], *, is_service: bool) -> tuple[str, ...]:
+def _similar_names(
+    name: str, names: AbstractSet[str], is_service: bool, *, or_only: bool
+) -> tuple[str, ...]:
     last = name.rpartition("/")[2]
     same = sorted(other for other in names if other.rpartition("/")[2] == last)
     if (is_service and last in NODE_SERVICES) or 0 < len(same) <= _SHOWN:
@@ -420,7 +431,10 @@ def _similar_names(name: str, names: Collection[str], *, is_service: bool) -> tu
         return ()
     from difflib import get_close_matches  # for this alone, which is asked last
 
-    return tuple(get_close_matches(name, sorted(names), n=_SHOWN, cutoff=_ALIKE))
+    similar = get_close_matches(name, sorted(names), n=_SHOWN, cutoff=_ALIKE)
+    others = [other for other in names - GLOBAL_TOPICS if not node_of_service(other)]
+    is_only = or_only and len(others) == 1 and name not in GLOBAL_TOPICS
+    return tuple(similar or (others if is_only else ()))
 
 
 _SHOWN = 3

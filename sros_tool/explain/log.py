@@ -748,9 +748,11 @@ class _Examiner:
             return [], ""
         asked = self._answer(enclave, denial.vendor, ask(words[0], name))
         names = likely_names(asked)
+        meant = ": perhaps that is meant" if names else " instead"
+        names = names or likely_names(asked, or_only=True)
         if not names:
             return [], ""
-        return [f"the enclave may {words[0]} {' and '.join(names)}: perhaps that is meant"], (
+        return [f"the enclave may {words[0]} {' and '.join(names)}{meant}"], (
             f"If a remapping was forgotten, add `--ros-args -r {quote(name)}:={quote(names[0])}`; "
             f"otherwise {remedy}"
         )

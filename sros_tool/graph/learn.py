@@ -37,6 +37,7 @@ from sros_tool.graph.observation import (
 )
 from sros_tool.names import (
     ACTION_SEPARATOR,
+    GLOBAL_TOPICS,
     check_enclave_name,
     check_namespace,
     dds_names,
@@ -320,10 +321,6 @@ _TOOLS = re.compile(r"_ros2cli(_.*)?\Z|(?P<observer>_sros_observer)(_.*)?\Z")
 _OF_OBSERVER = frozenset({Endpoint("rt/parameter_events", PUBLISH)})
 """The endpoints of an observer of sros. A node with its name but other endpoints is no
 observer."""
-_ABSOLUTE = frozenset(
-    ("/bond", "/clock", "/diagnostics", "/parameter_events", "/rosout", "/tf", "/tf_static")
-)
-"""Names that packages use with a leading slash, so that they stay the same in any namespace."""
 
 
 def is_tool(node: ObservedNode) -> bool:
@@ -356,7 +353,7 @@ def name_as_written(fqn: str, ns: str, node: str) -> str:
     if fqn.startswith(own):
         return "~/" + fqn[len(own) :]
     prefix = "/" if ns == "/" else ns + "/"
-    if fqn in _ABSOLUTE or not fqn.startswith(prefix):
+    if fqn in GLOBAL_TOPICS or not fqn.startswith(prefix):
         return fqn
     rest = fqn[len(prefix) :]
     if ns == "/" and "/" in re.sub(r"/_(action/\w+|service_event)\Z", "", rest):

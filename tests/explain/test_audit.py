@@ -83,6 +83,12 @@ def ids(found: Audit) -> list[str]:
     return [each.id for each in found.notes]
 
 
+def lacks(used: str, allowed: str) -> str:
+    """The hint at a remapping from the name that is used to the only one that is allowed."""
+    node = f"the node may lack its remapping: -r {used}:={allowed}"
+    return f"; perhaps the policy means {allowed} ({node})"
+
+
 TALKER = {"/t": {"/talker": ["publish chatter"]}}
 UNNAMED = "the policy has no enclave for this node"
 
@@ -115,7 +121,13 @@ def talks(*more: str, enclave: str = "/", fqn: str = "/talker", pid: str = "p1")
         (
             {"/t": {"/a": ["publish x"], "/b": []}},
             [node("/a", "publish /y", enclave="/t"), node("/b", "publish /y", enclave="/t")],
-            ["/t publish topic /y (/a, /b): no rule allows publish rt/y"],
+            [f"/t publish topic /y (/a, /b): no rule allows publish rt/y{lacks('/y', '/x')}"],
+        ),
+        # What another node of the process uses is no name that a remapping lacks.
+        (
+            {"/t": {"/a": ["publish x"], "/b": []}},
+            [node("/a", "publish /x", enclave="/t"), node("/b", "publish /y", enclave="/t")],
+            ["/t publish topic /y (/b): no rule allows publish rt/y"],
         ),
         # DDS knows processes: what another node of the enclave may do is allowed.
         ({"/t": {"/talker": [], "/b": ["publish /chatter"]}}, [talks()], []),
@@ -123,7 +135,10 @@ def talks(*more: str, enclave: str = "/", fqn: str = "/talker", pid: str = "p1")
         (
             {**TALKER, "/u": {"/other": ["publish /x"]}},
             [talks(enclave="/u")],
-            ["/u publish topic /chatter (/talker): no rule allows publish rt/chatter"],
+            [
+                "/u publish topic /chatter (/talker): no rule allows publish rt/chatter"
+                f"{lacks('/chatter', '/x')}"
+            ],
         ),
         (TALKER, [talks(enclave="/gone")], [f"/gone publish topic /chatter (/talker): {UNNAMED}"]),
         (TALKER, [talks(fqn="/hall/x")], [f"/hall/x publish topic /chatter (/hall/x): {UNNAMED}"]),
@@ -168,7 +183,8 @@ def test_the_rest_of_a_process_shows_its_enclave(tmp_path: Path) -> None:
         node("/transform_listener_impl_66", "subscribe /tf", enclave="/", participant="p2"),
     )
     found = audited(tmp_path, enclaves, seen)
-    assert said(found) == ["/b publish topic /x (/b): no rule allows publish rt/x"]
+    text = f"/b publish topic /x (/b): no rule allows publish rt/x{lacks('/x', '/y')}"
+    assert said(found) == [text]
     assert found.notes == ()
 
 
