@@ -18,7 +18,7 @@ from shlex import quote
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Permissions
-from sros_tool.errors import DocumentError, Note, SrosError
+from sros_tool.errors import DocumentError, Note, PkiError, SrosError
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.layout import (
@@ -337,21 +337,30 @@ def _common_governance(root: Path, folders: Iterable[Path]) -> Governance:
         DocumentError: an enclave has another governance, such as an earlier one with less
             protection.
     """
-    wanted = smime.parse(read_bytes(root / GOVERNANCE_P7S, "governance document")).document
+    governance = Keystore(root).governance
+    wanted = _signed_text(read_bytes(root / GOVERNANCE_P7S, "governance document"))
     same: set[bytes] = set()
     for folder in folders:
         file = folder / GOVERNANCE_FILE
         data = read_bytes(file, "governance document") if file.exists() else b""
         if not data or data in same:
             continue
-        if smime.parse(data).document != wanted:
+        if _signed_text(data) != wanted:
             raise DocumentError(
                 f"'{root}' cannot be compared: '{file}' is not the governance of the keystore",
                 "It is not certain which protection applies to the enclave and its peers.",
                 f"`sros check {quote(str(root))}` shows what is wrong with it.",
             )
         same.add(data)
-    return Keystore(root).governance
+    return governance
+
+
+def _signed_text(message: bytes) -> bytes | None:
+    """Return the document in a signed message, which is not verified; None if it is not signed."""
+    try:
+        return smime.parse(message).document
+    except PkiError:
+        return None
 
 
 def _exported_governance(root: Path, folders: Iterable[Path]) -> Governance:
@@ -470,9 +479,17 @@ def _trusts(
 
 
 def _governance(file: Path) -> Governance:
-    signed = smime.parse(read_bytes(file, "governance document"))
-    if authority := permissions_ca_for(file):
-        signed.verify(load_certificate(read_bytes(authority, "certificate"), f"'{authority}'"))
+    data = read_bytes(file, "governance document")
+    try:
+        signed = smime.parse(data)
+        if authority := permissions_ca_for(file):
+            signed.verify(load_certificate(read_bytes(authority, "certificate"), f"'{authority}'"))
+    except PkiError as error:
+        raise DocumentError(
+            f"the governance document '{file}' cannot be used: {error.what}",
+            error.why,
+            error.remedy,
+        ) from error
     return parse_governance(signed.document, f"'{file}'")
 
 

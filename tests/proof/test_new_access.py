@@ -814,6 +814,9 @@ def test_an_export_is_compared_in_its_enclaves(keystore: Path, tmp_path: Path) -
     lacking = sros("diff_policy", "--no-new-access", robot, policy)
     assert lacking.status == 2 and "it has Zenoh files, but not router.json5" in lacking.err
     session.unlink()
-    (robot / "enclaves" / "a" / "governance.p7s").unlink()
+    (governance := robot / "enclaves" / "a" / "governance.p7s").write_text("damaged")
+    damaged = sros("diff_policy", "--no-new-access", robot, policy)
+    assert damaged.status == 2 and f"'{governance}' cannot be used: it is not an" in damaged.err
+    governance.unlink()
     lacking = sros("diff_policy", "--no-new-access", robot, policy)
     assert lacking.status == 2 and "governance.p7s' does not exist" in lacking.err
