@@ -298,8 +298,8 @@ class ObservedProcesses(NamedTuple):
         It differs from the enclave of the process if the program itself chooses that enclave.
         """
         names = {process.enclave, *process.shares}
-        program = [each for each in self.processes if each.enclave in names]
-        return min((each.chooses, each.enclave) for each in program)[1]
+        return min((other.chooses, other.enclave) for other in self.processes
+                   if other.enclave in names)[1]  # fmt: skip
 
     def commands_by_hand(self, folder: Path) -> Mapping[str, Sequence[ClosedProcess]]:
         """Map shell commands to the processes that they start and that no unit starts alone.
@@ -467,12 +467,13 @@ def assign(
                 for process in processes:
                     assign_enclave(process, enclave, known_by)
     of_program: dict[int, set[str]] = {}
-    for each in assigned:
-        of_program.setdefault(each.pid, set()).add(each.enclave)
+    for closed in assigned:
+        of_program.setdefault(closed.pid, set()).add(closed.enclave)
     return ObservedProcesses(
         domain,
         sorted(
-            each._replace(shares=sorted(of_program[each.pid] - {each.enclave})) for each in assigned
+            closed._replace(shares=sorted(of_program[closed.pid] - {closed.enclave}))
+            for closed in assigned
         ),
         [_process_text(process) for process in left.values() if process.pid not in of_program],
         sorted(
@@ -679,6 +680,7 @@ class OpenRobot:
     ) -> None:
         self.folder, self._shell, self._without = folder, shell, sorted({*without})
         self._named_elsewhere = sorted({*elsewhere})
+        self._close = f"sros close {shlex.quote(str(folder))}"
         self.policy, self.observer = folder / CLOSED_POLICY, folder / "observer.xml"
         self.requirements = folder / _REQUIREMENTS
         self.keystore, self.export = folder / "keystore", folder / "export"
@@ -810,7 +812,9 @@ class OpenRobot:
             return closing._replace(problems=problems)
         if self.observed:
             known = {process.enclave for process in self.observed.processes}
-            later = [each for each in closing.observed.processes if each.enclave not in known]
+            later = [
+                process for process in closing.observed.processes if process.enclave not in known
+            ]
             if later:
                 processes = [*self.observed.processes, *later]
                 self._write_processes(self.observed._replace(processes=processes))
@@ -976,7 +980,7 @@ class OpenRobot:
             raise UsageError(
                 f"the robot runs closed: {first_few(secured, _MOST_NAMES)}",
                 "Only an open robot can be watched.",
-                f"Go back by `sros close {shlex.quote(str(self.folder))} --undo` and watch again, "
+                f"Go back by `{self._close} --undo` and watch again, "
                 f"or add what is missing to '{self.policy}' by hand.",
             )
         for process in running.processes:
@@ -996,10 +1000,10 @@ class OpenRobot:
         for process in running.processes:
             if not (self._is_neighbour(process) or process.network or process.is_daemon):
                 domains.setdefault(process.domain, []).append(process.label)
-        folder = "ANOTHER_FOLDER" if self.observed else shlex.quote(str(self.folder))
+        close = "sros close ANOTHER_FOLDER" if self.observed else self._close
         return "; ".join(
             f"in domain {domain}, not {self.domain}, runs {first_few(labels, _MOST_NAMES)}: "
-            f"to close it, sros close {folder} --domain {domain}"
+            f"to close it, {close} --domain {domain}"
             for domain, labels in sorted(domains.items())
         )
 
@@ -1038,7 +1042,7 @@ class OpenRobot:
         self._write_processes(observed.belonging_elsewhere(not_here))
         for process in running:
             own = process.environment.keys() - {*self._shell.environment, *_OF_EVERY_SHELL}
-            if process.pid in {each.pid for each in processes} and own:
+            if process.pid in {closed.pid for closed in processes} and own:
                 self._shell.say(
                     f"{process.label} has variables that this shell does not have, and that its "
                     f"command in {self.start / COMMANDS} does not set: "
@@ -1079,16 +1083,16 @@ class OpenRobot:
             )
             if meaning := likely_meaning(right, used, named):
                 meanings.append(meaning)
-        folder, file = shlex.quote(str(self.folder)), shlex.quote(str(self.policy))
-        add = f"sros merge_policy {file} {shlex.quote(str(self.seen_again))} --in-place"
+        policy, seen = shlex.quote(str(self.policy)), shlex.quote(str(self.seen_again))
+        add = f"sros merge_policy {policy} {seen} --in-place"
         first = (
-            f"{first_few(meanings, _MOST_NAMES)}; then restart it with that, and watch again: sros "
-            f"close {folder} --for 1m; otherwise, " * bool(meanings)
+            f"{first_few(meanings, _MOST_NAMES)}; then restart it with that, and watch again: "
+            f"{self._close} --for 1m; otherwise, " * bool(meanings)
         )
         return (
             f"'{self.policy}' stays as it is, and lacks {counted(len(rights), 'right')} seen now "
             f"({first_few(rights, _MOST_NAMES)}); {first}if a process should not have them, stop "
-            f"it, and run `sros close {folder}`; if they are right, add them: {add}"
+            f"it, and run `{self._close}`; if they are right, add them: {add}"
         )
 
     def _shared_program_texts(self) -> Iterator[str]:
@@ -1109,7 +1113,7 @@ class OpenRobot:
                     "enclaves, which then has the rights of all, and remove the other "
                     "enclaves; or let the program start each process with the method spawn after "
                     f"setting {ENCLAVE} in os.environ, and watch again: "
-                    f"sros close {shlex.quote(str(self.folder))} --for 1m"
+                    f"{self._close} --for 1m"
                 )
 
     def _shared_node_texts(self) -> Iterator[str]:
@@ -1117,14 +1121,13 @@ class OpenRobot:
         by_enclave: dict[str, list[ClosedProcess]] = {}
         for process in self.observed.processes if self.observed else ():
             by_enclave.setdefault(process.enclave, []).append(process)
-        folder = shlex.quote(str(self.folder))
         for enclave, twins in by_enclave.items():
             if len({twin.pid for twin in twins}) > 1:
                 commands = [f"process {twin.pid} ({shlex.join(twin.command)})" for twin in twins]
                 yield (
                     f"{enumerated(commands)} call themselves {enclave}, and the enclave of this "
                     "name would have the rights of all; nothing was signed; if one is not of the "
-                    f"robot, stop it, remove '{self.policy}', and watch again: sros close {folder} "
+                    f"robot, stop it, remove '{self.policy}', and watch again: {self._close} "
                     "--for 1m; if all are, accept it: --partial"
                 )
 
@@ -1321,14 +1324,14 @@ class OpenRobot:
     def _problems(self, closing: Closing, *, partial: bool) -> Iterator[str]:
         """Yield what keeps the robot from running closed, with what to do."""
         policy, observed = read_policy(self.policy), closing.observed
-        folder, not_here = shlex.quote(str(self.folder)), self._not_here
+        not_here = self._not_here
         for name in list_enclaves(self.keystore):
             if name not in (_OBSERVER, _ROUTER, *not_here) and not policy.enclave(name):
                 revoke = f"sros revoke {shlex.quote(str(self.keystore))} {name}"
                 yield (
                     f"the policy does not have {name}, and the keystore does: if nothing needs it "
-                    f"any more, {revoke}; if it belongs to another machine, such as a laptop, sros "
-                    f"close {folder} --elsewhere {name}; if it belongs to this machine, sros "
+                    f"any more, {revoke}; if it belongs to another machine, such as a laptop, "
+                    f"{self._close} --elsewhere {name}; if it belongs to this machine, sros "
                     f"merge_policy {shlex.quote(str(self.policy))} ITS_POLICY --in-place"
                 )
         for name in sorted(not_here & closing.secured.keys()):
@@ -1360,10 +1363,10 @@ class OpenRobot:
         silent = "they would not be heard any more (accept: --partial)"
         if observed.unknown:
             named = first_few(observed.unknown, _MOST_NAMES)
-            opened = f"go back by sros close {folder} --undo, and " if closing.secured else ""
+            opened = f"go back by {self._close} --undo, and " if closing.secured else ""
             yield (
                 f"sros saw no node of {counted(len(observed.unknown), 'process', 'processes')}: "
-                f"{named}; {opened}watch again while they run: sros close {folder} --for 1m; "
+                f"{named}; {opened}watch again while they run: {self._close} --for 1m; "
                 f"otherwise {silent}"
             )
         if observed.elsewhere:
@@ -1374,14 +1377,14 @@ class OpenRobot:
                     f"nodes of {twice[0]} are in process {here[twice[0]]} and in another one that "
                     "sros does not see: if another robot is in this ROS domain, switch it off, or "
                     "give it a domain of its own, remove the rights that it added to "
-                    f"'{self.policy}', and watch again: sros close {folder} --for 1m"
+                    f"'{self.policy}', and watch again: {self._close} --for 1m"
                 )
             if only_there := [name for name in observed.elsewhere if name not in twice]:
                 named = first_few(only_there, _MOST_NAMES)
                 options = " ".join(f"--elsewhere {name}" for name in only_there)
                 yield (
                     f"sros knows no process of this machine for nodes of {named}; if they run on "
-                    f"another machine: sros close {folder} {options}; otherwise {silent}"
+                    f"another machine: {self._close} {options}; otherwise {silent}"
                 )
 
     # ── applying ────────────────────────────────────────────────────────────────────────────
@@ -1482,7 +1485,7 @@ class OpenRobot:
         own = [*self._secured(running, everywhere=True)]
         secured = {
             enclave.name: process
-            for process, enclave in sorted(own, key=lambda each: self._may_use_files(each[0]))
+            for process, enclave in sorted(own, key=lambda pair: self._may_use_files(pair[0]))
         }
         if self.policy.exists():
             observed = observed.within(read_policy(self.policy))
@@ -1537,8 +1540,8 @@ class OpenRobot:
             where = "" if self.keystore.exists() else ", where the keystore is,"
             self._shell.say(
                 f"'{self.policy}' differs from the signed permissions of "
-                f"{first_few(changed, _MOST_NAMES)}: `sros close "
-                f"{shlex.quote(str(self.folder))}`{where} checks and signs it"
+                f"{first_few(changed, _MOST_NAMES)}: `{self._close}`"
+                f"{where} checks and signs it"
             )
         return closing._replace(proofs=proofs)
 
@@ -1603,11 +1606,11 @@ class OpenRobot:
         _, without = self._divide_by_profile(self._observed_nodes())
         left = {_node_name(node) for node in without if not is_tool(node)} - renamed.keys()
         if left and not fails:
-            close = f"sros close {shlex.quote(str(self.folder))}"
             text += (
                 "; not compared, as the policy has no profile for them any more: "
                 f"{first_few(sorted(left), _MOST_NAMES)} (if they have new names, they are compared"
-                f" when the open robot was watched again: {close} --undo, {close} --for 1m)"
+                f" once the open robot was watched again: {self._close} --undo, {self._close} "
+                "--for 1m)"
             )
         return text
 
@@ -1623,8 +1626,10 @@ class OpenRobot:
         sides: tuple[list[ObservedNode], list[ObservedNode]] = [], []
         for node in nodes:
             name = stable_name(node.name)
-            has_one = any(overlap(e.ns, node.ns) and overlap(e.node, name) for e in profiles)
-            sides[0 if has_one else 1].append(node)
+            has_profile = any(
+                overlap(profile.ns, node.ns) and overlap(profile.node, name) for profile in profiles
+            )
+            sides[0 if has_profile else 1].append(node)
         return sides
 
     def _proof_of_files(self) -> Proof:
@@ -1737,8 +1742,11 @@ class OpenRobot:
         near = tuple(filter(self._is_neighbour, running.processes))
         others = [process for process in running.processes if process not in near]
         running, now = replace(running, processes=near), self._shell.now()
-        found = process_findings(here, running, now=now, zone=self._shell.zone)
-        findings = [finding for finding in found if finding.severity > NOTE]
+        findings = [
+            finding
+            for finding in process_findings(here, running, now=now, zone=self._shell.zone)
+            if finding.severity > NOTE
+        ]
         present, known = (
             self._enclaves_with_process(running),
             self.observed or ObservedProcesses(self.domain),
@@ -1790,15 +1798,22 @@ class OpenRobot:
             except UnavailableError as error:
                 return Proof(_TALK, None, f"{error}")
             now = observation_from_json(value)
-            lost = _lost_endpoints(before, now, denied)
+            ended = self._ended_since(running)
+            unseen = [node for node in value["unseen"] if node["enclave"] not in missing]
             wrong = {
                 "denied": [
                     f"{right['enclave']} {right['right']} {right['name']}: {right['reason']}"
                     for right in value["denied"]
                 ],
                 "refused": [refused["enclave"] for refused in value["refused"]],
-                **self._unseen_nodes(value, before, lost, missing, running),
-                "gone": [f"{node} {endpoint}" for node in lost for endpoint in lost[node]],
+                "ended while the proof ran": [
+                    f"{node['node'] or node['enclave']} ({ended[node['enclave']]}; start it again, "
+                    f"or, if it does not always run, add --without {node['enclave']})"
+                    for node in unseen
+                    if node["enclave"] in ended
+                ],
+                "not seen": [self._unseen_text(node["node"], node["enclave"]) for node in unseen],
+                "gone": _lost_endpoints(before, now, denied),
                 "not judged": value["unjudged"],
                 "not done": ["the ROS graph kept changing"] if status else [],
             }
@@ -1819,39 +1834,14 @@ class OpenRobot:
                 return Proof(_TALK, True, f"{seen}{left}{but if denied else ''}{more}")
         return Proof(_TALK, False, reason)
 
-    def _unseen_nodes(
-        self,
-        audited: Mapping[str, Any],
-        before: Observation,
-        lost: Mapping[str, Sequence[str]],
-        missing: Sequence[str],
-        running: RunningProcesses,
-    ) -> dict[str, list[str]]:
-        """Return the nodes that were not seen, as text: those of ended processes, and others."""
-        seen = {*map(_node_name, observation_from_json(audited).nodes)}
-        unseen = {(node["node"], node["enclave"]) for node in audited["unseen"]}
-        unseen |= {
-            (name, node.enclaves[0])
-            for node in before.nodes
-            if (name := _node_name(node)) in lost and name not in seen
-        }
+    def _ended_since(self, running: RunningProcesses) -> dict[str, str]:
+        """Map enclaves to their processes that were ``running`` and have ended."""
         pids = {process.pid for process in ProcessTable().look(self._shell.now()).processes}
-        ended = {
+        return {
             enclave.name: process.label
             for process, enclave in self._secured(running)
             if process.pid not in pids
         }
-        texts: dict[str, list[str]] = {"ended while the proof ran": [], "not seen": []}
-        for node, enclave in sorted(unseen):
-            if enclave in ended:
-                text = (
-                    f"{node or enclave} ({ended[enclave]}; start it again, or, if it does not "
-                    f"always run, add --without {enclave})"
-                )
-                texts["ended while the proof ran"].append(text)
-            elif enclave not in missing:
-                texts["not seen"].append(self._unseen_text(node, enclave))
-        return texts
 
     def _unseen_text(self, node: str, enclave: str) -> str:
         """Return a node that an enclave has a profile for, and what to do if it does not exist."""
@@ -1904,18 +1894,21 @@ def _ended_processes(
     seen: Iterable[tuple[Process, ProcessOrigin]],
     observed: ObservedProcesses,
 ) -> list[ClosedProcess]:
-    """Return the last process of each enclave of nodes that ended while sros watched.
+    """Return the processes of nodes that ended while sros watched.
 
-    ``observed`` are the processes that stayed; a unit that starts one of them starts it alone.
+    Those of an enclave that had several commands are left out, because one of them may be another
+    program that took the node's name.  ``observed`` are the processes that stayed; a unit that
+    starts one of them starts it alone.
     """
     origins = {process.pid: origin for process, origin in seen}
     known = {*observed.units.values()}
     ended = assign(nodes, [process for process, _ in seen], observed.domain, {}, origins)
-    last = {process.enclave: process for process in ended.processes}
+    commands = Counter(process.enclave for process in ended.processes)
     return [
         process._replace(pid=0, unit="" if process.unit in known else process.unit)
-        for process in last.values()
-        if process.known_by != "elimination"  # many tools end while sros watches
+        for process in ended.processes
+        # Many tools end while sros watches, so elimination shows nothing.
+        if commands[process.enclave] == 1 and process.known_by != "elimination"
     ]
 
 
@@ -1964,18 +1957,15 @@ def _text(lines: Iterable[str]) -> str:
 
 def _lost_endpoints(
     before: Observation, now: Observation, denied: Iterable[DeniedRight]
-) -> dict[str, list[str]]:
-    """Map nodes to the endpoints, as text, that they had before and lack now, unless ``denied``."""
+) -> list[str]:
+    """Return the endpoints, as text, that nodes had before and lack now, unless ``denied``."""
     expected = {*_endpoints(before.nodes)} - {
-        (node, f"{way} {topic}")
+        f"{node} {way} {topic}"
         for right in denied
         for node in right.nodes
         for topic, way in right.endpoints
     }
-    lost: dict[str, list[str]] = {}
-    for node, endpoint in sorted(expected - {*_endpoints(now.nodes)}):
-        lost.setdefault(node, []).append(endpoint)
-    return lost
+    return sorted(expected - {*_endpoints(now.nodes)})
 
 
 def _node_name(node: ObservedNode) -> str:
@@ -1995,7 +1985,7 @@ def _under_name(node: ObservedNode, ns: str, name: str) -> ObservedNode:
     return replace(node, ns=ns, name=name, endpoints=frozenset(endpoints))
 
 
-def _endpoints(nodes: Iterable[ObservedNode]) -> Iterator[tuple[str, str]]:
+def _endpoints(nodes: Iterable[ObservedNode]) -> Iterator[str]:
     for node in nodes:
         for topic, way in node.endpoints:
-            yield _node_name(node), f"{way} {topic.replace(node.name, stable_name(node.name))}"
+            yield f"{_node_name(node)} {way} {topic.replace(node.name, stable_name(node.name))}"

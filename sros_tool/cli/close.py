@@ -200,9 +200,9 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
         pid += f", known by its {process.known_by}" if process.enclave not in closed.secured else ""
         if not process.pid:
             runs = process.enclave in closed.secured
-            pid = "started by another command than observed" if runs else "not running as observed"
-            ended = process.enclave in closed.observed.ended and not runs
-            pid = "has ended" if ended else pid
+            ended = process.enclave in closed.observed.ended
+            pid = "has ended" if ended else "not running as observed"
+            pid = "started by another command than observed" if runs else pid
         nodes = _nodes(policy, process.enclave)
         echo(f"  {process.enclave}: {pid}{nodes}: {how}")
     export = shlex.quote(str(robot.export.absolute()))
@@ -241,6 +241,10 @@ def _show_end(robot: OpenRobot, closed: Closing, *, apply: bool, holds: bool) ->
     from sros_tool.closing import COMMANDS
 
     folder, observed = shlex.quote(str(robot.folder)), closed.observed
+    ask = f"sros close {folder} --proof"
+    idle = closed.stopped if closed.secured else {*observed.ended}
+    if stopped := sorted(idle.intersection(closed.left)):
+        ask += "; what does not always run: " + " ".join(f"--without {name}" for name in stopped)
     for proof in closed.proofs:
         echo(f"{_ANSWERS[proof.holds]}: {proof.claim}: {proof.reason}")
     if closed.problems:
@@ -265,16 +269,12 @@ def _show_end(robot: OpenRobot, closed: Closing, *, apply: bool, holds: bool) ->
             stop = _started_together(processes)
             echo(f"stop {stop}, and start it with:" if stop else "start again with:")
             echo(f"  {command}")
-        echo(f"next: these commands, and then sros close {folder} --proof", err=True)
+        echo(f"next: these commands, and then {ask}", err=True)
     else:
-        ask = f"sros close {folder} --proof"
         steps = f"stop the robot, start each process by the commands in {robot.start / COMMANDS}"
         if closed.secured:
             stop = "" if closed.stopped.issuperset(closed.left) else "stop them, "
             steps = f"{stop}start them by the first commands in {robot.start / COMMANDS}"
-        if stopped := sorted(closed.stopped.intersection(closed.left) if closed.secured else ()):
-            ask += "; what does not always run: "
-            ask += " ".join(f"--without {name}" for name in stopped)
         if not closed.left:
             following = ask
         elif any(name in observed.units for name in closed.left):

@@ -869,7 +869,8 @@ def test_tools_that_ended_while_sros_watched(robot: Robot, monkeypatch: pytest.M
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert f"# /look has ended: COMMAND is what starts it\n{run_it} /look -- COMMAND" in commands
     assert f"# /tool\ncd /opt && {run_it} /tool -- /opt/tool 'a b'\n" in commands
-    robot.close("--apply", "--without", "/look", "--without", "/tool", status=1)
+    applied = robot.close("--apply", status=1).err
+    assert applied.endswith("run: --without /job --without /look --without /tool\n")
     assert robot.restarts == ["daemon-reload", "try-restart job.service"]
 
 
