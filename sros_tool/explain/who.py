@@ -7,12 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
+from sros_tool.dds.decision.access import is_open_to_unauthenticated
+from sros_tool.dds.decision.vendors import TESTED
 from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.governance import Governance
 from sros_tool.errors import KeystoreError, Note
 from sros_tool.explain.answer import Question, about_action, ask
 from sros_tool.explain.asking import taken_for_action
+from sros_tool.faults import REFUSE_STRANGERS
 from sros_tool.fleet.robots import Fleet
-from sros_tool.keystore.layout import enclave_names, is_original_keystore
+from sros_tool.keystore.layout import enclave_names, is_original_keystore, remedy_in_keystore
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import RightsSource, rights_by_domains
 from sros_tool.keystore.selection import likely_names, missing_enclave_error
@@ -297,7 +301,24 @@ def follow_reach(
         )
     reach = network.reach(enclave)
     notes = [note for note in source.notes if note.id != "rights.domains"]  # they are followed
+    if of_keystore and _admits_strangers(Keystore(source.path).governance):
+        refuse = remedy_in_keystore(source.path, f"Run {REFUSE_STRANGERS}.")
+        text = (
+            "processes without an identity may use some names, too, because the governance admits "
+            f"them: whom they influence is not followed. {refuse}"
+        )
+        notes.append(Note("explain.anybody", text))
     return FollowedReach(source.path, (*without, *questions), domain, reach, source.fleet, notes)
+
+
+def _admits_strangers(governance: Governance) -> bool:
+    """Return whether processes without an identity may use a name with any tested DDS vendor."""
+    return any(
+        is_open_to_unauthenticated(domain, rule, vendor)
+        for domain in governance.domain_access_rules
+        for rule in domain.topic_access_rules
+        for vendor in TESTED
+    )
 
 
 def _access_in_domain(unguarded_access: Iterable[Unguarded], domain: int) -> Iterator[Unguarded]:

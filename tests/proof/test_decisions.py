@@ -210,6 +210,8 @@ def test_who_may_what_counts_processes_without_an_identity(tmp_path: Path) -> No
         assert (who.status, refuse in who.err) == ((0, True) if is_open else (1, False))
         single = sros("explain", keystore, "/a", "publish", "/x", "--vendor", vendor).ok()
         assert (refuse in single.err) is is_open
+    reach = sros("explain", keystore, "--reach", "/a").ok()
+    assert "whom they influence is not followed" in reach.err and refuse in reach.err
     table = sros("view", keystore, "--format", "markdown").ok().out
     assert "| topic `/x` | everybody, even without an identity, `/a` |" in table
 
