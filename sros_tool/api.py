@@ -820,11 +820,11 @@ def _time_or_now(now: datetime | None) -> datetime:
     return now
 
 
-def _domain(given: int | None) -> int | None:
+def _domain(domain: int | None) -> int | None:
     """Return the ROS domain id; raise `UsageError` if it is not a valid id."""
     from sros_tool.dds.domains import DomainSet
 
-    return None if given is None else DomainSet.parse(str(given), "domain").only()
+    return None if domain is None else DomainSet.parse(str(domain), "domain").only()
 
 
 def _vendors(vendor: str, distribution: str) -> tuple[str, ...]:
@@ -840,8 +840,12 @@ def _vendors(vendor: str, distribution: str) -> tuple[str, ...]:
     return selected_vendors(vendor, named if vendor != ZENOH else ())
 
 
-def _policy(given: AnyPath | Policy) -> Policy:
-    return read_policy(given) if isinstance(given, str | PathLike) else given
+def _policy(policy_or_path: AnyPath | Policy) -> Policy:
+    return (
+        read_policy(policy_or_path)
+        if isinstance(policy_or_path, str | PathLike)
+        else policy_or_path
+    )
 
 
 def _keyring(
@@ -863,8 +867,8 @@ def _content(path: AnyPath) -> bytes:
     return read_bytes(Path(path), "file")
 
 
-def _no_string(parameter: str, given: Iterable[Item]) -> Iterable[Item]:
-    """Return ``given``; refuse a single string, which would be iterated letter by letter."""
-    if isinstance(given, str):
-        raise UsageError(f"{parameter} is one string", "", f"Pass a list: [{given!r}].")
-    return given
+def _no_string(parameter: str, items: Iterable[Item]) -> Iterable[Item]:
+    """Return ``items``; refuse a single string, which would be iterated letter by letter."""
+    if isinstance(items, str):
+        raise UsageError(f"{parameter} is one string", "", f"Pass a list: [{items!r}].")
+    return items

@@ -277,8 +277,8 @@ def _forced_text(
     return found
 
 
-def _have_same_value(one: str, other: str) -> bool:
-    return one.startswith(other) or other.startswith(one)
+def _have_same_value(first_text: str, second_text: str) -> bool:
+    return first_text.startswith(second_text) or second_text.startswith(first_text)
 
 
 def _moves(edges: Iterable[tuple[int, int]]) -> _Moves:
@@ -999,7 +999,11 @@ def _classes(edges: Iterable[tuple[int, Letters, int]]) -> tuple[_Class, ...]:
         letters = Letters(tuple(ranges))
         of = (by_letters[kind] for kind, has in zip(kinds, key, strict=True) if has)
         found.append(
-            _Class(letters, _best_letter(letters), _moves(each for some in of for each in some))
+            _Class(
+                letters,
+                _best_letter(letters),
+                _moves(letters for same_class in of for letters in same_class),
+            )
         )
     return tuple(sorted(found, key=lambda each: _letter_rank(each.best)))
 

@@ -157,7 +157,7 @@ def find_distribution(name: str) -> Distribution:
             "Name one of them.",
         )
     later = DISTRIBUTIONS[DISTRIBUTIONS.index(name) :]
-    like = next((each for each in SUPPORTED if each.name in later), SUPPORTED[-1])
+    like = next((supported for supported in SUPPORTED if supported.name in later), SUPPORTED[-1])
     return like if like.name == name else like._replace(stands_for=name)
 
 
@@ -184,8 +184,18 @@ def selected_vendors(vendor: str, distributions: Sequence[Distribution]) -> tupl
         UsageError: a distribution does not ship the vendor.
     """
     if not vendor or not distributions:
-        chosen = [each for known in distributions for each in known.vendors]
-        return (vendor,) if vendor else tuple(dict.fromkeys(each.value for each in chosen))
+        chosen = [
+            vendor_of_distribution
+            for known in distributions
+            for vendor_of_distribution in known.vendors
+        ]
+        return (
+            (vendor,)
+            if vendor
+            else tuple(
+                dict.fromkeys(vendor_of_distribution.value for vendor_of_distribution in chosen)
+            )
+        )
     shipped = (known.shipped_vendor_product(Vendor(vendor)).vendor.value for known in distributions)
     return tuple(dict.fromkeys(shipped))
 
@@ -203,7 +213,7 @@ def unknown_distribution(environment: Mapping[str, str]) -> list[Note]:
     text = (
         f"{ROS_DISTRO} is {name!r}, which sros does not know; sros decides as if it were not set. "
     )
-    return [Note("distribution.unknown", f"{text}Name the one that is sourced, such as jazzy.")]
+    return [Note("distribution.unknown", f"{text}Name the sourced distribution, such as jazzy.")]
 
 
 def _decided_as(product: str, version: str) -> Vendor:

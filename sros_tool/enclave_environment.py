@@ -166,7 +166,7 @@ def loadable_environment(
     if rmw:
         variables[RMW] = rmw
     notes = () if target else tuple(unknown_distribution(environment))
-    if wanted is None and any(other != domain for other in domains or ()):
+    if wanted is None and any(other_domain != domain for other_domain in domains or ()):
         text = (
             f"a process in enclave {name} may run in any of the domains {domains}, and runs in "
             f"{domain}: for another one, add --domain ID."

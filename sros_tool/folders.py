@@ -160,7 +160,7 @@ class Folder:
         except (OSError, ValueError, KeystoreError) as error:
             if isinstance(error, FileNotFoundError) and not os.path.lexists(self.path / path):
                 raise
-        real, top = (os.path.realpath(each) for each in (self.path / path, self.path))
+        real, top = (os.path.realpath(folder_path) for folder_path in (self.path / path, self.path))
         if not Path(real).is_relative_to(top):
             raise KeystoreError(
                 f"'{self.path / path}' is a link out of '{self.path}'",
@@ -354,9 +354,9 @@ class Folder:
             self.forget()
         return self._find(path)
 
-    def _two_places(self, one: str, other: str) -> tuple[int, str, int, str]:
+    def _two_places(self, first_path: str, second_path: str) -> tuple[int, str, int, str]:
         """Return `_folder_and_name` of two paths, whose folders stay open together."""
-        return (*self._folder_and_name(one), *self._find(other))
+        return (*self._folder_and_name(first_path), *self._find(second_path))
 
     def _find(self, path: str) -> tuple[int, str]:
         folder, _, name = path.rpartition("/")

@@ -156,7 +156,7 @@ class SecuredOption:
             "--secured",
             nargs=2,
             metavar=("KEYSTORE", "POLICY_FILE"),
-            help="Start each node in the enclave of KEYSTORE that POLICY_FILE names, by sros.",
+            help="Start each node, by sros, in the enclave of KEYSTORE that POLICY_FILE names.",
         )
 
     def prestart(self, args: Namespace) -> None:

@@ -230,7 +230,7 @@ class Network:
         joined = _domains_by_enclave(by_domains) if opened else {}
         for each, enclave in product(opened, everybody):
             outside = sorted({*each.without, *ignored})
-            met = tuple(other for other in outside if overlap(other, each.topic))
+            met = tuple(expression for expression in outside if overlap(expression, each.topic))
             if each.topic in met:
                 continue
             for domains in joined.get(enclave, (None,)) if each.join_needs_right else (None,):
@@ -301,10 +301,10 @@ class Network:
             if like in followed:
                 continue
             followed.add(like)
-            for other in others.possibly_overlapping(end.topic):
-                if other.enclave in known:
+            for reached in others.possibly_overlapping(end.topic):
+                if reached.enclave in known:
                     continue
-                writer, reader = (end, other) if forward else (other, end)
+                writer, reader = (end, reached) if forward else (reached, end)
                 if name := self._carried_topic(writer, reader):
                     yield _hop(writer, reader, name)
 
@@ -317,7 +317,7 @@ class Network:
             return _shared_topic(writer, reader)
         passing = self._passing[receiving].possibly_overlapping(writer.topic)
         names = (
-            _shared_topic(writer, reader, given) for given in passing if given.enclave == sending
+            _shared_topic(writer, reader, passed) for passed in passing if passed.enclave == sending
         )
         return next(filter(None, names), "")
 
@@ -332,17 +332,17 @@ def _domains_by_enclave(rights: DomainRights) -> dict[str, list[DomainSet | None
 
 
 def _common_domain_set(
-    one: DomainSet | None, other: DomainSet | None
+    first: DomainSet | None, second: DomainSet | None
 ) -> tuple[DomainSet | None] | tuple[()]:
     """Return the ROS domains that two sets have in common, in a tuple; () if there are none."""
-    if one is None or other is None or one is other:
-        return (other if one is None else one,)
-    return _common_domains(one, other)
+    if first is None or second is None or first is second:
+        return (second if first is None else first,)
+    return _common_domains(first, second)
 
 
 @lru_cache(maxsize=4096)
-def _common_domains(one: DomainSet, other: DomainSet) -> tuple[DomainSet] | tuple[()]:
-    common = one & other
+def _common_domains(first: DomainSet, second: DomainSet) -> tuple[DomainSet] | tuple[()]:
+    common = first & second
     return (common,) if common.ranges else ()
 
 

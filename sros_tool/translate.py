@@ -350,7 +350,9 @@ def _candidates(publish: Iterable[str], subscribe: Iterable[str]) -> Iterable[tu
     """
     requests_out, requests_in = (
         [name for name, _ in map(service_of, requests) if name]
-        for requests in ([each for each in of if each[:2] == "rq"] for of in (publish, subscribe))
+        for requests in (
+            [topic for topic in of if topic[:2] == "rq"] for of in (publish, subscribe)
+        )
     )
     for kind, end in (("actions", GOAL), ("services", "")):
         for right, services in zip(RIGHTS[kind], (requests_out, requests_in), strict=True):

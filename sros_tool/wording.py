@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 
-def counted(number: int, thing: str, things: str = "") -> str:
+def counted(number: int, noun: str, plural: str = "") -> str:
     """Return a number with its noun, like ``1 topic`` or ``2 topics``.
 
-    ``things`` is the plural where it is more than the noun with an *s*.
+    ``plural`` is needed if the plural is not the noun with an *s*.
     """
-    return f"{number} {thing if number == 1 else things or f'{thing}s'}"
+    return f"{number} {noun if number == 1 else plural or f'{noun}s'}"
 
 
 def first_few(

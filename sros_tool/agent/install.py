@@ -251,7 +251,7 @@ def _pinned(release: Release, pinned: frozenset[str]) -> Iterator[x509.Certifica
 
 
 def _check_lists(folder: Folder, enclaves: Mapping[str, Mapping[str, bytes]]) -> None:
-    """Raise `KeystoreError` if a revocation list in the release is older than the one here.
+    """Raise `KeystoreError` if a revocation list in the release is older than the list here.
 
     The owner of the folder can write anything into it, so only lists count that are signed by a CA
     which the release trusts.
@@ -270,7 +270,7 @@ def _check_lists(folder: Folder, enclaves: Mapping[str, Mapping[str, bytes]]) ->
         if sent is None or list_number(sent) <= number:
             has = "none" if sent is None else f"the number {list_number(sent)}"
             raise KeystoreError(
-                f"the revocation list for {name} in the release is older than the one here",
+                f"the revocation list for {name} in the release is older than the list here",
                 f"The current list has the number {number}, the release has {has}: revoked "
                 "enclaves would be trusted again. Either the server has an old copy, or the "
                 "keystore comes from a backup. Nothing was changed.",
@@ -350,7 +350,7 @@ def _check_not_older(folder: Folder, place: str, sent: OpenedEnclave, now: datet
         return
     same_authority = present.files.get(PERMISSIONS_CA_FILE) == sent.files.get(PERMISSIONS_CA_FILE)
     newer = [
-        f"its {what} is valid from {iso(here)}, the one in the release from {iso(there)}"
+        f"its {what} is valid from {iso(here)}, the {what} in the release from {iso(there)}"
         for what, here, there in (
             (
                 "certificate",
@@ -445,11 +445,13 @@ def _list_alone(folder: Folder, name: str, files: Mapping[str, bytes], now: date
     with suppress(SrosError, OSError):
         _check_place(folder, place)
         authorities = files.get(IDENTITY_CA_FILE, b"")
-        same = _content(folder, f"{place}/{IDENTITY_CA_FILE}") == authorities
+        same_authorities = _content(folder, f"{place}/{IDENTITY_CA_FILE}") == authorities
         path, sent = f"{place}/{CRL_FILE}", files.get(CRL_FILE, b"")
         newest = newest_list(sent, authorities)
         expiry = next_update(newest) if newest else None
-        fits = same and _had_certificate(folder, name) and _content(folder, path) != sent
+        fits = (
+            same_authorities and _had_certificate(folder, name) and _content(folder, path) != sent
+        )
         valid = newest and last_update(newest) <= now and (expiry is None or now < expiry)
         if fits and valid:
             change.write[path] = sent

@@ -242,8 +242,10 @@ class Systemd:
         except OSError as error:
             raise UnavailableError(what, f"{error.strerror or error}.") from error
         if done.returncode:
-            said = plain(" ".join((done.stderr or done.stdout).split()), _LONGEST_PATH)
-            raise UnavailableError(what, f"{said or f'Its exit status is {done.returncode}'}.")
+            error_text = plain(" ".join((done.stderr or done.stdout).split()), _LONGEST_PATH)
+            raise UnavailableError(
+                what, f"{error_text or f'Its exit status is {done.returncode}'}."
+            )
         return done.stdout
 
 

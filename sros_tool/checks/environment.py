@@ -132,7 +132,7 @@ OTHER_DISTRIBUTION = FindingKind(
     "runtime.other-distribution",
     WARNING,
     "ROS_DISTRO is none of the distributions that the keystore is for",
-    "`sros check` decided by the rules of the DDS that those distributions ship. Another "
+    "`sros check` decided by the rules of the DDS that the keystore's distributions ship. Another "
     "distribution can allow or deny other accesses, without any message.",
     "sros: `distributions` in the settings of a keystore, `distribution` in its fleet file.",
     "Source one of these distributions. Or check the other one, with `--upgrade-to` of `sros "
@@ -582,9 +582,9 @@ def _certificate_file_findings(document: ConfigurationDocument, variable: str) -
         if any(endpoint.is_encrypted() for endpoint in endpoints):
             wanted = needed if side == "listen" or document.tls.mutual else ()
             missing += [
-                each
-                for each in ("root_ca_certificate", *wanted)
-                if each not in document.tls.named and each not in missing
+                setting
+                for setting in ("root_ca_certificate", *wanted)
+                if setting not in document.tls.named and setting not in missing
             ]
     if missing:
         text = f"{variable} and {OVERRIDE} name no {', '.join(missing)}"

@@ -136,8 +136,8 @@ def _kinds(group: tuple[Finding, ...], fleet: Fleet) -> _Kinds:
             for text in (first.subject, first.text, first.file, first.remedy)
         ]
         same = (first.id, first.line, first.accepted, *texts)
-        for other in named:
-            texts = [with_robot_placeholder(text, other, "other") for text in texts]
+        for other_robot in named:
+            texts = [with_robot_placeholder(text, other_robot, "other") for text in texts]
         kinds[robot.name] = same, (first.id, first.line, first.accepted, *texts)
     return kinds
 

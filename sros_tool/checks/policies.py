@@ -368,7 +368,7 @@ def _differ_only_by_namespace(statement_a: _Statement, statement_b: _Statement) 
 
 
 def _candidates_text(candidates: Sequence[_Statement]) -> str:
-    texts = dict.fromkeys(f"{each.name} ({each.right.right})" for each in candidates)
+    texts = dict.fromkeys(f"{candidate.name} ({candidate.right.right})" for candidate in candidates)
     return f"perhaps you mean {' or '.join([*texts][:_NAMES_SHOWN])}, which nobody uses"
 
 
@@ -643,7 +643,7 @@ def _check_parameters_of_others(checked_policy: _CheckedPolicy) -> Iterator[Find
         reply = statement.allows and statement.right.right == "reply"
         if not (reply and service in PARAMETER_SERVICES):
             continue
-        if not any(covers(own, node) for own in nodes[enclave]):
+        if not any(covers(own_node, node) for own_node in nodes[enclave]):
             text = f"may serve {name}, and has no node {node}"
             yield statement.found(OTHER_NODES_PARAMETERS, text)
         elif is_expression(node):
@@ -723,7 +723,7 @@ def _different_common_part_cause(folder: str, lacking: Sequence[_Lacking]) -> Ca
     return Cause(
         f"the included '{folder}/node.xml' lacks rights that the one of this sros has",
         _denied_at_start(lacking),
-        f"'{folder}/node.xml' is included and differs from the one of this sros. Replace it: "
+        f"'{folder}/node.xml' is included and differs from the file of this sros. Replace it: "
         f"`mv {here} {old} && sros policies --copy {here}`. Files and changes of your own are then "
         f"in {old} only: copy them back.",
         len(lacking),
@@ -1127,7 +1127,7 @@ ROBOT_WRITTEN_OUT = FindingKind(
     "policy.robot-written-out",
     WARNING,
     "the name of a robot in place of its placeholder",
-    "sros takes the enclave for one of no robot: nothing delivers, renews or revokes it with the "
+    "For sros, the enclave belongs to no robot: nothing delivers, renews or revokes it with the "
     "robot.",
     "sros (placeholder {robot}).",
     "Write the path with the placeholder that the finding names.",
@@ -1269,7 +1269,11 @@ def _robots_in_unknown_groups(named: Collection[str], fleet: Fleet) -> str:
         for group in sorted({*robot.groups} - groups):
             close = get_close_matches(group, groups) if len(fleet.groups[group]) < 2 else []
             letters = _NUMBER.sub("", group)
-            if meant := sorted(each for each in close if _NUMBER.sub("", each) != letters):
+            if meant := sorted(
+                similar_group
+                for similar_group in close
+                if _NUMBER.sub("", similar_group) != letters
+            ):
                 clauses.append(f"{robot.name} (group {group}: perhaps {first_few(meant, 2)})")
         if not (robot.groups or for_all):
             clauses.append(f"{robot.name} (in no group)")
@@ -1301,9 +1305,9 @@ def _robots_on_one_domain(
     seen = {robot.domain: robot for robot in others or ()}
     for robot in robots:
         same = (seen.get(robot.domain), seen.get(None))
-        for other in seen.values() if robot.domain is None else same:
-            if other:
-                return other, robot
+        for other_robot in seen.values() if robot.domain is None else same:
+            if other_robot:
+                return other_robot, robot
         if others is None:
             seen[robot.domain] = robot
     return None
@@ -1448,7 +1452,9 @@ class NearNames:
         candidates = {
             candidate for key in set(_keys(name)) for candidate in self._by_key.get(key, ())
         }
-        return sorted(other for other in candidates if other != name and _is_near(name, other))
+        return sorted(
+            candidate for candidate in candidates if candidate != name and _is_near(name, candidate)
+        )
 
     def same_name_elsewhere(self, name: str) -> list[str]:
         """Return the sorted names that are ``name`` with a namespace more, or less, before it.
@@ -1491,10 +1497,10 @@ def _without_separators(name: str) -> str:
     return name.replace("_", "").replace("/", "").lower()
 
 
-def _is_near(one: str, other: str) -> bool:
-    if _without_separators(one) == _without_separators(other):
+def _is_near(first_name: str, second_name: str) -> bool:
+    if _without_separators(first_name) == _without_separators(second_name):
         return True
-    pairs = zip(_PARTS.split(one), _PARTS.split(other), strict=False)
+    pairs = zip(_PARTS.split(first_name), _PARTS.split(second_name), strict=False)
     different = [(a, b) for a, b in pairs if a != b]
     if len(different) != 1:
         return False

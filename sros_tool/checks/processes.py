@@ -206,7 +206,11 @@ def newer_files(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
         files = tuple(file for file in files if file.name in _LOADED_BY_ZENOH)
         files += (process.configuration,) if process.configuration else ()
     newer = [e.name for e in files if e.changed and e.changed > process.started]
-    gone = [each for each in enclave.lacking if any(each == file.name for file in files)]
+    gone = [
+        missing_file
+        for missing_file in enclave.lacking
+        if any(missing_file == file.name for file in files)
+    ]
     yield from (_plain_path(file) for file in newer)
     yield from (f"{file} (removed)" for file in gone)
     if not newer and not gone:

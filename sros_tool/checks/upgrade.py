@@ -87,7 +87,8 @@ VULNERABILITIES = FindingKind(
     "sros compares the latest release that each of the two distributions ships; `sros check "
     "runtime` looks at the libraries that processes have loaded.",
     "Advisories in the OSV format: those of sros, and of --advisories FILE.",
-    "Take new ones into account before the update. Against those that no release fixes, keep "
+    "Take new vulnerabilities into account before the update. Against vulnerabilities that no "
+    "release fixes, keep "
     "strangers out of the network.",
     prominent=True,
 )

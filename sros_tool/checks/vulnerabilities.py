@@ -23,7 +23,7 @@ KNOWN_VULNERABILITIES = FindingKind(
     WARNING,
     "a DDS with known vulnerabilities",
     "With some of them, anyone on the network can crash a process with one packet, also on a "
-    "secured robot. The version is the one of the library that the process has loaded.",
+    "secured robot. The version is from the library that the process has loaded.",
     "Advisories in the OSV format: those of sros, and of --advisories FILE.",
     "Upgrade the package of the library to a release with the fixes, and restart the processes. "
     "Against vulnerabilities that no release fixes, keep strangers out of the network.",
@@ -147,7 +147,7 @@ def _library_findings(
 ) -> Iterator[Finding]:
     """Yield one finding for each library; ``users`` maps it to clauses on where it is used."""
     used = shipped_advisories() if advisories is None else advisories
-    said: dict[str, str] = {}
+    clause_by_text: dict[str, str] = {}
     for library, clauses in users.items():
         if not any(advisory.product == library.product for advisory in used):
             continue
@@ -165,7 +165,7 @@ def _library_findings(
             described = _counted_vulnerabilities(known.known, library.version)
             if known.unclear:
                 described += f". {_unclear(known.unclear)}"
-            if (first := said.setdefault(f"{name}: {described}", place)) != place:
+            if (first := clause_by_text.setdefault(f"{name}: {described}", place)) != place:
                 described = f"with the same vulnerabilities as {first}"
             text = f"{place}{by}, {described}"
             yield kind.found(name, text, remedy=_remedy(kind, library))

@@ -275,8 +275,8 @@ def _finding_at(
 
 
 def _link_findings(document: ConfigurationDocument) -> Iterator[Finding]:
-    both = (("listen", document.listen), ("connect", document.connect))
-    for what, endpoints in both:
+    endpoint_kinds = (("listen", document.listen), ("connect", document.connect))
+    for what, endpoints in endpoint_kinds:
         for endpoint in endpoints:
             allowed = document.protocols is None or endpoint.protocol in document.protocols
             if not allowed:
@@ -288,7 +288,9 @@ def _link_findings(document: ConfigurationDocument) -> Iterator[Finding]:
                 default = "" if f"{what}/endpoints" in document.lines else ", by default"
                 text = f"{what} has {endpoint.text}{default}"
                 yield _finding_at(document, PLAIN_ENDPOINT, f"{what}/endpoints", text)
-    if not any(endpoint.is_encrypted() for _, endpoints in both for endpoint in endpoints):
+    if not any(
+        endpoint.is_encrypted() for _, endpoints in endpoint_kinds for endpoint in endpoints
+    ):
         return
     if document.protocols is None or set(document.protocols) - ENCRYPTED:
         text = f"the protocols are {_protocols_text(document)}"
@@ -430,7 +432,9 @@ def _denial_findings(document: ConfigurationDocument) -> Iterator[Finding]:
         if not denials:
             continue
         limit.spend(_COMPARISON * len(access.subjects))
-        others = [other for other in access.subjects if other.overlaps(subject)]
+        others = [
+            other_subject for other_subject in access.subjects if other_subject.overlaps(subject)
+        ]
         for rule in denials:
             for kind, text in (
                 (DENY_IN_WILDCARD, _wildcard_that_circumvents(rule, subject, access, limit)),
@@ -463,7 +467,7 @@ def _wildcard_that_circumvents(
                     if _values_intersect(wide, key, limit)
                 ]
             for wide, by in passing:
-                if not any(includes(other, wide) for other in denied):
+                if not any(includes(denied_expression, wide) for denied_expression in denied):
                     return (
                         f"{flow} {message} of {key} is denied, but {by} allows {message} of {wide}"
                     )

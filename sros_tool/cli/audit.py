@@ -210,8 +210,8 @@ def audit(
         echo(_TO_ALLOW, err=True)
     elif patch is not None:
         stays = f"; the earlier '{patch}' stays" if existed else ""
-        said = "no patch is needed" if audited.allowed else _NO_PATCH
-        echo(said + stays, err=True)
+        patch_remark = "no patch is needed" if audited.allowed else _NO_PATCH
+        echo(patch_remark + stays, err=True)
     return 0 if fine else 1
 
 
@@ -277,4 +277,4 @@ def _show(audited: Audit, enclaves: AuditedEnclaves, changing_seconds: float) ->
         verdict += f"; the ROS graph kept changing for {changing_seconds:.0f} s"
     echo(verdict, err=True)
     if any(denied_right.by_rule for denied_right in audited.denied):
-        echo("some of it is denied by a DENY, which no added right overrides", err=True)
+        echo("some rights are denied by a DENY, which no added right overrides", err=True)

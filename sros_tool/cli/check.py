@@ -596,7 +596,9 @@ def _findings(family: str, paths: tuple[Path, ...], circumstances: Circumstances
                 "Go to the folder of the keystore, or name its path.",
             )
         roots = paths or (keystore_from_environment(),)
-        findings = [each for root in roots for each in findings_in_keystore(root, circumstances)]
+        findings = [
+            finding for root in roots for finding in findings_in_keystore(root, circumstances)
+        ]
         return [*findings, *findings_between_folders(roots, circumstances)]
     if paths:
         return path_findings(paths, circumstances)
@@ -679,7 +681,10 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
         print_json(expiring_enclaves(found))
     else:
         lines = [describe_lifetime(enclave, moment) for enclave in found.due]
-        lines += [f"{other.name}  unknown: {other.error}" for other in found.unreadable]
+        lines += [
+            f"{unreadable_enclave.name}  unknown: {unreadable_enclave.error}"
+            for unreadable_enclave in found.unreadable
+        ]
         none = "the 1 enclave does not need" if found.lasting == 1 else ""
         none = f"{none or f'none of {found.lasting} enclaves needs'} to be renewed ({text})"
         if found.short_lived and not found.lasting:
@@ -691,8 +696,8 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
         else:
             for line in lines:
                 echo(line)
-            for said in filter(None, ("" if lines else none, left_out)):
-                echo(said, err=True)
+            for remark in filter(None, ("" if lines else none, left_out)):
+                echo(remark, err=True)
     return NOT_DONE if found.unreadable else 1 if found.due else 0
 
 

@@ -54,7 +54,8 @@ def _run(words: Sequence[str], shows_output: bool) -> tuple[int, str, str]:
     "--for",
     "duration",
     metavar="DURATION",
-    help="Watch the robot for DURATION, such as 5m, or watch it again. [default: until the ROS "
+    help="Watch the robot for DURATION, such as 5m, even if it was watched before. [default: "
+    "until the ROS "
     "graph stops changing]",
 )
 @click.option(
@@ -73,14 +74,14 @@ def _run(words: Sequence[str], shows_output: bool) -> tuple[int, str, str]:
     "--without",
     metavar="ENCLAVE",
     multiple=True,
-    help="Accept that no process of ENCLAVE runs; repeat it for others.",
+    help="Accept that no process of ENCLAVE runs. Can be repeated.",
 )
 @click.option(
     "--elsewhere",
     metavar="ENCLAVE",
     multiple=True,
-    help="Remember that ENCLAVE belongs to another machine, such as a laptop, and keep its key out "
-    "of the export; repeat it for others.",
+    help="Remember that ENCLAVE belongs to another machine, such as a laptop, and keep its key "
+    "out of the export. Can be repeated.",
 )
 @dry_run_option
 @json_option
@@ -102,7 +103,7 @@ def close(
     Watches the robot on DDS or Zenoh, and writes into FOLDER its policy, requirements that hold
     now, a production keystore with an enclave for each process, an export of the enclaves without
     CA keys, and the files that start each process with security. Each step is a command, which is
-    printed. Existing files are kept: edit policy.xml and requirements.toml, and run it again.
+    printed. Existing files are kept: edit policy.xml and requirements.toml, and run the verb again.
 
     Nothing is closed before --apply, which restarts the processes that are systemd units, and
     shows the commands for all others. --proof checks that every process was started in its enclave,

@@ -527,7 +527,7 @@ def _certify(
 @verb("import")
 @click.argument("answer", type=PATH)
 @keystore_argument("folder", "[DIR]")
-@click.option("--force", is_flag=True, help="Accept an older answer, or one from other CAs.")
+@click.option("--force", is_flag=True, help="Accept an older answer, or an answer from other CAs.")
 @click.option(
     "--ca",
     "pin",

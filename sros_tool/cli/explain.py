@@ -403,7 +403,7 @@ def _notes_on_past(moment: datetime, root: Path | None) -> Iterator[Note]:
         with suppress(SrosError):
             entries = Keystore(root).ledger.entries
             changes = sum(entry.time > iso(moment) for entry in entries)
-    text = "today's files decide, as if it were that time: they do not tell what was allowed then"
+    text = "the current files decide for that time: they do not show what was allowed then"
     if changes:
         text += f"; {counted(changes, 'entry', 'entries')} of ledger.jsonl are later"
     yield Note("explain.past", text)
@@ -680,9 +680,20 @@ def _table_lines(compared: Comparison) -> Iterator[str]:
         (answer.vendor.title, "", answer, " (as documented)" if answer.as_documented else "")
         for answer in compared.vendors or ()
     ]
-    for each in compared.distributions or ():
-        remark = "" if each.measured else f" (assumed to decide as {each.decided_as.title})"
-        rows.append((each.shipped.distribution.title, f"  {each.release}", each.answer, remark))
+    for explanation in compared.distributions or ():
+        remark = (
+            ""
+            if explanation.measured
+            else f" (assumed to decide as {explanation.decided_as.title})"
+        )
+        rows.append(
+            (
+                explanation.shipped.distribution.title,
+                f"  {explanation.release}",
+                explanation.answer,
+                remark,
+            )
+        )
     widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
     for name, release, answer, remark in rows:
         row = f"{name:{widths[0]}}{release:{widths[1]}}"
@@ -1099,5 +1110,5 @@ def _finding_lines(finding: LogFinding) -> Iterator[str]:
     source = finding.dds.title.split()[0] + " DDS" if finding.dds else "ROS 2"
     source = _ZENOH_TITLE if finding.zenoh else source
     yield f"  means     {source}{of}: {finding.cause}"
-    yield from (f"  found     {each}" for each in finding.found)
+    yield from (f"  found     {cause}" for cause in finding.found)
     yield f"  remedy    {finding.remedy}"

@@ -408,8 +408,8 @@ _VALIDITIES = {
 @click.option(
     "--new-folder",
     is_flag=True,
-    help="Publish to PUB although it lacks everything that the keystore published before: it is "
-    "a new folder, or replaces one that was lost.",
+    help="Publish to PUB although it lacks everything that the keystore published before: it is a "
+    "new folder, or replaces a lost folder.",
 )
 @dry_run_option
 @json_option
@@ -432,9 +432,9 @@ def _publish(
     for example each hour. Archives of unchanged robots stay; archives of robots that were revoked
     or left the fleet are removed.
 
-    The keys are in KEYSTORE/private. The root key only signs the list of the other keys. Move this
-    key away from the keystore. Name it with --root-key to replace a key, and once a year to renew
-    that list.
+    The keys are in KEYSTORE/private. The root key only signs the list of the other keys.  Move the
+    root key away from the keystore.  Name it with --root-key to replace a key, and once a year to
+    renew the list of keys.
 
     Example:
       $ sros fleet publish keystore pub

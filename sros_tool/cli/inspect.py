@@ -157,7 +157,7 @@ def _show_history(root: Path, policy: Path | None, as_json: bool) -> int:
     if policy:
         from sros_tool.policy.document import read_policy
 
-        digests = {each.digest for each in read_policy(policy, placeholders=True).enclaves}
+        digests = {enclave.digest for enclave in read_policy(policy, placeholders=True).enclaves}
         signed = tuple(item for item in found.entries if item.entry.policy in digests)
         found = found._replace(entries=signed)
     if as_json:
@@ -244,10 +244,10 @@ def _authority_lines(role: str, authority: AuthorityFile | UnreadableFile) -> It
         f"  {role} CA {_authority_name(first.subject, first.sha256)}, {first.key}, {key}, "
         f"valid until {iso(first.not_after)}"
     )
-    for other in authority.file.further or ():
+    for further in authority.file.further or ():
         yield (
-            f"    next to it {_authority_name(other.subject, other.sha256)}, {other.key}, "
-            f"valid until {iso(other.not_after)}, serial {other.serial}"
+            f"    next to it {_authority_name(further.subject, further.sha256)}, {further.key}, "
+            f"valid until {iso(further.not_after)}, serial {further.serial}"
         )
     if crl := authority.file.crl:
         yield f"    {_list(crl)}"
@@ -293,9 +293,9 @@ def _certificate_file_lines(certificates: DescribedCertificates) -> Iterator[str
     file = certificates.file
     yield f"{'CA certificate' if file.first.is_ca else 'certificate'} {certificates.path}"
     yield from _indented(_certificate_lines(file.first))
-    for other in file.further or ():
+    for further in file.further or ():
         yield "next to it, in the same file"
-        yield from _indented(_certificate_lines(other))
+        yield from _indented(_certificate_lines(further))
     if file.crl:
         yield _list(file.crl)
 

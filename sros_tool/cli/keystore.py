@@ -819,7 +819,7 @@ def update_keystore(
     }
     flags = ("--next", *(["--allow-looser"] * allow_looser))
     flags += ("--revoke-old",) * (revoke_old and domain is not None)
-    words = [each for name, given in options.items() for one in given for each in (name, one)]
+    words = [word for name, given in options.items() for value in given for word in (name, value)]
     again = " ".join(map(quote, ("sros", "update_keystore", str(root), *words, *flags)))
     _show_update(update, undone, again, as_json)
     refused = bool(update.looser) and not allow_looser

@@ -159,8 +159,8 @@ def _replaced_lines(result: Changed, *, has_new_keys: bool) -> Iterator[str]:
         )
     if has_new_keys and result.outcomes and publish_command(result.root):
         yield (
-            "a release has no keys, so bring the new ones to robots that fetch by hand, after "
-            "publishing: "
+            "a release has no keys: after publishing, bring the new keys by hand to robots that "
+            "fetch: "
             f"`sros distribute_key {quote(str(result.root))} --robot NAME FOLDER --force`"
         )
 
@@ -358,11 +358,11 @@ def _list_lines(lists: Sequence[RevocationList], names: Mapping[str, str]) -> It
     for entry in newest.revoked:
         serial = f"{entry.serial:x}"
         yield f"  {serial}  {iso(entry.date)}  {entry.reason}  {names.get(serial, '')}".rstrip()
-    for other in others:  # of the other CA during a rotation
+    for other_list in others:  # of the other CA during a rotation
         yield (
-            f"next to it, list {other.number} of the other CA, "
-            f"{subject_text(other.list.issuer)}, until {iso(other.next_update)}: "
-            f"{len(other.revoked)} revoked"
+            f"next to it, list {other_list.number} of the other CA, "
+            f"{subject_text(other_list.list.issuer)}, until {iso(other_list.next_update)}: "
+            f"{len(other_list.revoked)} revoked"
         )
 
 

@@ -229,8 +229,8 @@ def _observer_error(error: ObserverError, environment: dict[str, str]) -> SrosEr
         plain_text,
     )
 
-    said = f"{error.output}\n{error.reason}"
-    if line := missing_security(said):
+    error_text = f"{error.output}\n{error.reason}"
+    if line := missing_security(error_text):
         return UnavailableError(
             "the DDS of this rclpy was built without DDS Security, so it cannot observe a secured "
             "robot",
@@ -242,7 +242,7 @@ def _observer_error(error: ObserverError, environment: dict[str, str]) -> SrosEr
     name = environment.get(ENCLAVE) or os.environ.get(ENCLAVE) or "/"
     is_by_shell = ENABLE not in environment and os.environ.get(ENABLE) == "true"
     by_shell = f", in which it runs because {ENABLE} is set" if is_by_shell else ""
-    if line := endpoint_refusal(said):
+    if line := endpoint_refusal(error_text):
         return SrosError(
             f"the enclave {name} does not permit an observer{by_shell}",
             f"DDS says: {line}",
@@ -250,7 +250,7 @@ def _observer_error(error: ObserverError, environment: dict[str, str]) -> SrosEr
             "policies`), for an "
             "enclave named /sros_observer.",
         )
-    if line := participant_refusal(said):
+    if line := participant_refusal(error_text):
         return SrosError(
             f"DDS refuses the enclave {name}{by_shell}",
             f"DDS says: {line}",

@@ -119,8 +119,10 @@ def merge_policy(
         check_output(output, force=force)
     additions = [read_policy(path) for path in others]
     if nodes:
-        additions = [policy_of_nodes(other, nodes) for other in additions]
-        there = {p.node for other in additions for e in other.enclaves for p in e.all_profiles()}
+        additions = [policy_of_nodes(addition, nodes) for addition in additions]
+        there = {
+            p.node for addition in additions for e in addition.enclaves for p in e.all_profiles()
+        }
         if missing := [node for node in nodes if node not in there]:
             raise UsageError(
                 f"--node {missing[0]}: no policy to merge has a node of this name",
@@ -130,10 +132,10 @@ def merge_policy(
     if namespace is not None:
         if problem := namespace_problem(namespace):
             raise UsageError(f"--namespace {namespace!r}: {problem}", "", "Write it as /left.")
-        additions = [policy_in_namespace(other, namespace) for other in additions]
+        additions = [policy_in_namespace(addition, namespace) for addition in additions]
     if enclave is not None:
         check_enclave_name(enclave)
-        additions = [policy_in_enclave(other, enclave) for other in additions]
+        additions = [policy_in_enclave(addition, enclave) for addition in additions]
     merged = merge_all(policy, additions)
     if merged.added and (output is None or output.parent.resolve() == policy.parent.resolve()):
         from sros_tool.graph.learn import with_common_parts
@@ -380,8 +382,14 @@ def domain_lines(difference: SourcesDifference, fleet: Fleet | None) -> list[str
     from sros_tool.fleet.robots import folded
 
     sides = [
-        [(each.enclave, f"- {each.enclave} in domain {each.a}") for each in difference.domains],
-        [(each.enclave, f"+ {each.enclave} in domain {each.b}") for each in difference.domains],
+        [
+            (enclave_domains.enclave, f"- {enclave_domains.enclave} in domain {enclave_domains.a}")
+            for enclave_domains in difference.domains
+        ],
+        [
+            (enclave_domains.enclave, f"+ {enclave_domains.enclave} in domain {enclave_domains.b}")
+            for enclave_domains in difference.domains
+        ],
     ]
     return [text for lines in sides for text in folded(fleet, lines)]
 

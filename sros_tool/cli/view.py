@@ -258,7 +258,7 @@ def _format(form: str | None, output: Path | None, graphviz: bool) -> str:
         raise UsageError(
             f"view writes no {ending} files",
             "",
-            f"Let the name end with {', '.join(f'.{each}' for each in _FORMATS)}, or name the "
+            f"Let the name end with {', '.join(f'.{known}' for known in _FORMATS)}, or name the "
             "format with --format.",
         )
     chosen = chosen or "html"

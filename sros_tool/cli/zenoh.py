@@ -216,8 +216,8 @@ def zenoh(
         raise SystemExit(1)
 
 
-def _refuse_with_from(*given: object) -> None:
-    if any(given):
+def _refuse_with_from(*options: object) -> None:
+    if any(options):
         raise UsageError(
             "--from takes no keystore and no options of the network",
             "It reads one configuration, and changes nothing.",
@@ -369,11 +369,15 @@ def _configuration_lines(
         obeys = ", by rules that bind only itself" if rights.self_limiting else ""
         yield f"{_subject_text(rights)}{obeys}"
         for right in VERBS:
-            stated = [one for one in rights.rights if one.right == right]
-            for one in stated:
-                domain = "" if one.domain == "0" else f" (domain {one.domain})"
-                lacks = f" (of no use without {', '.join(one.lacks)})" if one.lacks else ""
-                yield f"  may {VERBS[right]} {one.name}{domain}{lacks}"
+            stated = [stated_right for stated_right in rights.rights if stated_right.right == right]
+            for stated_right in stated:
+                domain = "" if stated_right.domain == "0" else f" (domain {stated_right.domain})"
+                lacks = (
+                    f" (of no use without {', '.join(stated_right.lacks)})"
+                    if stated_right.lacks
+                    else ""
+                )
+                yield f"  may {VERBS[right]} {stated_right.name}{domain}{lacks}"
         yield from _key_lines("may also", rights.unsaid)
         yield from _key_lines("is denied, if no wildcard is used,", rights.denied)
 
@@ -428,7 +432,7 @@ def _untranslatable_notes(subjects: Sequence[RightsBehindRules]) -> Iterator[Not
                 f"ROS name states exactly: {keys}",
             )
     domains = sorted(
-        {one.domain for rights in subjects for one in rights.rights} - {"0", "*"}, key=int
+        {right.domain for rights in subjects for right in rights.rights} - {"0", "*"}, key=int
     )
     if domains:
         yield Note(

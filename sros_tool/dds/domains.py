@@ -142,10 +142,10 @@ class DomainSet:
         known = tuple(dict.fromkeys(sets))
         if len(known) == 1:
             return known
-        borders = {part.first or 0 for one in known for part in one.ranges}
-        borders |= {(part.last or 0) + 1 for one in known for part in one.ranges}
+        borders = {part.first or 0 for domain_set in known for part in domain_set.ranges}
+        borders |= {(part.last or 0) + 1 for domain_set in known for part in domain_set.ranges}
         for first, after in pairwise(sorted(borders)):
-            inside = tuple(first in one for one in known)
+            inside = tuple(first in domain_set for domain_set in known)
             if any(inside):
                 ranges.setdefault(inside, []).append((first, after - 1))
         return tuple(cls.of(*pairs) for pairs in ranges.values())
@@ -153,8 +153,8 @@ class DomainSet:
     def __and__(self, other: DomainSet) -> DomainSet:
         """Return the domains that two closed sets have in common."""
         common = (
-            (max(one.first or 0, two.first or 0), min(one.last or 0, two.last or 0))
-            for one in self.ranges
+            (max(own_range.first or 0, two.first or 0), min(own_range.last or 0, two.last or 0))
+            for own_range in self.ranges
             for two in other.ranges
         )
         return DomainSet.of(*(pair for pair in common if pair[0] <= pair[1]))

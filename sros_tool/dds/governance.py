@@ -131,10 +131,12 @@ class DomainRule:
 def _declared(rule: type[DomainRule | TopicRule]) -> tuple[Attribute, ...]:
     return tuple(
         Attribute(
-            each.name, **each.metadata, default=None if each.default is MISSING else each.default
+            attribute_field.name,
+            **attribute_field.metadata,
+            default=None if attribute_field.default is MISSING else attribute_field.default,
         )
-        for each in fields(rule)
-        if each.metadata
+        for attribute_field in fields(rule)
+        if attribute_field.metadata
     )
 
 

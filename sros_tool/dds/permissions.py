@@ -102,7 +102,7 @@ class Permissions(NamedTuple):
 
     def grant_of(self, subject: str) -> Grant | None:
         """Return the first grant for a subject, or None."""
-        return next((each for each in self.grants if each.subject == subject), None)
+        return next((grant for grant in self.grants if grant.subject == subject), None)
 
 
 def grant(name: str, subject: str, validity: Window, rules: tuple[Rule, ...]) -> Grant:
@@ -123,18 +123,18 @@ def render_permissions(permissions: Permissions) -> bytes:
         f'<dds xmlns:xsi="{XSI}" xsi:noNamespaceSchemaLocation="{_SCHEMA}">',
         "  <permissions>",
     ]
-    for each in permissions.grants:
+    for grant in permissions.grants:
         lines += [
-            f"    <grant name={quoted(each.name)}>",
-            f"      <subject_name>{escape(each.subject)}</subject_name>",
+            f"    <grant name={quoted(grant.name)}>",
+            f"      <subject_name>{escape(grant.subject)}</subject_name>",
             "      <validity>",
-            f"        <not_before>{escape(each.not_before)}</not_before>",
-            f"        <not_after>{escape(each.not_after)}</not_after>",
+            f"        <not_before>{escape(grant.not_before)}</not_before>",
+            f"        <not_after>{escape(grant.not_after)}</not_after>",
             "      </validity>",
         ]
-        for rule in each.rules:
+        for rule in grant.rules:
             _write_rule(lines, rule)
-        default = "ALLOW" if each.default_allow else "DENY"
+        default = "ALLOW" if grant.default_allow else "DENY"
         lines += [f"      <default>{default}</default>", "    </grant>"]
     lines += ["  </permissions>", "</dds>", ""]
     document = "\n".join(lines).encode()
@@ -354,7 +354,9 @@ Meets = Callable[[str], bool]
 
 def _meets_text(names: Sequence[str]) -> Meets:
     """Return a predicate: the text of an expression matches one of ``names``, or the reverse."""
-    return lambda name: any(fnmatchcase(each, name) or fnmatchcase(name, each) for each in names)
+    return lambda name: any(
+        fnmatchcase(other_name, name) or fnmatchcase(name, other_name) for other_name in names
+    )
 
 
 def portability_problems(
@@ -407,7 +409,11 @@ def _topics(criteria: Iterable[Criteria]) -> tuple[str, ...]:
 
 def _blocked_by_denials(denied: list[str], denied_too: set[str], is_allowed: Meets) -> list[str]:
     """Return the denied expressions that share a name with one allowed in the other direction."""
-    return [each for each in denied if each not in denied_too and is_allowed(each)]
+    return [
+        expression
+        for expression in denied
+        if expression not in denied_too and is_allowed(expression)
+    ]
 
 
 _FEW_PARTS = 20

@@ -391,7 +391,7 @@ def _types_not_heard(node: HandNode, environment: Mapping[str, str]) -> str:
         return ""
     lacks = built_without_security(rmw, environment)
     but = "was built without security here" if lacks else "needs --backend rclpy"
-    return f"secured nodes on {rmw} and this one do not hear each other; {rmw} {but}"
+    return f"secured nodes on {rmw} and this node do not hear each other; {rmw} {but}"
 
 
 def run_by_hand(node: HandNode, say: Callable[[str], None]) -> int:

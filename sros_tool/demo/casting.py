@@ -389,8 +389,8 @@ def _best_cast(
         lent = next(((g, a) for g, a in nested if a in talkers and g not in talkers), None)
         if lent and not set(lent) & set(pair):
             cast["guest"], cast["admin"] = lent
-        both = talkers & listeners
-        score = len(cast) + (cast.get("guest") not in talkers) - len(both & set(pair))
+        talking_listeners = talkers & listeners
+        score = len(cast) + (cast.get("guest") not in talkers) - len(talking_listeners & set(pair))
         score += 10 * (cast["listener"] in without_list)
         if score > best[0]:
             best = (score, cast, topic)
@@ -472,7 +472,7 @@ def _widest_enclaves(
             if not _allows_name(grant, right, name, named=True)
             or _allows_name(grant, right, DENIED_TOPIC)
         ]
-        tried = {cast[other] for other in others if other in cast}
+        tried = {cast[part] for part in others if part in cast}
         width = {enclave: _width(rights[enclave], right, name) for enclave in unnamed}
         free = [enclave for enclave in unnamed if enclave not in tried]
         if not free:

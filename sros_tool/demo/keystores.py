@@ -244,7 +244,11 @@ def _forgeries_of(scenario: Scenario) -> list[Forge | Undefended]:
         party.identity.keystore for row in scenario.rows for party in row.parties
     ]
     chosen = dict.fromkeys(used)
-    return [each for each in chosen if each is not None and not isinstance(each, SoundKeystore)]
+    return [
+        forgery
+        for forgery in chosen
+        if forgery is not None and not isinstance(forgery, SoundKeystore)
+    ]
 
 
 def _forge(

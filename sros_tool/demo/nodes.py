@@ -108,7 +108,9 @@ def parse_options(module: str, roles: Collection[str], arguments: Sequence[str])
         help="time to wait for a connection on Zenoh (default: %(default)s)",
     )
     parser.add_argument(
-        "--by-hand", action="store_true", help="report what others have on the topic, of any type"
+        "--by-hand",
+        action="store_true",
+        help="report other publishers and subscriptions on the topic, of any type",
     )
     parser.add_argument(
         "--type",

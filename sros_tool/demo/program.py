@@ -697,9 +697,11 @@ class _Runner:
             servers = [party for party in row.parties if party.role is Role.ACTION_SERVER]
             options += ["--server", self._text(index, servers[0])] if len(servers) == 1 else []
         if party.role is Role.OBSERVER:
-            for other in row.parties:
-                if other.role in (Role.TALKER, Role.SERVER) and (other.other_topic or other.topic):
-                    options += ["--also", plan.keystores.topic(other, plan.topic)]
+            for other_party in row.parties:
+                if other_party.role in (Role.TALKER, Role.SERVER) and (
+                    other_party.other_topic or other_party.topic
+                ):
+                    options += ["--also", plan.keystores.topic(other_party, plan.topic)]
         if plan.backend.on_zenoh:
             options += ["--size", str(party.size)] if party.size else []
             options += ["--patience", str(patience.connect)] if _is_refused(party, row) else []

@@ -115,8 +115,8 @@ def _signal_watch() -> Callable[[], bool]:
     ("Unable to convert call argument").
     """
     received: list[int] = []
-    for each in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(each, lambda number, _frame: received.append(number))
+    for signal_number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signal_number, lambda number, _frame: received.append(number))
     return lambda: bool(received)
 
 

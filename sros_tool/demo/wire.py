@@ -234,7 +234,7 @@ class _Injector:
 
 def packets_of(packets: Sequence[_CapturedPacket], ports: Collection[int]) -> list[_CapturedPacket]:
     """Return the captured packets that were sent from one of the ports, in order."""
-    return [each for each in packets if each.source in ports]
+    return [packet for packet in packets if packet.source in ports]
 
 
 def with_changed_bit(packet: bytes, later: int, place: int, places: int) -> bytes | None:

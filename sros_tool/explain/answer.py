@@ -152,7 +152,7 @@ def ask(word: str, name: str = "", kind: str | None = None) -> Question:
                 "The question is whether the enclave may join the domain.",
             )
         return Question(_JOIN)
-    fitting = [each for each in TYPES if (word, each) in _RIGHTS]
+    fitting = [kind_of_name for kind_of_name in TYPES if (word, kind_of_name) in _RIGHTS]
     chosen = kind or fitting[0]
     if chosen not in fitting:
         others = " or ".join(verb for verb, right in _RIGHTS if right == chosen)

@@ -83,7 +83,7 @@ class EnclaveNodes:
         return exact or frozenset(
             name
             for name, nodes in self.by_enclave.items()
-            if any(_is_of(node, each) for each in nodes)
+            if any(_is_of(node, named_node) for named_node in nodes)
         )
 
     @property
@@ -173,7 +173,7 @@ def audited_enclaves(
         )
     protection = load_template(DEFAULT_TEMPLATE).protection
     governance = governance_for(protection, DomainSet.of((context.domain, context.domain)))
-    policy = join_policies([read_policy_for(each, fleet) for each in paths])
+    policy = join_policies([read_policy_for(path, fleet) for path in paths])
     return policy_enclaves(policy, governance, vendor, context)
 
 
@@ -182,8 +182,8 @@ def policy_enclaves(
 ) -> AuditedEnclaves:
     """Return the enclaves of a policy, as if it were signed now with this governance."""
     nodes = {
-        each.path: tuple(expand("~", p.ns, p.node) for p in each.all_profiles())
-        for each in policy.enclaves
+        enclave.path: tuple(expand("~", p.ns, p.node) for p in enclave.all_profiles())
+        for enclave in policy.enclaves
     }
 
     def load(name: str) -> LoadedEnclave:

@@ -354,8 +354,10 @@ def _rights_by_profile(
     own = nodes_served((right.right, right.name) for right in rights)
     found: dict[tuple[str, str], set[NodeRight]] = {}
     (only,) = present if len(present) == 1 else (None,)
-    (one,) = own if len(own) == 1 else (None,)
-    rest = only or (_profile_of_node(one, present) if one and not present else _ANY_NODE)
+    (only_profile,) = own if len(own) == 1 else (None,)
+    rest = only or (
+        _profile_of_node(only_profile, present) if only_profile and not present else _ANY_NODE
+    )
     for right in rights:
         served = nodes_served([(right.right, right.name)])
         found.setdefault(_profile_of_node(served[0], present) if served else rest, set()).add(right)
@@ -365,7 +367,7 @@ def _rights_by_profile(
 def _profile_of_node(fqn: str, present: Iterable[tuple[str, str]]) -> tuple[str, str]:
     """Return namespace and name of the profile for the node ``fqn``, perhaps with wildcards."""
     ns, _, name = fqn.rpartition("/")
-    return next((each for each in present if covers(_full_name(each), fqn)), (ns or "/", name))
+    return next((place for place in present if covers(_full_name(place), fqn)), (ns or "/", name))
 
 
 def _full_name(profile: tuple[str, str]) -> str:

@@ -345,7 +345,7 @@ def _added_xml(right: Right, places: Iterable[tuple[str, str]]) -> str:
     namespace that contains the right's name.  Without places, the profile is for any node.
     """
     known = list(places)
-    fitting = [each for each in known if right.name.startswith(each[0].rstrip("/") + "/")]
+    fitting = [place for place in known if right.name.startswith(place[0].rstrip("/") + "/")]
     ns, node = max(fitting or known, key=lambda pair: len(pair[0]), default=_ANY_NODE)
     group = Group(right.kind, ((right.right, right.qualifier),), (right.name,))
     enclave = Enclave(right.enclave, (Profiles((Profile(ns, node, (group,)),)),))
@@ -424,7 +424,7 @@ def _similar_names(
     name: str, names: AbstractSet[str], is_service: bool, *, or_only: bool
 ) -> tuple[str, ...]:
     last = name.rpartition("/")[2]
-    same = sorted(other for other in names if other.rpartition("/")[2] == last)
+    same = sorted(other_name for other_name in names if other_name.rpartition("/")[2] == last)
     if (is_service and last in NODE_SERVICES) or 0 < len(same) <= _SHOWN:
         return tuple(same) if len(same) <= _SHOWN else ()
     if not names:

@@ -719,18 +719,19 @@ class _Examiner:
     def _other_node_cause(self, denial: Denial, answer: Answer) -> tuple[list[str], str]:
         """Return causes and a remedy if the permissions are for a node with another name."""
         node, nodes = serving_node(denial), _served_names(answer)
-        if node and not any(covers(each, node) for each in nodes):
+        if node and not any(covers(own_node, node) for own_node in nodes):
             enclaves = self._keystore.enclaves_for(node) if self._keystore else ()
-            this = f"the permissions are for {_listed_nodes(nodes)}, and " if nodes else ""
+            beginning = f"the permissions are for {_listed_nodes(nodes)}, and " if nodes else ""
             if enclaves:
                 return [
-                    f"{this}this is the node {node}, for which there is {_enclaves_text(enclaves)}"
+                    f"{beginning}this is the node {node}, for which there is "
+                    f"{_enclaves_text(enclaves)}"
                 ], (
                     f"Start it in the enclave that is for it: `sros run {quote(self._root)} "
                     f"{quote(enclaves[0])} -- COMMAND`."
                 )
             if nodes:
-                return [f"{this}this is the node {node}"], _renaming_advice(nodes, node)
+                return [f"{beginning}this is the node {node}"], _renaming_advice(nodes, node)
         if not nodes and (node or denial.topic in _TOPICS_OF_EVERY_NODE):
             return [f"the permissions lack {_EVERY_NODE}"], (
                 'Add <xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/> to the '
@@ -871,7 +872,7 @@ def _renaming_advice(nodes: Sequence[str], wrong: str) -> str:
         rules += f"-r {quote(name)}:__ns:={quote(ns or '/')}`"
         one = meant[0] if len(meant) == 1 else f"one of these names, such as {meant[0]}"
         start = (
-            f"The enclave is for several nodes. Rename this one alone to {one}: in its code or "
+            f"The enclave is for several nodes. Rename this node alone to {one}: in its code or "
             f"launch file, or with {rules}; `-r __node:=` would rename all nodes of the process"
         )
     return (

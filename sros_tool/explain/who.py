@@ -148,8 +148,12 @@ def names_meant(decider: Decider, question: Question, enclaves: Container[str]) 
         }
     )
     last = question.name.rpartition("/")[2]
-    same = [name for name in names if name.rpartition("/")[2] == last and not is_expression(name)]
-    meant = same or likely_names(question.name, [name for name in names if not is_expression(name)])
+    same_last_part = [
+        name for name in names if name.rpartition("/")[2] == last and not is_expression(name)
+    ]
+    meant = same_last_part or likely_names(
+        question.name, [name for name in names if not is_expression(name)]
+    )
     if not meant or question.name in meant:  # an enclave with the right cannot start now
         return None
     text = f"they may {question.word} {first_few(meant, 3)}: perhaps that is meant."

@@ -135,8 +135,8 @@ class FleetPolicy(Mapping[str, Enclave]):
             if has_placeholder(profile.ns):
                 ns = check_namespace(ns)  # in the root namespace it can be empty
             groups = []
-            for one in profile.groups:
-                group = self._group(one, robot, _MOST_NAMES - count)
+            for unfilled in profile.groups:
+                group = self._group(unfilled, robot, _MOST_NAMES - count)
                 count += len(group.names)
                 if count > _MOST_NAMES:
                     raise PolicyError(

@@ -485,7 +485,7 @@ class _Inventory:
         """Read a group; it inherits ``variables`` from the ``parent_groups`` that contain it."""
         self._step()
         if name in parent_groups or len(parent_groups) > _MOST_DEPTH:
-            raise self._error(f"the group {name} is in itself, or in too many others")
+            raise self._error(f"the group {name} contains itself, or is in too many other groups")
         if not isinstance(group, dict):
             group = {"hosts": group} if isinstance(group, list) else self._mapping(group, name)
         inside = (*parent_groups, name)

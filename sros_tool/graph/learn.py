@@ -501,7 +501,8 @@ def _needed_files(root: Path, part: str) -> dict[str, bytes]:
 _SHOWN = 5
 _TEXTS = {
     "ambiguous": "nodes with the same name run in several enclaves, and the graph does not show "
-    "which node runs in which enclave, so each of these enclaves gets the rights of all of them; "
+    "which node runs in which enclave, so each of these enclaves gets the rights of all these "
+    "nodes; "
     "to tell them apart, start one node at a time under --watch: {}",
     "changing-name": "nodes whose name changes with every start have a profile with a wildcard: {}",
     "half-service": "left out, because only the request or the reply of these services was "
@@ -939,9 +940,9 @@ def with_common_parts(path: Path, merged: bytes, others: Sequence[Policy]) -> by
     that denies something or states a protection.
     """
     if not any(
-        group.source.file != other.file
-        for other in others
-        for enclave in other.enclaves
+        group.source.file != merged_policy.file
+        for merged_policy in others
+        for enclave in merged_policy.enclaves
         for profile in enclave.all_profiles()
         for group in profile.groups
     ):

@@ -162,10 +162,10 @@ def _topic_pairs(
     rules = (*old.topic_access_rules, *new.topic_access_rules)
     expressions = list(dict.fromkeys(rule.topic_expression for rule in rules))
     # A name without wildcards is covered by what it overlaps with.
-    for one, other in combinations(filter(is_expression, expressions), 2):
-        parted = overlap(one, other) and not covers(one, other) and not covers(other, one)
+    for first, second in combinations(filter(is_expression, expressions), 2):
+        parted = overlap(first, second) and not covers(first, second) and not covers(second, first)
         # Which of the two decides depends on their order, so ask for a topic of both.
-        if parted and (name := common_name((one, other), absolute=False)):
+        if parted and (name := common_name((first, second), absolute=False)):
             expressions.append(name)
     before_of, after_of = _first_covering_rule(old), _first_covering_rule(new)
     for expression in expressions:
@@ -192,9 +192,9 @@ def _first_covering_rule(domain: DomainRule) -> Callable[[str], TopicRule | None
     return rule_for
 
 
-def _equal(rule: TopicRule, other: TopicRule) -> bool:
+def _equal(rule: TopicRule, second: TopicRule) -> bool:
     return all(
-        getattr(rule, attribute.name) == getattr(other, attribute.name)
+        getattr(rule, attribute.name) == getattr(second, attribute.name)
         for attribute in attributes(TopicRule)
     )
 
@@ -321,12 +321,12 @@ def _settings_changes(old: Template, new: Template, now: datetime) -> Iterator[S
         before, after = getattr(old, name), getattr(new, name)
         if before != after:
             effect = Effect.LOOSER if after == open_value else Effect.TIGHTER
-            one, other = _choice_text(key, before), _choice_text(key, after)
-            yield SettingChange(effect, key, one, other, words[effect is Effect.TIGHTER])
+            first, second = _choice_text(key, before), _choice_text(key, after)
+            yield SettingChange(effect, key, first, second, words[effect is Effect.TIGHTER])
     yield from _zenoh_changes(old.zenoh, new.zenoh)
     rotated = "applies to the CAs that `sros rotate_ca` makes"
     listed = "applies to the next revocation list, also of `sros crl --refresh`"
-    for key, one, other, meaning in (
+    for key, first, second, meaning in (
         (
             "authorities.validity",
             span_text(old.authority_validity),
@@ -341,8 +341,8 @@ def _settings_changes(old: Template, new: Template, now: datetime) -> Iterator[S
             listed,
         ),
     ):
-        if one != other:
-            yield SettingChange(Effect.LATER, key, one, other, meaning)
+        if first != second:
+            yield SettingChange(Effect.LATER, key, first, second, meaning)
 
 
 def _short_lived_changes(old: Template, new: Template) -> Iterator[SettingChange]:
@@ -357,20 +357,20 @@ def _short_lived_changes(old: Template, new: Template) -> Iterator[SettingChange
             continue
         longer = after is None or (before is not None and after > before)
         effect = Effect.LOOSER if longer else Effect.TIGHTER
-        one, other = (
+        first, second = (
             duration_text(lifetime) if lifetime else "as others" for lifetime in (before, after)
         )
         meaning = f"what is issued for {name} expires {'later' if longer else 'earlier'}"
-        yield SettingChange(effect, f"enclaves {name}.validity", one, other, meaning)
+        yield SettingChange(effect, f"enclaves {name}.validity", first, second, meaning)
 
 
 def _zenoh_changes(old: ZenohNetwork | None, new: ZenohNetwork | None) -> Iterator[SettingChange]:
     """Yield the changes of a Zenoh network's settings; None: the keystore has no network."""
     if old is None or new is None:
         if old != new:
-            one, other = (network.mode.value if network else "none" for network in (old, new))
+            first, second = (network.mode.value if network else "none" for network in (old, new))
             meaning = "enclaves get files for Zenoh" if new else "no files for Zenoh are kept"
-            yield SettingChange(Effect.LATER, "zenoh", one, other, meaning)
+            yield SettingChange(Effect.LATER, "zenoh", first, second, meaning)
         return
     for key, meaning in (
         ("router", "the other enclaves trust this enclave as the router"),
@@ -383,13 +383,13 @@ def _zenoh_changes(old: ZenohNetwork | None, new: ZenohNetwork | None) -> Iterat
     ):
         before, after = getattr(old, key), getattr(new, key)
         if before != after:
-            one, other = (
+            first, second = (
                 ",".join(map(str, setting)) or "(as usual)"
                 if isinstance(setting, tuple)
                 else str(setting)
                 for setting in (before, after)
             )
-            yield SettingChange(Effect.LATER, f"zenoh.{key}", one, other, meaning)
+            yield SettingChange(Effect.LATER, f"zenoh.{key}", first, second, meaning)
 
 
 _CHOICES = (

@@ -284,7 +284,7 @@ def shortened_problems(problems: Iterable[str]) -> tuple[str, ...]:
     """Return problems in the form of a confirmation: not too long, and not too many."""
     texts = []
     for problem in dict.fromkeys(problems):
-        text = "".join(each if each.isprintable() else "?" for each in problem)
+        text = "".join(character if character.isprintable() else "?" for character in problem)
         texts.append(text if len(text) <= LONGEST_PROBLEM else f"{text[: LONGEST_PROBLEM - 3]}...")
     more = len(texts) - MOST_PROBLEMS
     if more > 0:

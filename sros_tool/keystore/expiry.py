@@ -125,8 +125,10 @@ def expiring_enclaves(renewals: ExpiryCheck) -> ExpiringEnclaves:
 
     def due_enclave_values(lifetimes: Sequence[Lifetime]) -> list[DueEnclave]:
         return [
-            DueEnclave(each.name, each.certificate.not_after, each.permissions.not_after)
-            for each in lifetimes
+            DueEnclave(
+                lifetime.name, lifetime.certificate.not_after, lifetime.permissions.not_after
+            )
+            for lifetime in lifetimes
         ]
 
     return ExpiringEnclaves(

@@ -345,7 +345,7 @@ def left_enclave_notes(root: Path, before: Fleet, after: Fleet) -> Iterator[Note
     # Also what an earlier change of the fleet left.
     earlier = unrecorded_enclaves(before, enclave_names(root), left) if left else {}
     for name, enclaves in left.items():
-        enclaves.update(each for each in earlier[name].below if not robot_of(after, each))
+        enclaves.update(enclave for enclave in earlier[name].below if not robot_of(after, enclave))
         why = "has other enclave paths now" if name in after.robots else "is no longer in the fleet"
         stay = "stays" if len(enclaves) == 1 else "stay"
         shown = first_few(sorted(enclaves), _SHOWN)

@@ -500,7 +500,7 @@ class FleetStatus:
         publication = self.publication and self.publication.at(now)
         is_accepted = publication is None or bool(publication.accepted)
         to_do = tuple(robot.with_to_do(now, is_accepted=is_accepted) for robot in robots)
-        received = max((each.received for each in self.robots if each.received), default=None)
+        received = max((robot.received for robot in self.robots if robot.received), default=None)
         clock = clock_behind(self.keystore, now)
         clock = clock or behind_clause(now, received, "the last confirmation")
         if clock:  # nobody knows how old the confirmations are

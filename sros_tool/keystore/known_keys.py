@@ -233,7 +233,7 @@ class KnownKeys:
                 name: others
                 for name in names
                 for key in _digests(self._keystore, name)
-                if (others := [other for other in self._holders(key) if other != name])
+                if (others := [holder for holder in self._holders(key) if holder != name])
             }
         else:
             shared = {
@@ -241,7 +241,7 @@ class KnownKeys:
                 for enclaves in self._enclaves.values()
                 if len(enclaves) > 1
                 for name in enclaves
-                if (others := [other for other in enclaves if other != name])
+                if (others := [enclave for enclave in enclaves if enclave != name])
             }
         for name in names:
             if name in shared:

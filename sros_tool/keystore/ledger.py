@@ -702,11 +702,11 @@ class LedgerFile:
         gaps = (at for at, entry in zip(numbers, entries, strict=True) if entry.what == GAP)
         last_recorded = max(gaps, default=0)
         start = _first_ca_line(self._authorities(), zip(numbers, entries, strict=True))
-        every = [*recorded, *faults]
-        last_fault = max((fault.line for fault in every), default=0)
+        all_faults = [*recorded, *faults]
+        last_fault = max((fault.line for fault in all_faults), default=0)
         ledger = Ledger(
             entries,
-            tuple(dict.fromkeys(fault.text for fault in every if fault.line >= start)),
+            tuple(dict.fromkeys(fault.text for fault in all_faults if fault.line >= start)),
             entries[bisect_right(numbers, last_fault) :],
             0 if start > read.unchained else read.unchained,
             read.lines,

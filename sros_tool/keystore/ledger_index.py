@@ -422,4 +422,8 @@ def _connect(path: Path, mode: str, *, is_new: bool = False) -> sqlite3.Connecti
 
 def merged_postings(postings: Iterable[Iterable[Posting]]) -> Sequence[Posting]:
     """Return postings of several terms in the order of their lines, each line once."""
-    return sorted({posting.number: posting for some in postings for posting in some}.values())
+    return sorted(
+        {
+            posting.number: posting for term_postings in postings for posting in term_postings
+        }.values()
+    )

@@ -482,7 +482,10 @@ def _list_faults(
     )
     if refusal is None:
         return
-    crl, file = next((each for each in lists if each[0] is refusal.list), lists[0])
+    crl, file = next(
+        (revocation_list for revocation_list in lists if revocation_list[0] is refusal.list),
+        lists[0],
+    )
     if refusal.obstacle is Obstacle.REVOKED:
         yield Problem(CERTIFICATE_FILE, f"it is revoked by {file}", Fault.REVOKED)
         return

@@ -40,13 +40,13 @@ def contradictions(
         if protection.level is Level.SIGN:
             continue
         met = {
-            other: None
+            statement: None
             for topic in protected_topics(protection.kind, protection.name)
             for meeting in names.overlapping(topic)
-            for other in signed[meeting]
+            for statement in signed[meeting]
         }
-        for other in met:
-            first, second = sorted((protection, other), key=place.__getitem__)
+        for statement in met:
+            first, second = sorted((protection, statement), key=place.__getitem__)
             yield first, second
 
 
@@ -132,7 +132,8 @@ class _Raising:
         """Return whether an entry of the settings is for exactly these topics."""
         own = protected_topics(self._named[number].kind, self._named[number].name)
         return len(own) == len(topics) and all(
-            any(covers(topic, other) and covers(other, topic) for other in own) for topic in topics
+            any(covers(topic, own_topic) and covers(own_topic, topic) for own_topic in own)
+            for topic in topics
         )
 
     def _deciding_entry(self, topic: str, protection: StatedProtection) -> int | None:

@@ -977,7 +977,7 @@ class _EnclaveFiles:
         """
         with suppress(SrosError):
             chain = load_certificates(authorities, "")
-            if any(issued_by(certificate, each) for each in chain):
+            if any(issued_by(certificate, authority) for authority in chain):
                 return chain_fault(certificate, chain, moment=self._now)
         return ""
 
@@ -1070,7 +1070,7 @@ class _EnclaveFiles:
         subject = subject_text(certificate.subject)
         grant = permissions.grant_of(subject)
         if grant is None:
-            others = ", ".join(each.subject for each in permissions.grants)
+            others = ", ".join(grant.subject for grant in permissions.grants)
             only = f", only for {others}" if others else ""
             text = f"it has no grant for {subject}{only}"
             self._add(name, text, Fault.PERMISSIONS_SUBJECT)

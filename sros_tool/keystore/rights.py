@@ -276,7 +276,8 @@ def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSour
             ):
                 sources.append(_zenoh_rights(file, document))
     check_routers(
-        root, {one: configurations[files[one] / ROUTER_FILE].access.names() for one in routers}
+        root,
+        {router: configurations[files[router] / ROUTER_FILE].access.names() for router in routers},
     )
     # Peers state the rights that both ends of a link have: parts of those that the router states.
     of_router = frozenset(
@@ -301,7 +302,7 @@ def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSour
         tuple(dict.fromkeys(note for source in sources for note in source.notes)),
         enforcers=tuple(item for source in sources for item in source.enforcers),
         routers=tuple(routers),
-        links=_links({each.path.parent: each for each in sources}, files, routers),
+        links=_links({source.path.parent: source for source in sources}, files, routers),
         configurations=configurations,
         key_domains=domains,
     )
@@ -712,14 +713,14 @@ def _stated_domains(source: RightsSource) -> dict[str, str]:
     if source.kind == "zenoh":
         return {}
     ranges: dict[str, list[tuple[int, int]]] = defaultdict(list)
-    every = set()
+    all_rights = set()
     for domains, rights in rights_by_domains(source).items():
         for enclave in {right.enclave for right in rights}:
             if domains is None:
-                every.add(enclave)
+                all_rights.add(enclave)
             else:
                 ranges[enclave] += ((part.first or 0, part.last or 0) for part in domains.ranges)
-    return {name: str(DomainSet.of(*of)) for name, of in ranges.items() if name not in every}
+    return {name: str(DomainSet.of(*of)) for name, of in ranges.items() if name not in all_rights}
 
 
 def _unanswered_rights(

@@ -121,8 +121,8 @@ def select_to_revoke(
         possible = _possible_enclaves(keystore, fleet, robots)
         unrecorded = unrecorded_enclaves(fleet, possible, set(robots))
     chosen |= dict.fromkeys(_robots_enclaves(keystore, robots, True, unrecorded))
-    below = [name for each in unrecorded.values() for name in each.below]
-    left = {name for each in unrecorded.values() for name in each.naming} - chosen.keys()
+    below = [name for enclaves in unrecorded.values() for name in enclaves.below]
+    left = {name for enclaves in unrecorded.values() for name in enclaves.naming} - chosen.keys()
     return tuple(chosen), tuple(_unrecorded_notes(keystore.root, sorted(below), sorted(left)))
 
 
@@ -230,7 +230,7 @@ def missing_enclave_error(
         return _revoked_enclave_error(root, revocation)
     what = f"enclave {name} does not exist in keystore '{root}'"
     names = sorted(existing_enclaves)
-    if below := [each for each in names if name and each.startswith(f"{name}/")]:
+    if below := [existing for existing in names if name and existing.startswith(f"{name}/")]:
         return KeystoreError(
             what,
             f"It is the namespace of {counted(len(below), 'enclave')}, such as {below[0]}.",

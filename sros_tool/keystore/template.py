@@ -272,10 +272,10 @@ def _read_zenoh(table: _Table) -> ZenohNetwork:
             raise _TemplateError(f"{table.path}.routers has {name}, which is {table.path}.router")
     for router in (network, *network.routers):
         for key in ("endpoints", "listen"):
-            for each in getattr(router, key):
-                if not is_endpoint(each):
+            for endpoint in getattr(router, key):
+                if not is_endpoint(endpoint):
                     raise _TemplateError(
-                        f"{table.path}.{key} has {each!r}, which is not HOST:PORT, such as "
+                        f"{table.path}.{key} has {endpoint!r}, which is not HOST:PORT, such as "
                         "localhost:7447 or [::1]:7447"
                     )
     table.finish()
@@ -417,10 +417,10 @@ def with_values(
         raise UsageError(f"the settings would not be valid: {error}") from error
 
 
-def _match_same_names(one: str, other: str) -> bool:
+def _match_same_names(first: str, second: str) -> bool:
     """Return whether two name expressions in settings match the same names."""
-    one, other = (expand(each, "/", "") for each in (one, other))
-    return covers(one, other) and covers(other, one)
+    first, second = (expand(expression, "/", "") for expression in (first, second))
+    return covers(first, second) and covers(second, first)
 
 
 class NamedValues(NamedTuple):
@@ -437,7 +437,7 @@ def _typed_value(key: str, text: str) -> str | bool | list[str] | list[int]:
     ):
         return text.split(",")
     if key == "zenoh.domains":
-        return [int(each) if each.isdecimal() else -1 for each in text.split(",")]
+        return [int(word) if word.isdecimal() else -1 for word in text.split(",")]
     return {"true": True, "false": False}.get(text, text)
 
 

@@ -145,7 +145,7 @@ def open_zenoh(folder: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
     configurations: dict[str, Configuration] = {}
     problems: list[ZenohProblem] = []
     if not present:
-        text = "the enclave has neither it nor router.json5"
+        text = "the enclave has neither this file nor router.json5"
         problems.append(ZenohProblem(SESSION_FILE, text, ZenohFault.MISSING))
     for file in present:
         read = _read(folder, file, state)
@@ -895,9 +895,9 @@ def _prove(
         names = {(e.right.kind, name) for e in rights for name in _examples(e.right.name)}
         for kind, name in names:
             for right in RIGHTS[kind]:
-                told = passing[right].include(f"{domain}{name}/{ANY_TYPE}")
-                if told != (meant := rules.allow(enclave, right, name)):
-                    check_meaning(told, meant, f"the right of {enclave} to {right} {name}")
+                passes = passing[right].include(f"{domain}{name}/{ANY_TYPE}")
+                if passes != (meant := rules.allow(enclave, right, name)):
+                    check_meaning(passes, meant, f"the right of {enclave} to {right} {name}")
                 if nodes and is_announced(domain, right, name) != meant:
                     check_meaning(not meant, meant, f"that {enclave} announces {right} {name}")
 

@@ -220,7 +220,9 @@ def _issuer(
 ) -> x509.Certificate | None:
     """Return the first issuer valid at ``moment``, else the issuer that expires last, or None."""
     certificates = [
-        each for each in candidates if likely_issued(certificate, each) and each not in chain
+        candidate
+        for candidate in candidates
+        if likely_issued(certificate, candidate) and candidate not in chain
     ]
     valid = (issuer for issuer in certificates if validity_of(issuer).contains(moment))
     return next(
@@ -312,7 +314,9 @@ def _authority(certificate: x509.Certificate) -> _Authority:
 
 def _netscape_type(certificate: x509.Certificate) -> int | None:
     """Return the bits of the extension nsCertType, or None without it; -1 for unreadable ones."""
-    kinds = [each.value for each in certificate.extensions if each.oid == _NETSCAPE_TYPE]
+    kinds = [
+        extension.value for extension in certificate.extensions if extension.oid == _NETSCAPE_TYPE
+    ]
     if not kinds:
         return None
     with suppress(PkiError):
@@ -425,7 +429,7 @@ _IDENTIFIERS = {ExtensionOID.SUBJECT_KEY_IDENTIFIER, ExtensionOID.AUTHORITY_KEY_
 
 
 def _critical(certificate: x509.Certificate) -> set[ObjectIdentifier]:
-    return {each.oid for each in certificate.extensions if each.critical}
+    return {extension.oid for extension in certificate.extensions if extension.critical}
 
 
 def _time_faults(chain: Sequence[x509.Certificate], moment: datetime) -> Iterator[str]:
@@ -464,7 +468,9 @@ def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
     Also yield a fault if a certificate has a policy twice, or maps policies, which sros does not
     support.
     """
-    if not any(_OF_POLICIES & {each.oid for each in below.extensions} for below in chain[:-1]):
+    if not any(
+        _OF_POLICIES & {extension.oid for extension in below.extensions} for below in chain[:-1]
+    ):
         return
     demanded = len(chain)
     valid: set[ObjectIdentifier] = {_ANY_POLICY}
@@ -474,11 +480,15 @@ def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
         named = [policy.policy_identifier for policy in found or ()]
         if len(named) != len(set(named)):
             yield f"{name} has a certificate policy twice"
-        maps = any(other.oid == ExtensionOID.POLICY_MAPPINGS for other in certificate.extensions)
+        maps = any(
+            extension.oid == ExtensionOID.POLICY_MAPPINGS for extension in certificate.extensions
+        )
         if maps and found is not None:
             yield f"{name} has policyMappings, not known to sros"
         asked = _ALWAYS_ASKED if found is None else _OF_POLICIES
-        if any(other.oid in asked and is_unread(other) for other in certificate.extensions):
+        if any(
+            extension.oid in asked and is_unread(extension) for extension in certificate.extensions
+        ):
             yield f"the policies of {name} cannot be read"
         constraints = extension(certificate, x509.PolicyConstraints)
         after = constraints.require_explicit_policy if constraints else None

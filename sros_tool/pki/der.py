@@ -179,8 +179,8 @@ def encode_integer(number: int) -> bytes:
 
 def encode_oid(dotted: str) -> bytes:
     """Encode an object identifier, given in dotted form, as the content of a DER value."""
-    one, two, *rest = map(int, dotted.split("."))
-    content = bytearray([40 * one + two])
+    first_arc, second_arc, *rest = map(int, dotted.split("."))
+    content = bytearray([40 * first_arc + second_arc])
     for number in rest:
         part = [number & 0x7F]
         while number := number >> 7:

@@ -29,9 +29,9 @@ _ENCODINGS = {
 _SPACES = re.compile(rb"[ \t\n\v\f\r]+")
 
 
-def same_name(one: x509.Name, other: x509.Name) -> bool:
+def same_name(first: x509.Name, second: x509.Name) -> bool:
     """Return whether two names are equal: string types, case and blanks do not count."""
-    return len(one.rdns) == len(other.rdns) and canonical(one) == canonical(other)
+    return len(first.rdns) == len(second.rdns) and canonical(first) == canonical(second)
 
 
 @lru_cache(maxsize=64)  # all documents of a keystore have the same signer

@@ -383,7 +383,7 @@ def _media_type(header: bytes) -> tuple[bytes, Mapping[bytes, bytes]]:
     programs read in different ways.
     """
     fields = [_FIELD.fullmatch(line) for line in _FOLD.sub(b"; ", header).split(b"\n")]
-    named = [found[2] for found in fields if found and found[1].lower() == b"content-type"]
+    named = [field[2] for field in fields if field and field[1].lower() == b"content-type"]
     kind = _TYPE.fullmatch(named[0]) if len(named) == 1 and all(fields) else None
     if not kind:
         return b"", {}
@@ -503,7 +503,7 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
     if None in listed:
         raise ValueError("unknown digest")
     signatures = tuple(_signature(child) for child in der.children(signers.content))
-    if not signatures or any(each.digest not in listed for each in signatures):
+    if not signatures or any(signature.digest not in listed for signature in signatures):
         raise ValueError("no signature, or another digest than announced")
     return SignedDocument(
         content=content,
@@ -525,7 +525,7 @@ def _signature(signer: der.Value) -> Signature:
     info = der.children(signer.content)
     attributes = _optional(info, 3, der.CONTEXT_0)
     unsigned = _optional(info, 5, der.CONTEXT_1)
-    if signer.tag != der.SEQUENCE or [each.tag for each in info] != [
+    if signer.tag != der.SEQUENCE or [value.tag for value in info] != [
         *(der.INTEGER, der.SEQUENCE, der.SEQUENCE, der.SEQUENCE, der.OCTET_STRING)
     ]:
         raise ValueError("not the fields of SignerInfo")

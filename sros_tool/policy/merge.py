@@ -189,12 +189,12 @@ def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
     notes = []
     for (denied, new), allowed in by_denial.items():
         shown = [right.describe() for right in dict.fromkeys(sorted(allowed, key=order))]
-        some = first_few(shown, _SHOWN)
+        shown_text = first_few(shown, _SHOWN)
         if new:
-            text = f"{denied} was added. It removes rights that the file allows: {some}."
+            text = f"{denied} was added. It removes rights that the file allows: {shown_text}."
             notes.append(Note("merge.newly-denied", text))
         else:
-            text = f"{denied} stays, and overrides requested rights: {some}."
+            text = f"{denied} stays, and overrides requested rights: {shown_text}."
             notes.append(Note("merge.still-denied", text))
     return tuple(notes)
 
@@ -578,8 +578,8 @@ class _Editor:
             else:
                 new.append(_profile(place, entries))
         if new and blocks:
-            for each in new:
-                self._append(blocks[0], each)
+            for element in new:
+                self._append(blocks[0], element)
         elif new:
             self._append(enclave, _New("profiles", children=new))
 

@@ -169,8 +169,10 @@ def _protected_as_before(before: Policy, after: Policy) -> Policy:
     for kind, name, level in sorted(gone):
         met = list(names[kind].overlapping(name)) if kind in names else []
         # A wildcard of others gets it only if nobody has the right to the name itself.
-        for each in [e for e in met if covers(name, e)] or met:
-            levels[kind, each] = max(level, levels.get((kind, each), level), key=list(Level).index)
+        for wildcard in [e for e in met if covers(name, e)] or met:
+            levels[kind, wildcard] = max(
+                level, levels.get((kind, wildcard), level), key=list(Level).index
+            )
 
     def groups(group: Group, profile: Profile) -> Iterator[Group]:
         found: dict[Level | None, list[str]] = {}
@@ -419,9 +421,11 @@ def _profile(
                 whole = Right(path, qualifier, right, fqn)
                 if qualifier is DENY or whole in kept_rights:
                     said.setdefault((group.kind, name, level), {})[right, qualifier] = None
-                for each in pending.pop(whole, ()):
-                    written = _name_written_like(each.name, name, profile)
-                    said.setdefault((each.kind, written, level), {})[each.right, ALLOW] = None
+                for replacement in pending.pop(whole, ()):
+                    written = _name_written_like(replacement.name, name, profile)
+                    said.setdefault((replacement.kind, written, level), {})[
+                        replacement.right, ALLOW
+                    ] = None
     groups: dict[tuple[str, GroupRights, Level | None], list[str]] = {}
     for (kind, name, level), rights in said.items():
         for together in group_rights(rights):

@@ -344,6 +344,8 @@ def stated_protections(enclaves: Iterable[Enclave]) -> tuple[StatedProtection, .
                     continue
                 for index, written in enumerate(group.names):
                     name, source = expand(written, profile.ns, profile.node), group.source_of(index)
-                    each = StatedProtection(enclave.path, group.kind, name, group.protect, source)
-                    found.setdefault(each)
+                    statement = StatedProtection(
+                        enclave.path, group.kind, name, group.protect, source
+                    )
+                    found.setdefault(statement)
     return tuple(found)

@@ -57,7 +57,7 @@ class NodeRights:
             # Nodes without parameters, such as those of tf2_ros, have one name in many processes.
             compared = PARAMETER_SERVICES if services == _WITHOUT_PARAMETERS else NODE_SERVICES
             names = {f"{node}/{service}" for service in compared}
-            names |= {each for name in [*names] for each in wild.overlapping(name)}
+            names |= {expression for name in [*names] for expression in wild.overlapping(name)}
             return all(enclaves.get(name, {enclave}) <= {enclave} for name in names)
 
         complete = (set(NODE_SERVICES), set(PARAMETER_SERVICES), _WITHOUT_PARAMETERS)

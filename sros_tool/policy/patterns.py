@@ -78,14 +78,14 @@ def covers(wide: str, narrow: str) -> bool:
     )
 
 
-def overlap(one: str, other: str) -> bool:
+def overlap(first: str, second: str) -> bool:
     """Return whether at least one name matches both expressions."""
-    if not is_expression(one):
-        return matches(other, one) if is_expression(other) else one == other
-    if not is_expression(other):
-        return matches(one, other)
-    shorter, longer = sorted((literal_prefix(one), literal_prefix(other)), key=len)
-    return longer.startswith(shorter) and _pattern_form(one).overlaps(_pattern_form(other))
+    if not is_expression(first):
+        return matches(second, first) if is_expression(second) else first == second
+    if not is_expression(second):
+        return matches(first, second)
+    shorter, longer = sorted((literal_prefix(first), literal_prefix(second)), key=len)
+    return longer.startswith(shorter) and _pattern_form(first).overlaps(_pattern_form(second))
 
 
 _Pieces = tuple[frozenset[str], ...]
@@ -175,9 +175,9 @@ class _Form:
         return self._letters[letter]
 
 
-def _pieces_meet(one: _Pieces, other: _Pieces) -> bool:
+def _pieces_meet(first: _Pieces, second: _Pieces) -> bool:
     """Return whether the pieces at every position share a letter; extra pieces are ignored."""
-    return not any(map(frozenset.isdisjoint, one, other))
+    return not any(map(frozenset.isdisjoint, first, second))
 
 
 @lru_cache(maxsize=4 * _MANY)
@@ -289,10 +289,10 @@ class Names:
             yield name
         yield from self.covering(name)
 
-    def _count_failure(self, fits: bool, one: str, other: str) -> bool:
+    def _count_failure(self, fits: bool, first: str, second: str) -> bool:
         """Return ``fits``; a comparison without result counts against the limit."""
         if not fits:
-            self._limit.spend(len(one) + len(other))
+            self._limit.spend(len(first) + len(second))
         return fits
 
     def _cover_candidates(self, name: str) -> Iterable[str]:
@@ -317,7 +317,7 @@ class Names:
             {gram for run in _RUN.findall(_letters_of(expression)) for gram in _grams(run)}
             for expression in self._wild
         ]
-        count = Counter(gram for each in grams for gram in each)
+        count = Counter(gram for expression_grams in grams for gram in expression_grams)
 
         def rarity(gram: str) -> tuple[int, int, str]:
             return -len(gram), count[gram], gram

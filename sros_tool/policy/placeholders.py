@@ -50,23 +50,23 @@ def parts_of(text: str) -> Parts:
     """
     parts: list[str | Placeholder] = []
     end = 0
-    for found in _BRACES.finditer(text):
-        kind = _KIND.fullmatch(found[1])
+    for brace in _BRACES.finditer(text):
+        kind = _KIND.fullmatch(brace[1])
         if not kind:
             raise ValueError(
-                f"{found[0][:80]!r} is not a placeholder; there are {{robot}}, {{namespace}}, "
+                f"{brace[0][:80]!r} is not a placeholder; there are {{robot}}, {{namespace}}, "
                 "{robots} and {namespaces}, and those of a group, such as {robot:carriers}."
             )
         placeholder = Placeholder(kind[1], bool(kind[2]), kind[3] or "")
-        if problem := _place_problem(placeholder, text[: found.start()], text[found.end() :]):
+        if problem := _place_problem(placeholder, text[: brace.start()], text[brace.end() :]):
             raise ValueError(problem)
-        parts += [text[end : found.start()], placeholder]
-        end = found.end()
+        parts += [text[end : brace.start()], placeholder]
+        end = brace.end()
     parts.append(text[end:])
     kept = tuple(part for part in parts if part != "")
     if any(isinstance(part, str) and has_placeholder(part) for part in kept):
         raise ValueError("It has a brace outside of a placeholder such as {robot}.")
-    if len({each.group for each in placeholders_of(kept) if each.plural}) > 1:
+    if len({placeholder.group for placeholder in placeholders_of(kept) if placeholder.plural}) > 1:
         raise ValueError("It names robots of several groups, so it is unclear how to combine them.")
     return kept
 
@@ -106,8 +106,8 @@ def check_path(path: Parts) -> None:
     """
     found = placeholders_of(path)
     if plural := next((part for part in found if part.plural), None):
-        one = plural._replace(plural=False)
-        raise ValueError(f"{plural} names all robots, a path names one enclave: write {one}.")
+        singular = plural._replace(plural=False)
+        raise ValueError(f"{plural} names all robots, a path names one enclave: write {singular}.")
     if len({part.group for part in found}) > 1:
         raise ValueError("Its placeholders are of different groups.")
 

@@ -108,7 +108,7 @@ def group_rights(rights: Iterable[tuple[str, Qualifier]]) -> Iterator[GroupRight
         yield tuple(ordered)
         return
     for qualifier in Qualifier:
-        yield tuple(each for each in ordered if each[1] is qualifier)
+        yield tuple(right for right in ordered if right[1] is qualifier)
 
 
 def policy_rights(policy: Policy) -> frozenset[Right]:
@@ -205,7 +205,9 @@ class Rules:
     def covering_rights(self, right: Right) -> tuple[Right, ...]:
         """Return the rights that together cover ``right``, or () if it is not covered."""
         found = [self._covering_right(part) for part in parts(right)]
-        return tuple(dict.fromkeys(each for each in found if each)) if all(found) else ()
+        return (
+            tuple(dict.fromkeys(covering for covering in found if covering)) if all(found) else ()
+        )
 
     def overlaps(self, right: Right) -> bool:
         """Return whether a right of the set has a name in common with ``right``."""
@@ -313,7 +315,7 @@ def compare(
     if wildcards that both state cover it: large permissions leave such names out.
     """
     one, other = (
-        folded(each for each in side if scope is None or each.enclave in scope)
+        folded(right for right in side if scope is None or right.enclave in scope)
         for side in (first_rights, second_rights)
     )
     both = Rules(unfolded(one) & unfolded(other) if one != other else ())
@@ -372,12 +374,12 @@ def nodes_not_shown(enclave: Enclave) -> tuple[NodeName, ...]:
     `nodes_of_rights` derives the others, unless their own services are denied (`denied_nodes`).
     """
     profiles = tuple(enclave.all_profiles())
-    rights = {right for each in profiles for right in profile_rights(enclave.path, each)}
+    rights = {right for profile in profiles for right in profile_rights(enclave.path, profile)}
     gone = denied_nodes(rights)
     return tuple(
         dict.fromkeys(
             node
-            for profile, node in ((each, _node_of(each)) for each in profiles)
+            for profile, node in ((profile, _node_of(profile)) for profile in profiles)
             if not any(map(_offers_node_services, profile.groups)) or any(map(node.is_within, gone))
         )
     )

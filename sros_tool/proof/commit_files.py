@@ -130,7 +130,7 @@ def find_revision(text: str) -> Revision:
         DocumentError: git finds no such revision or path, or the revision is ambiguous.
     """
     name, colon, path = text.removeprefix(PREFIX).partition(":")
-    if not name or not colon or not path or any(ord(each) < 32 for each in text):
+    if not name or not colon or not path or any(ord(character) < 32 for character in text):
         raise UsageError(
             f"'{text}' does not name a policy at a git revision",
             "",
@@ -351,9 +351,9 @@ class CommitFiles:
 
 def _make_folders(folder: Folder, path: str) -> None:
     """Create the folder at a path, with its missing parents."""
-    for each in reversed((PurePosixPath(path), *PurePosixPath(path).parents[:-1])):
-        if str(each) != "." and not folder.is_folder(str(each)):
-            folder.mkdir(str(each), 0o700)
+    for folder_path in reversed((PurePosixPath(path), *PurePosixPath(path).parents[:-1])):
+        if str(folder_path) != "." and not folder.is_folder(str(folder_path)):
+            folder.mkdir(str(folder_path), 0o700)
 
 
 # ── policies, and their parts ──────────────────────────────────────────────────────────────
@@ -417,7 +417,9 @@ def _gives_access(element: etree._Element) -> bool:
         case "profile":
             return {"ns", "node"} <= keys
         case kind:
-            return any(element.get(each) in ("ALLOW", "DENY") for each in RIGHTS.get(str(kind), ()))
+            return any(
+                element.get(right) in ("ALLOW", "DENY") for right in RIGHTS.get(str(kind), ())
+            )
 
 
 def is_whole_policy(content: bytes) -> bool:
@@ -473,17 +475,17 @@ def _includes(path: str, content: bytes | None) -> Iterator[tuple[str, str]]:
     except DocumentError:
         return
     for element in root.iter(*INCLUDES) if root is not None else ():
-        above = {str(other.tag) for other in element.iterancestors()}
+        above = {str(ancestor.tag) for ancestor in element.iterancestors()}
         if not above & {"metadata", *FALLBACKS}:
             name = unquote(element.get("href", ""), errors="surrogateescape")
             target = os.path.normpath(Path(path).parent / name) if name else path
             yield target, element.get("xpointer", "")
 
 
-def same_root(one: bytes, other: bytes) -> bool:
+def same_root(first_content: bytes, second_content: bytes) -> bool:
     """Return whether the root elements of two files have the same name and attributes."""
     try:
-        first, second = (parse(each, "the file") for each in (one, other))
+        first, second = (parse(content, "the file") for content in (first_content, second_content))
     except DocumentError:
         return False
     return first.tag == second.tag and first.items() == second.items()

@@ -140,7 +140,9 @@ class Worlds:
         self._first_alike: dict[World, World] = {}
         for world in worlds:
             others = self._first_alike.values()
-            alike = (each for each in others if world.has_same_access(each))
+            alike = (
+                world_of_group for world_of_group in others if world.has_same_access(world_of_group)
+            )
             self._first_alike[world] = next(alike, world)
 
     def decide(
@@ -211,8 +213,8 @@ def _confirm(requirement: Requirement, witness: Witness, world: World) -> None:
     worlds = (world, *(world.elsewhere if isinstance(requirement, Apart) else ()))
     for use in witness.uses:
         confirm = any(
-            (each.confirm if may else each.confirm_own)(use.enclave, use.writes, use.topic)
-            for each in worlds
+            (world.confirm if may else world.confirm_own)(use.enclave, use.writes, use.topic)
+            for world in worlds
         )
         if confirm is not may:
             raise AssertionError(f"{world.title} decides otherwise on {use}, for {requirement}")
@@ -464,7 +466,7 @@ def _shared_by(
     if not is_expression(expression):
         return expression if is_shared(expression) else None
     known = [right for right in stated if is_shared(right)]
-    valid = shortest(each for each in known if each in valid_topics("", ""))
+    valid = shortest(name for name in known if name in valid_topics("", ""))
     if valid or len(wild) < count:  # nobody but holders with wildcards has a name not stated
         return valid or shortest(known)
     shared, every = NameSet.at_least(count, wild), Topics("", expression, "")
@@ -598,7 +600,7 @@ def _witness_against_apart(requirement: Apart, world: World, limit: SearchLimit)
     through = _matching_enclaves(requirement.through, world.enclaves)
     sources = sorted(_matching_enclaves(requirement.sources, world.enclaves) - through)
     targets = _matching_enclaves(requirement.targets, world.enclaves) - through
-    if sources and any(each.open_topics for each in (world, *world.elsewhere)):
+    if sources and any(domain_world.open_topics for domain_world in (world, *world.elsewhere)):
         sources.append(ANYBODY)  # their processes can run without an identity, too
     chain = _shortest_chain(world, sources, targets, through, limit)
     if not chain:
@@ -713,8 +715,8 @@ def _is_used_by_anybody(
 # ── the flow of information ────────────────────────────────────────────────────────────────
 
 _IGNORED = NameSet.union(
-    names_of_expression(each)
-    for each in (
+    names_of_expression(topic)
+    for topic in (
         ROS_DISCOVERY_TOPIC,
         *(f"rt{name}" for name in OF_EVERY_NODE),
         *(f"rq/{name.lstrip('/')}{SERVICE_ENDS['rq']}" for name in QUESTIONS),
@@ -753,7 +755,7 @@ def _shortest_chain(
     origins: dict[str, set[str]] = {start: {start} for start in starts}
     used: dict[tuple[int, str, str], set[str]] = {}
     queue: deque[tuple[str, str, _Chain]] = deque((start, start, ()) for start in starts)
-    flows = [_Flow(each, limit) for each in (world, *world.elsewhere)]
+    flows = [_Flow(domain_world, limit) for domain_world in (world, *world.elsewhere)]
     while queue:
         here, origin, chain = queue.popleft()
 

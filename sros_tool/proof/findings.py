@@ -185,7 +185,7 @@ def _step(use: Use, world: World, system: System) -> Step:
 def _never_fails(verdicts: Sequence[Verdict]) -> Iterator[str]:
     """Yield clauses that say why a requirement, or a part of it, cannot fail in any world."""
     first, *others = verdicts
-    empty = [name for name in first.empty if all(name in other.empty for other in others)]
+    empty = [name for name in first.empty if all(name in verdict.empty for verdict in others)]
     if empty:
         yield _listed_names(empty)
     if all(verdict.always for verdict in verdicts):
@@ -210,8 +210,8 @@ def decided_findings(decided: Decided, system: System) -> list[Finding]:
     """Return the findings of decisions: broken requirements first, in order."""
     findings = [_violation_finding(violation) for violation in decided.violations]
     findings += [_vacuous_finding(requirement, why) for requirement, why in decided.vacuous]
-    findings += [_assumption_finding(*each) for each in decided.assumed]
-    findings += [_not_crossing_finding(*each) for each in decided.kept]
+    findings += [_assumption_finding(*assumption) for assumption in decided.assumed]
+    findings += [_not_crossing_finding(*kept_use) for kept_use in decided.kept]
     if system.is_export:
         text = "only the enclaves in this export were judged: others of its keystore may be missing"
         findings.append(OF_EXPORT.found(system.file, text, system.file))
@@ -246,7 +246,7 @@ _CLOSE_GOVERNANCE = (
 def _violation_finding(violation: Violation) -> Finding:
     requirement, steps = violation.requirement, violation.steps
     first = next((step.source for step in steps if step.source), None) or requirement.source
-    others = [step for other in violation.others for step in other]
+    others = [step for other_steps in violation.others for step in other_steps]
     named = [*steps, *others] if len(steps) > 1 else others
     related = [
         RelatedPlace(step.text(), step.source.file, step.source.line or None)

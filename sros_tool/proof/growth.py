@@ -199,12 +199,15 @@ class Growth:
     @property
     def less_protection(self) -> list[LostProtection]:
         """The protections that are weaker in HEAD."""
-        return [LostProtection(it.key, it.before, it.after, it.meaning) for it in self.lost]
+        return [
+            LostProtection(change.key, change.before, change.after, change.meaning)
+            for change in self.lost
+        ]
 
     @property
     def more_protection(self) -> list[GainedProtection]:
         """The protections that are stronger in HEAD."""
-        return [GainedProtection(it.key, it.after, it.before) for it in self.gained]
+        return [GainedProtection(change.key, change.after, change.before) for change in self.gained]
 
     def __bool__(self) -> bool:
         return bool(self.added or self.lost)
@@ -860,7 +863,7 @@ class _Stated:
                     if topic is not None:
                         yield self._gain(enclave, verb, right, expression, topic, world, domain)
                 break
-        stated = names_of(world.style, (each for _, topics in allowed for each in topics))
+        stated = names_of(world.style, (topic for _, topics in allowed for topic in topics))
         topic = self._example(added_names - stated, (enclave, verb, "*"), world, limit)
         if topic is not None:
             yield self._gain(enclave, verb, None, topic, topic, world, domain)
@@ -1077,8 +1080,10 @@ def _completed(side: AccessSource, other: AccessSource) -> AccessSource:
     permissions = _certified_as(side, other)
     if domains:
         permissions = {
-            name: _permissions_for_domain(each, domains[name]) if name in domains else each
-            for name, each in permissions.items()
+            name: _permissions_for_domain(enclave_permissions, domains[name])
+            if name in domains
+            else enclave_permissions
+            for name, enclave_permissions in permissions.items()
         }
     if side.governance:
         return replace(side, permissions=permissions)

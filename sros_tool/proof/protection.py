@@ -214,7 +214,9 @@ def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChan
             for serial in lost_revocations(before, new.trusts[name]):
                 again[serial].append(name)
     for serial in sorted(again)[:_MOST_SERIALS]:
-        names = [each for each in again[serial] if each != KEYSTORE_ITSELF] or [KEYSTORE_ITSELF]
+        names = [enclave for enclave in again[serial] if enclave != KEYSTORE_ITSELF] or [
+            KEYSTORE_ITSELF
+        ]
         who = (
             f"{names[0]} again trusts" if len(names) == 1 else f"{len(names)} enclaves again trust"
         )
@@ -232,10 +234,10 @@ def _looser_governance(
     old: Governance, new: Governance, limit: SearchLimit
 ) -> Iterator[SettingChange]:
     pairs = dict.fromkeys(
-        (rule, other)
+        (rule, new_rule)
         for rule in old.domain_access_rules
-        for other in new.domain_access_rules
-        if any(each in other.domains.closed() for each in rule.domains.closed())
+        for new_rule in new.domain_access_rules
+        if any(domains in new_rule.domains.closed() for domains in rule.domains.closed())
     )
     for rule, other in pairs:
         for change in attribute_changes(rule, other, "protection", ""):
@@ -286,10 +288,10 @@ def _dropped_statements(
     later = tuple(new)
     for protection in old:
         enough = [
-            other.name
-            for other in later
-            if other.kind == protection.kind
-            and (other.level, protection.level) != (Level.SIGN, Level.ENCRYPT)
+            later_statement.name
+            for later_statement in later
+            if later_statement.kind == protection.kind
+            and (later_statement.level, protection.level) != (Level.SIGN, Level.ENCRYPT)
         ]
         names = _set_of_names((protection.name,)) - _set_of_names(enough)
         example = names.example(limit)
@@ -446,8 +448,10 @@ def _expressions(network: ZenohNetwork, router: str) -> _Crossing:
     return tuple(dict.fromkeys(filter(None, (network.crossing, own))))
 
 
-def _crossing_of_both(network: ZenohNetwork, one: str, other: str) -> _Crossing:
-    return tuple(dict.fromkeys((*_expressions(network, one), *_expressions(network, other))))
+def _crossing_of_both(network: ZenohNetwork, first_router: str, second_router: str) -> _Crossing:
+    return tuple(
+        dict.fromkeys((*_expressions(network, first_router), *_expressions(network, second_router)))
+    )
 
 
 def _router(network: ZenohNetwork, enclave: str) -> str:

@@ -202,7 +202,7 @@ class Repository:
             return {}
         lines = self._ask("for-each-ref", "--format=%(objectname) %(refname)", "--", *wanted)
         targets = {name: digits for digits, _, name in map(_split_at_blank, lines.splitlines())}
-        return {each: targets[each] for each in wanted if each in targets}
+        return {reference: targets[reference] for reference in wanted if reference in targets}
 
     def _commit_id(self, digits: str, name: str) -> str:
         """Return the id of the commit that an object id names, directly or by annotated tags.
@@ -334,7 +334,9 @@ class Repository:
                 than ``maximum`` bytes.
         """
         known = self.sizes(wanted := dict.fromkeys(ids))
-        sizes = {each: known.get(each, 0) for each in wanted}  # what is missing is an error below
+        sizes = {
+            object_id: known.get(object_id, 0) for object_id in wanted
+        }  # what is missing is an error below
         if sum(sizes.values()) > maximum:
             raise DocumentError(f"the files of the commit have more than {maximum} bytes")
         part: list[str] = []
@@ -363,9 +365,9 @@ class Repository:
         Raises:
             DocumentError: an object is damaged, or larger than `_MOST_BYTES`.
         """
-        known = {each: _known.get((self.folder, each)) for each in ids}
+        known = {object_id: _known.get((self.folder, object_id)) for object_id in ids}
         objects = {each: value for each, value in known.items() if value}
-        unknown = [each for each in ids if each not in objects]
+        unknown = [object_id for object_id in ids if object_id not in objects]
         if unknown:
             objects |= self._read(unknown, self.sizes(unknown))
         return objects
@@ -504,12 +506,12 @@ class Repository:
             )
         except subprocess.TimeoutExpired as error:
             raise DocumentError(f"git does not answer within {wait} seconds") from error
-        said = done.stderr[:500].decode(errors="replace").strip()
-        if done.returncode and (said or not quiet):
-            why = said.removeprefix("fatal: ") or f"it ended with status {done.returncode}"
+        error_text = done.stderr[:500].decode(errors="replace").strip()
+        if done.returncode and (error_text or not quiet):
+            why = error_text.removeprefix("fatal: ") or f"it ended with status {done.returncode}"
             raise DocumentError(f"git cannot read it: {why}")
-        if said and not done.returncode and environment is None:
-            raise DocumentError(f"git warns: {said}", "Its answer may be incomplete.")
+        if error_text and not done.returncode and environment is None:
+            raise DocumentError(f"git warns: {error_text}", "Its answer may be incomplete.")
         return done.stdout
 
 
@@ -568,7 +570,7 @@ def walk(
         depth += 1
         if depth > _MOST_DEPTH:
             raise DocumentError(f"the commit has more than {_MOST_DEPTH} levels of folders")
-        ids = [each for _, *pair in level for each in pair if each]
+        ids = [object_id for _, *pair in level for object_id in pair if object_id]
         folders = repository.folders(ids)
         below = []
         for path, here, there in level:
@@ -595,7 +597,7 @@ def _program(path: str) -> str:
     Raises:
         UnavailableError: git is not installed.
     """
-    folders = [each for each in path.split(os.pathsep) if each.startswith("/")]
+    folders = [folder for folder in path.split(os.pathsep) if folder.startswith("/")]
     program = shutil.which("git", path=os.pathsep.join(folders)) if folders else None
     if not program:
         raise UnavailableError("git is not installed", "", "Install git.")

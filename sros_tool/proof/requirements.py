@@ -897,7 +897,10 @@ def dropped_findings(
     return [
         DROPPED.found(
             ": ".join(filter(None, (first.name, first.demand))),
-            first.text() + _other_robots_text([other.requirement.robot for other in same_table]),
+            first.text()
+            + _other_robots_text(
+                [dropped_requirement.requirement.robot for dropped_requirement in same_table]
+            ),
             file,
             related=(RelatedPlace("required before", first.file, first.line or None),),
         )
@@ -926,8 +929,8 @@ def _parts(requirement: Requirement) -> Iterator[Requirement]:
                 yield replace(requirement, enclaves=single)
         case NotBoth(first=first, second=second):
             for right in _single_rights(first):
-                for other in _single_rights(second):
-                    yield replace(requirement, first=(right,), second=(other,))
+                for second_right in _single_rights(second):
+                    yield replace(requirement, first=(right,), second=(second_right,))
         case (
             Only(rights=rights)
             | Nobody(rights=rights)

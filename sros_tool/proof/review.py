@@ -738,7 +738,7 @@ class _Review:
             and not stated.overlaps(right._replace(qualifier=ALLOW))
             and not stated.cover(right)
         )
-        undenied += tuple(each.right for each in moving if each.right.qualifier is DENY)
+        undenied += tuple(moved.right for moved in moving if moved.right.qualifier is DENY)
         status = _FOUND if growth or undenied else _OK
         return status, AccessChange(before, after, growth, undenied)
 
@@ -749,8 +749,8 @@ class _Review:
         moving: Callable[[], Sequence[PlacedRight]],
     ) -> tuple[int, Content] | None:
         first, second = before().as_rights(), after().as_rights()
-        absolute = tuple(each for each in moving() if each.written.startswith("/"))
-        relative = tuple(each for each in moving() if not each.written.startswith("/"))
+        absolute = tuple(moved for moved in moving() if moved.written.startswith("/"))
+        relative = tuple(moved for moved in moving() if not moved.written.startswith("/"))
         compared = compare_sources(first, second)
         if not compared and not (absolute or relative):
             return None
@@ -926,7 +926,7 @@ def _fixed_or_moving_names(before: AccessSource, after: AccessSource) -> Iterato
     for placed, moved in of_before:
         denies = placed.right.qualifier is DENY
         if denies and now.cover(placed.right) and not now_elsewhere.cover(moved):
-            yield next(each for each in denials if Rules([each.right]).overlaps(placed.right))
+            yield next(denial for denial in denials if Rules([denial.right]).overlaps(placed.right))
 
 
 def _moved_rights(enclave: Enclave) -> Iterator[tuple[PlacedRight, Right]]:

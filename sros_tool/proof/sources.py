@@ -339,11 +339,11 @@ def _common_governance(root: Path, folders: Iterable[Path]) -> Governance:
     """
     governance = Keystore(root).governance
     wanted = _signed_text(read_bytes(root / GOVERNANCE_P7S, "governance document"))
-    same: set[bytes] = set()
+    known: set[bytes] = set()
     for folder in folders:
         file = folder / GOVERNANCE_FILE
         data = read_bytes(file, "governance document") if file.exists() else b""
-        if not data or data in same:
+        if not data or data in known:
             continue
         if _signed_text(data) != wanted:
             raise DocumentError(
@@ -351,7 +351,7 @@ def _common_governance(root: Path, folders: Iterable[Path]) -> Governance:
                 "It is not certain which protection applies to the enclave and its peers.",
                 f"`sros check {quote(str(root))}` shows what is wrong with it.",
             )
-        same.add(data)
+        known.add(data)
     return governance
 
 

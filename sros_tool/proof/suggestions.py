@@ -123,8 +123,8 @@ def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
 def _unused_services(stated_rights: _Stated) -> Iterator[Nobody]:
     """Yield requirements that nobody calls unused services that change nodes."""
     last = {name.rpartition("/")[2] for name in stated_rights.names("reply") if name.count("/") > 1}
-    for each in sorted(last.difference(READING_SERVICES)):
-        yield Nobody(source=_NOWHERE, rights=(("request", (f"*/{each}",)),))
+    for service in sorted(last.difference(READING_SERVICES)):
+        yield Nobody(source=_NOWHERE, rights=(("request", (f"*/{service}",)),))
 
 
 def _gate_requirements(world: World) -> Iterator[Apart]:
@@ -319,7 +319,7 @@ _WIDTH = 80
 def _toml(value: object) -> str:
     if not isinstance(value, tuple | list):
         return json.dumps(value)
-    texts = [json.dumps(each) for each in value]
+    texts = [json.dumps(item) for item in value]
     line = f"[{', '.join(texts)}]"
     if len(line) <= _WIDTH:
         return line

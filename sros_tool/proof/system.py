@@ -143,7 +143,7 @@ def load_system(
                 "Leave --template out, or check the policy.",
             )
         return _keystore_system(keystore or Keystore(paths[0]), moment, zone, domain, only_enclaves)
-    files = [file for each in paths for file in files_of_policies(each)]
+    files = [file for path in paths for file in files_of_policies(path)]
     if not files:
         raise PolicyError(
             "requirements need a policy, and there is no policy", "", "Name a policy."
@@ -234,7 +234,7 @@ def _planned_zenoh(
         own = rules.get(enclave)
         return own is not None and bool(messages) and all(own.allows(enclave, *e) for e in messages)
 
-    access = {each.path: ros_access(stated_rights(each)) for each in policy.enclaves}
+    access = {enclave.path: ros_access(stated_rights(enclave)) for enclave in policy.enclaves}
     return World("Zenoh", access, confirm=confirm, stated_access=stated_access)
 
 
@@ -262,18 +262,25 @@ def _dds_world(
 
     def confirm(enclave: str, writes: bool, topic: str) -> bool:
         verb = AccessVerb.PUBLISH if writes else AccessVerb.SUBSCRIBE
-        return any(each.decide(verb, topic).outcome.ok for each in access.get(enclave, ()))
+        return any(
+            possible_access.decide(verb, topic).outcome.ok
+            for possible_access in access.get(enclave, ())
+        )
 
     def topics(some: Sequence[Access]) -> TopicAccess:
-        every = [dds_access(each) for each in some]
+        every = [dds_access(possible_access) for possible_access in some]
         if len(every) == 1:
             return every[0]
         writes, reads = ([getattr(e, side) for e in every] for side in ("writes", "reads"))
         return TopicAccess(NameSet.union(writes), NameSet.union(reads))
 
-    every = [each for accesses in access.values() for each in accesses]
+    every = [possible_access for accesses in access.values() for possible_access in accesses]
     weak = _weaker_topics(every)
-    opened = [names for each in every if (names := each.topics_of_unauthenticated()) is not None]
+    opened = [
+        names
+        for possible_access in every
+        if (names := possible_access.topics_of_unauthenticated()) is not None
+    ]
     if demanded is not None:
         weak[Level.ENCRYPT] |= demanded[Level.SIGN]
     return World(
@@ -296,7 +303,7 @@ _RANK = {Level.NONE: 0, Level.SIGN: 1, Level.ENCRYPT: 2}
 
 def _weaker_topics(access: Iterable[Access]) -> dict[Level, NameSet]:
     """Map levels to the topics that the governance of at least one enclave protects less."""
-    different = dict.fromkeys(each.protection() for each in access)
+    different = dict.fromkeys(enclave_access.protection() for enclave_access in access)
     return {
         level: NameSet.union(
             NameSet.first(
@@ -405,7 +412,12 @@ def _keystore_system(
         for rule in parse_governance(document).domain_access_rules
     }
     grants = {name: document.grants for name, document in source.documents.items()}
-    granted = {rule.domains for grant in grants.values() for each in grant for rule in each.rules}
+    granted = {
+        rule.domains
+        for grant in grants.values()
+        for grant_of_subject in grant
+        for rule in grant_of_subject.rules
+    }
     domains = (domain,) if domain is not None else DomainSet.one_of_each_kind(listed, granted)
     domains = domains or (0,)
     if len(domains) > _MOST_DOMAINS:
@@ -415,7 +427,10 @@ def _keystore_system(
             "Name one with --domain.",
         )
     subjects = {name: enclave.subject for name, enclave in loaded.items() if enclave.subject}
-    granting = {name: [each.subject for each in grant] for name, grant in grants.items()}
+    granting = {
+        name: [grant_of_subject.subject for grant_of_subject in grant]
+        for name, grant in grants.items()
+    }
     moments = {name: (at, *_later_moments(name, grants.get(name, ()), at)) for name in names}
     worlds = []
     for vendor, number in product(TESTED, domains):
@@ -439,7 +454,9 @@ def _keystore_system(
                 Evaluator(vendor, loaded_enclave, JoinContext(number, moment, zone)).access
                 for loaded_enclave, moment in product(possible, moments[name])
             )
-            access[name] = tuple(each for each in accesses if each is not None)
+            access[name] = tuple(
+                possible_access for possible_access in accesses if possible_access is not None
+            )
         fitting_others = other_fitting_enclaves(vendor.traits, subjects, granting)
         worlds.append(
             _dds_world(
@@ -470,7 +487,7 @@ def _keystore_system(
 def _link_domains(worlds: Sequence[World]) -> None:
     """Tell the worlds of a vendor, or of Zenoh, which worlds are of other ROS domains."""
     for world in worlds:
-        world.elsewhere = tuple(other for other in worlds if other is not world)
+        world.elsewhere = tuple(other_world for other_world in worlds if other_world is not world)
 
 
 def _without_faults(
@@ -495,7 +512,9 @@ def _later_moments(name: str, grants: Iterable[Grant], moment: datetime) -> tupl
         with suppress(UsageError):  # it ends before it begins
             validities.append(grant.validity)
     later = (validity for validity in validities if moment < validity.not_before)
-    moments = {each.not_before + (each.not_after - each.not_before) / 2 for each in later}
+    moments = {
+        validity.not_before + (validity.not_after - validity.not_before) / 2 for validity in later
+    }
     if len(moments) > _MOST_MOMENTS:
         raise KeystoreError(
             f"the permissions of enclave {name} become valid at more than {_MOST_MOMENTS}"
@@ -531,11 +550,11 @@ def _zenoh_worlds(
         name: source.configurations[enclave_path(root, name) / ROUTER_FILE].access
         for name in (source.routers if source.links else ())
     }
-    for each in domains:
-        title = "Zenoh" if len(domains) == 1 else f"Zenoh in domain {each}"
-        crossing = Crossing(source.links.router_of, rules, each) if source.links else None
+    for zenoh_domain in domains:
+        title = "Zenoh" if len(domains) == 1 else f"Zenoh in domain {zenoh_domain}"
+        crossing = Crossing(source.links.router_of, rules, zenoh_domain) if source.links else None
         enclaves = {*stated_access}.difference(source.routers)
-        yield _zenoh_world(title, enforcers, enclaves, each, stated_access, crossing)
+        yield _zenoh_world(title, enforcers, enclaves, zenoh_domain, stated_access, crossing)
 
 
 def _zenoh_world(

@@ -167,7 +167,7 @@ def _planned_files(policy: Policy, *, moment: datetime, domain: int | None = Non
         enclave.path: plan_enclave(enclave, governance, moment=moment)
         for enclave in policy.enclaves
     }
-    permissions = {name: each.portable for name, each in enclaves.items() if each.portable}
+    permissions = {name: loaded.portable for name, loaded in enclaves.items() if loaded.portable}
     side = AccessSource(policy.file, "policy", policy_rights(policy), permissions)
     return DecidedFiles(
         *(policy.file, enclaves, side, moment),
@@ -299,10 +299,17 @@ def _vulnerabilities(
 ) -> Iterator[Finding]:
     """Yield findings on vulnerabilities that the latest release of only one distribution has."""
     for releases in _products(before, after, vendor):
-        known = [known_vulnerabilities(each.product, each.latest, advisories) for each in releases]
+        known = [
+            known_vulnerabilities(release.product, release.latest, advisories)
+            for release in releases
+        ]
         if None in known or releases[0].latest == releases[1].latest:
             continue
-        old, new = ({advisory.id for advisory in each.known} for each in known if each)
+        old, new = (
+            {advisory.id for advisory in vulnerabilities.known}
+            for vulnerabilities in known
+            if vulnerabilities
+        )
         unclear = {advisory.id for advisory in known[1].unclear} if known[1] else set()
         parts = [f"{len(old & new)} stay"] if old & new else []
         for ids, what in (
@@ -357,7 +364,7 @@ def _pairs(distributions: Sequence[Distribution]) -> Iterator[tuple[Shipped, Shi
             releases = by_product.setdefault(shipped.product, {})
             releases.setdefault(shipped.vendor, shipped)
     for first, *others in (list(releases.values()) for releases in by_product.values()):
-        yield from ((first, other) for other in others)
+        yield from ((first, second) for second in others)
 
 
 _MORE, _LESS, _LOSES, _JOINS = "opens", "closes", "refused", "accepted"
@@ -388,7 +395,9 @@ def changes(files: DecidedFiles, before: Shipped, after: Shipped) -> Iterator[De
     if before.vendor is after.vendor:
         return
     by_vendors = AccessByVendors(files.source)
-    fitting_others = {each.vendor: files.fitting_others(each.vendor) for each in (before, after)}
+    fitting_others = {
+        shipped.vendor: files.fitting_others(shipped.vendor) for shipped in (before, after)
+    }
     for name, enclave in files.loaded_enclaves():
         numbers = files.domains(enclave)
         for number in numbers:
@@ -432,7 +441,10 @@ class _Decided:
             )
             for holder in fitting_others
         )
-        others = (VendorParticipant(shipped.vendor, each, context).access for each in presented)
+        others = (
+            VendorParticipant(shipped.vendor, permissions, context).access
+            for permissions in presented
+        )
         usable = (participant.access, *others) if participant.access else ()
         self.access: tuple[Access, ...] = tuple(filter(None, usable))
 
@@ -466,17 +478,16 @@ def _changes_of_enclave(
         for topic in names_without_wildcards(grant)
     }
     file = files.place(name, PERMISSIONS_FILE)
-    for kind, one, other in ((_MORE, old, new), (_LESS, new, old)):
+    for kind, first_access, other in ((_MORE, old, new), (_LESS, new, old)):
         gains = list(
             by_vendors.gained_topics(
-                name, one.access, other.access, other.shipped.vendor, domain, names
+                name, first_access.access, other.access, other.shipped.vendor, domain, names
             )
         )
         if gains:
             accesses = first_few(list(dict.fromkeys(map(_words, gains))), _SHOWN, "; ", "; and ")
-            opened = (
-                f"{where}{accesses}: open on {other.shipped.title}, closed on {one.shipped.title}"
-            )
+            closed = first_access.shipped.title
+            opened = f"{where}{accesses}: open on {other.shipped.title}, closed on {closed}"
             yield DecisionChange(kind, name, opened, file)
 
 

@@ -169,8 +169,8 @@ class Side:
             self._any
         )
         return [
-            TopicUser(each, self.of[each], tuple(stated.get(each, ())), each in wild)
-            for each in sorted(wild.union(stated))
+            TopicUser(enclave, self.of[enclave], tuple(stated.get(enclave, ())), enclave in wild)
+            for enclave in sorted(wild.union(stated))
         ]
 
     def topics_matching(self, expression: str, limit: SearchLimit) -> Sequence[str]:
@@ -366,7 +366,7 @@ class World:
         if enclave not in self.fitting_others or self.confirm_own(enclave, writes, topic):
             return ""
         others = self.fitting_others[enclave]
-        return next((each for each in others if self.confirm_own(each, writes, topic)), "")
+        return next((holder for holder in others if self.confirm_own(holder, writes, topic)), "")
 
     def has_same_access(self, other: World) -> bool:
         """Return whether another world has equal sets of topics, so all decisions are equal."""
@@ -548,9 +548,11 @@ def enforced_access(enforcers: Iterable[Enforcement], enclave: str, domain: int)
         def of(keys: Iterable[str]) -> NameSet:
             return NameSet.union(_topics(key, domain, begin) for key in keys)
 
-        first, *others = (enforcer.passing(remote, *each, of) for each in _USES[writes, begin])
-        for other in others:
-            first &= other
+        first, *others = (
+            enforcer.passing(remote, *message, of) for message in _USES[writes, begin]
+        )
+        for names in others:
+            first &= names
         return first & names_of_expression(f"{begin}/*{_ENDS[begin]}")
 
     every = tuple(enforcers)
@@ -629,9 +631,9 @@ def _topics(key: str, domain: int, begin: str) -> NameSet:
     assert around
     inner = (automaton.between(space, _TYPE) for automaton in around.automata)
     exact = (
-        f"{begin}{each[len(space) : -len(_TYPE)]}{end}"
-        for each in around.exact
-        if each.startswith(f"{space}/") and each.endswith(_TYPE)
+        f"{begin}{key[len(space) : -len(_TYPE)]}{end}"
+        for key in around.exact
+        if key.startswith(f"{space}/") and key.endswith(_TYPE)
     )
     return NameSet(exact, (automaton.surrounded(begin, end) for automaton in inner))
 

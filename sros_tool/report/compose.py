@@ -108,7 +108,7 @@ class PictureSource:
             self,
             rights=frozenset(right for right in self.rights if right.enclave in enclaves),
             nodes={path: names for path, names in self.nodes.items() if path in enclaves},
-            enclaves=tuple(each for each in self.enclaves if each.path in enclaves),
+            enclaves=tuple(enclave for enclave in self.enclaves if enclave.path in enclaves),
         )
 
     def moved_to_homes(self, homes: Mapping[str, str]) -> PictureSource:
@@ -246,7 +246,7 @@ def _picture(
     def sides(kind: str, name: str) -> Sequence[bool]:
         known = known_names.matching_names(kind, name) if is_expression(name) else ()
         # What is not drawn under its own name is a part of an action, which has both sides.
-        others = [drawn.get((kind, other), (True, True)) for other in known]
+        others = [drawn.get((kind, known_name), (True, True)) for known_name in known]
         return [any(ends) for ends in zip(drawn[kind, name], *others, strict=True)]
 
     said = next((source.protections for source in reversed(sources) if source.protections), ())
@@ -579,7 +579,7 @@ class _Wild:
         if key not in self._drawn:
             meeting = self._names.overlapping(name)
             self._drawn[key] = tuple(
-                other for other in meeting if qualifier is not DENY or covers(name, other)
+                wildcard for wildcard in meeting if qualifier is not DENY or covers(name, wildcard)
             )
         return self._drawn[key]
 
@@ -648,7 +648,7 @@ def _action_edges(
     for (right, inside), names in remaining.items():
         rest[right][inside] = names
     for right, halves in rest.items():
-        by = _wildcards_used({text for said in halves.values() for text in said})
+        by = _wildcards_used({text for names in halves.values() for text in names})
         yield Edge(enclave, "actions", action, right, qualifier, by, tuple(sorted(halves)))
 
 

@@ -233,7 +233,7 @@ class _System:
         for source in sources:
             for domains, some in (source.in_domains or {None: source.rights}).items():
                 in_domains[domains] += (right for right in some if right.enclave in enclaves)
-        self._rights = [right for some in in_domains.values() for right in some]
+        self._rights = [right for rights in in_domains.values() for right in rights]
         self._domains = {enclave.path: enclave.domains for enclave in picture.enclaves}
         self._governance: Governance | None = next(
             (source.governance for source in reversed(sources) if source.governance), None
@@ -715,7 +715,7 @@ class _Draft:
             for text in (near if hop == 1 else f"{hop} {far}",)
         }
         for column, text in texts.items():
-            card = next((other for other in cards.values() if other.column == column), None)
+            card = next((card for card in cards.values() if card.column == column), None)
             if card:
                 yield Head(card.x + card.width // 2, "middle", text)
 

@@ -400,7 +400,9 @@ class _Draft:
         return parts
 
     def _symbols_around(self, units: Sequence[int], unit: int) -> tuple[int, ...]:
-        return tuple(_SELF if other == unit else self._symbols[other] for other in units)
+        return tuple(
+            _SELF if other_unit == unit else self._symbols[other_unit] for other_unit in units
+        )
 
     def _named_by(self, families: Container[int]) -> Counter[int]:
         """Return how many other units of its family have rights to names of each unit."""
@@ -453,7 +455,7 @@ class _Draft:
         """Return whether a unit may not be drawn together with others."""
         symbol = self._symbols[unit]
         return not any(
-            len({other for other in units if self._symbols[other] == symbol}) > 1
+            len({other_unit for other_unit in units if self._symbols[other_unit] == symbol}) > 1
             for _kind, units, _what in self._seen
         )
 
@@ -525,23 +527,23 @@ class _Draft:
                 rest,
                 name.form,
                 self._symbols_around(name.units, unit),
-                self._units[other].family,
+                self._units[other_unit].family,
             )
 
         for edge in self._picture.edges:
             unit = self._of.get(edge.enclave)
             if unit is not None and self._is_drawn(unit):
-                for other in self._text(edge.name).units:
-                    if self._is_counted(unit, other):
-                        others[key(edge, unit, other)].add(other)
+                for other_unit in self._text(edge.name).units:
+                    if self._is_counted(unit, other_unit):
+                        others[key(edge, unit, other_unit)].add(other_unit)
 
         def several(edge: Edge, unit: int, other: int, position: int) -> str:
-            family = self._units[other].family
-            named, all_of = others[key(edge, unit, other)], families[family]
+            family = self._units[other_unit].family
+            named, all_of = others[key(edge, unit, other_unit)], families[family]
             if not named or sorted(named) == sorted(
-                self._classes.get(self._inside.get(other, -1), ())
+                self._classes.get(self._inside.get(other_unit, -1), ())
             ):
-                return self._label(other, position)
+                return self._label(other_unit, position)
             ends = f"{self._word(all_of[0], position)}…{self._word(all_of[-1], position)}"
             kin = family == self._units[unit].family
             return f"{{{counted(len(named), 'other') if kin else len(named)} of {ends}}}"
@@ -569,7 +571,7 @@ class _Draft:
                 yield replace(found, name=shown, namespace=namespace_of(shown))
 
     def _folded_enclaves(self, differing_parts: Set[Edge | str]) -> Iterator[PicturedEnclave]:
-        differing = {what if isinstance(what, str) else what.enclave for what in differing_parts}
+        differing = {part if isinstance(part, str) else part.enclave for part in differing_parts}
         for enclave in self._picture.enclaves:
             unit = self._of.get(enclave.path)
             if unit is None:
@@ -652,14 +654,14 @@ class _Draft:
         def word(named: int, position: int) -> str:
             return self._label(unit if named == instead else named, position)
 
-        enclaves = {what for what in drawn if isinstance(what, str)}
-        for what in drawn:
-            if isinstance(what, str):
-                yield f"enclave {self._owner(what).fill(word)}"
-            elif what.enclave not in enclaves:
-                deny = "" if what.qualifier is ALLOW else "DENY "
-                enclave = self._owner(what.enclave).fill(word)
-                yield f"{enclave} {deny}{what.right} {self._text(what.name).fill(word)}"
+        enclaves = {drawn_part for drawn_part in drawn if isinstance(drawn_part, str)}
+        for drawn_part in drawn:
+            if isinstance(drawn_part, str):
+                yield f"enclave {self._owner(drawn_part).fill(word)}"
+            elif drawn_part.enclave not in enclaves:
+                deny = "" if drawn_part.qualifier is ALLOW else "DENY "
+                enclave = self._owner(drawn_part.enclave).fill(word)
+                yield f"{enclave} {deny}{drawn_part.right} {self._text(drawn_part.name).fill(word)}"
 
 
 def _classes(views: Sequence[Counter[object]], before: Sequence[int]) -> dict[int, list[int]]:

@@ -113,8 +113,10 @@ def render_svg(picture: Picture, scene: Scene) -> str:
     """Return the scene as an SVG document; the same scene gives the same bytes."""
     legend = list(_legend(picture, scene))
     used = _USE if picture.overlay and picture.overlay.kind == "use" else ""
-    said = [line for headline in picture.headlines for line in _lines(f"{headline}.", scene.width)]
-    top = _HEAD + _SAID * len(said) + (8 if said else 0)
+    text_lines = [
+        line for headline in picture.headlines for line in _lines(f"{headline}.", scene.width)
+    ]
+    top = _HEAD + _SAID * len(text_lines) + (8 if text_lines else 0)
     height = scene.height + top + 16 + 20 * len(legend)
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {scene.width} {height}" '
@@ -128,7 +130,7 @@ def render_svg(picture: Picture, scene: Scene) -> str:
         f"{escape(_summary(picture, scene))}</text>",
         *(
             f'<text class="said" x="14" y="{_HEAD + 8 + _SAID * number}">{escape(line)}</text>'
-            for number, line in enumerate(said)
+            for number, line in enumerate(text_lines)
         ),
         f'<g transform="translate(0 {top})">',
         *_heads(scene),
@@ -189,7 +191,7 @@ def _link_text(link: Link, overlay: Overlay | None) -> str:
     if link.violates:
         text += ": breaks a requirement"
     if link.differs:
-        text += ": not for the equal ones"
+        text += ": not for the equal units"
     if overlay and link.mark is not OverlaySide.BOTH:
         text += f": {overlay.first if link.mark is OverlaySide.FIRST else overlay.second}"
     return f"{text}, {LEVEL_NAMES[link.level]}"
@@ -272,7 +274,7 @@ def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
     if any(link.violates for link in scene.links):
         rows.append(('<path class="link violates" d="M0 -4h40"/>', "breaks a requirement"))
     if any(link.differs for link in scene.links):
-        rows.append(('<path class="link differs" d="M0 -4h40"/>', "not for the equal ones"))
+        rows.append(('<path class="link differs" d="M0 -4h40"/>', "not for the equal units"))
     if picture.overlay:
         rows.append(('<path class="link first" d="M0 -4h40"/>', picture.overlay.first))
         rows.append(('<path class="link second" d="M0 -4h40"/>', picture.overlay.second))
@@ -504,10 +506,12 @@ def _link_label(picture: Picture, link: Link) -> str:
     if link.violates:
         text += ": breaks a requirement"
     if link.differs:
-        text += ": not for the equal ones"
+        text += ": not for the equal units"
     if picture.overlay and link.mark is not OverlaySide.BOTH:
-        said = picture.overlay.first if link.mark is OverlaySide.FIRST else picture.overlay.second
-        text += f": {said}"
+        text_lines = (
+            picture.overlay.first if link.mark is OverlaySide.FIRST else picture.overlay.second
+        )
+        text += f": {text_lines}"
     return text
 
 

@@ -395,9 +395,9 @@ class _Draft:
         notes += self._notes.get(node, ())
         notes += [
             f"{reach} {counted(self._looking[node, right], 'name')}: see {tag}"
-            for (other, right), tag in self._tags.items()
+            for (second_id, right), tag in self._tags.items()
             for reach in (_REACHES[right],)
-            if other == node and SENDS[right] is sends
+            if second_id == node and SENDS[right] is sends
         ]
         lines = wrapped_name(label, SIDE_LETTERS)
         return Card(
@@ -625,9 +625,9 @@ def _tops(
     tops: dict[str, float] = {}
     height = {item.id: item.height for column in columns for item in column}
     near: dict[str, list[str]] = defaultdict(list)
-    for one, other in lines:
-        near[one].append(other)
-        near[other].append(one)
+    for first_id, second_id in lines:
+        near[first_id].append(second_id)
+        near[second_id].append(first_id)
     for number in sorted(range(len(columns)), key=lambda number: abs(number - tallest)):
         wanted = {}
         for item in columns[number] if number != tallest else ():
@@ -672,9 +672,9 @@ def order_columns(
     fewest crossings of all sweeps.
     """
     near: dict[str, list[str]] = {item.id: [] for column in columns for item in column}
-    for one, other in lines:
-        near[one].append(other)
-        near[other].append(one)
+    for first_id, second_id in lines:
+        near[first_id].append(second_id)
+        near[second_id].append(first_id)
     current = [list(column) for column in columns]
     best, fewest = [list(column) for column in current], _crossings(current, lines)
     inner, outer = range(1, len(columns), 2), range(0, len(columns), 2)
@@ -723,11 +723,11 @@ def _crossings(columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[st
     total = 0
     for first in range(len(columns) - 1):
         pairs = []
-        for one, other in lines:
-            if side[one] > side[other]:
-                one, other = other, one
-            if side[one] == first:
-                pairs.append((place[one], place[other]))
+        for first_id, second_id in lines:
+            if side[first_id] > side[second_id]:
+                first_id, second_id = second_id, first_id
+            if side[first_id] == first:
+                pairs.append((place[first_id], place[second_id]))
         total += _inversions([end for _, end in sorted(pairs)], len(columns[first + 1]))
     return total
 

@@ -127,12 +127,12 @@ def _page_data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> d
         "join_needs_right": picture.join_needs_right,
         "enclaves": [_enclave_json(enclave) for enclave in picture.enclaves],
         "bundles": [
-            _bundle_json(each)
-            for each in fold(picture.names, picture.edges, separate_questions=True)
+            _bundle_json(bundle)
+            for bundle in fold(picture.names, picture.edges, separate_questions=True)
         ],
-        "scenes": [_scene_json(each) for each in scenes],
+        "scenes": [_scene_json(scene) for scene in scenes],
         "equal": as_plain(picture.equal),
-        "rows": [_row_json(each) for each in fold(drawn.names, drawn.edges)],
+        "rows": [_row_json(bundle) for bundle in fold(drawn.names, drawn.edges)],
         "differences": as_plain(picture.differences),
         "validities": as_plain(picture.validities),
         "findings": as_plain(picture.findings),
@@ -228,7 +228,7 @@ def without_folders(value: Any, folders: Sequence[str]) -> Any:
     if isinstance(value, Mapping):
         return {key: without_folders(each, folders) for key, each in value.items()}
     if isinstance(value, Sequence):
-        return [without_folders(each, folders) for each in value]
+        return [without_folders(item, folders) for item in value]
     return value
 
 
@@ -334,14 +334,14 @@ def _demo_scenario(scenario: Json) -> str:
     parts = [f"<section><h2>{escape(scenario['title'])}</h2>"]
     if scenario.get("cast"):
         members = (
-            f"<b>{escape(each['part'])}</b> {escape(each['enclave'])}"
-            + (f" as node {escape(', '.join(each['nodes']))}" if each["nodes"] else "")
-            + (f" ({escape(each['why'])})" if each.get("why") else "")
-            for each in scenario["cast"]
+            f"<b>{escape(member['part'])}</b> {escape(member['enclave'])}"
+            + (f" as node {escape(', '.join(member['nodes']))}" if member["nodes"] else "")
+            + (f" ({escape(member['why'])})" if member.get("why") else "")
+            for member in scenario["cast"]
         )
         parts.append(f'<p class="soft">Cast: {"; ".join(members)}.</p>')
     if keystore := scenario.get("keystore"):
-        used = len({each["enclave"] for each in scenario["cast"]})
+        used = len({member["enclave"] for member in scenario["cast"]})
         played = f"Parts are played by {used} of {keystore['enclaves']} enclaves"
         elsewhere = keystore["elsewhere"]
         played += f"; the keys of {elsewhere} are elsewhere" if elsewhere else ""
@@ -451,11 +451,11 @@ def render_fleet_page(
                 "confirm by Ansible or <code>sros agent</code>; <code>sros fleet report</code> "
                 "does not tell what runs.</p>"
             )
-    said = "".join(f"<br>{_sentence(fact)}" for fact in facts)
+    fact_lines = "".join(f"<br>{_sentence(fact)}" for fact in facts)
     head = (
         f"<header><h1>Status of the fleet</h1>"
         f"<p>Keystore <code>{escape(status['keystore'])}</code>, {len(status['robots'])} robots, "
-        f"as of {_minute(status['at'])} UTC.{said}</p>"
+        f"as of {_minute(status['at'])} UTC.{fact_lines}</p>"
         f'<ul class="tiles">{tiles}</ul>{trusted}</header>'
     )
     heads = "".join(f'<th scope="col">{name}</th>' for name in _FLEET_COLUMNS)

@@ -403,8 +403,10 @@ class Requirements(NamedTuple):
             return (holds,)
         number = len(self.violations)
         more = (f"{number - _SAID} more do not hold",) if number > _SAID else ()
-        said = (f"Violated: {violation.text}" for violation in self.violations[:_SAID])
-        return (*said, *more, *((holds,) if self.hold else ()))
+        violation_sentences = (
+            f"Violated: {violation.text}" for violation in self.violations[:_SAID]
+        )
+        return (*violation_sentences, *more, *((holds,) if self.hold else ()))
 
 
 class EqualUnits(NamedTuple):
@@ -542,8 +544,9 @@ class Picture:
 
 def _sentence_on_export(title: str) -> str:
     return (
-        f"'{title}' is an export, which may lack enclaves: what is said of one, all or no enclave "
-        "is said of the enclaves in this export. Draw the keystore that it comes from to see all"
+        f"'{title}' is an export, which may lack enclaves: statements about one, all or no "
+        "enclave are about the enclaves in this export. Draw the keystore that it comes from to "
+        "see all"
     )
 
 

@@ -142,7 +142,7 @@ def _digest_of(
     ]
     if len(hidden) < len(enclaves):
         return ""
-    return hashlib.sha256(b"".join(sorted(each.digest() for each in hidden))).hexdigest()
+    return hashlib.sha256(b"".join(sorted(digest.digest() for digest in hidden))).hexdigest()
 
 
 def _without_unit_names(text: str, unit: DrawnUnit, names: UnitNames) -> str:

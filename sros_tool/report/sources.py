@@ -576,10 +576,12 @@ def _with_keystore(source: PictureSource, sample: SampledKeystore, now: datetime
 
 def _joint_governance(governances: Iterable[Governance | None]) -> Governance | None:
     """Return the rules of all governance documents: access that one of them opens is open."""
-    distinct = [each for each in dict.fromkeys(governances) if each is not None]
+    distinct = [governance for governance in dict.fromkeys(governances) if governance is not None]
     if len(distinct) < 2:
         return distinct[0] if distinct else None
-    return Governance(tuple(rule for each in distinct for rule in each.domain_access_rules))
+    return Governance(
+        tuple(rule for governance in distinct for rule in governance.domain_access_rules)
+    )
 
 
 def _with_enclave(source: PictureSource, folder: Path, now: datetime) -> PictureSource:
@@ -654,7 +656,9 @@ def _attach_to_known_enclave(finding: PicturedFinding, known: Set[str]) -> Pictu
 
 
 def _without_paths(finding: PicturedFinding, places: Mapping[str, str]) -> PicturedFinding:
-    text, remedy = (_without_path(each, places) for each in (finding.text, finding.remedy))
+    text, remedy = (
+        _without_path(text_with_paths, places) for text_with_paths in (finding.text, finding.remedy)
+    )
     return replace(finding, text=text, remedy=remedy)
 
 

@@ -755,11 +755,11 @@ def main() -> int:
     domain, wanted = int(sys.argv[1]), {int(pid) for pid in sys.argv[2:]}
     with Participant(domain) as participant:
         end = time.monotonic() + _LOOK_SECONDS
-        while not wanted <= {*(told := participant.process_ids()).values()}:
+        while not wanted <= {*(process_ids := participant.process_ids()).values()}:
             if time.monotonic() > end:
                 break
             time.sleep(0.05)
-    echo(json.dumps(told))
+    echo(json.dumps(process_ids))
     return 0
 
 

@@ -600,7 +600,7 @@ def _may_speak(command: tuple[str, ...]) -> bool:
 def _is_sros_run(command: tuple[str, ...]) -> bool:
     """Return whether a command is ``sros run``, which later becomes the command of the node."""
     names = [Path(word).name for word in command[:4]]
-    return "run" in names and any(each in names for each in _SCRIPTS_OF_SROS)
+    return "run" in names and any(script in names for script in _SCRIPTS_OF_SROS)
 
 
 def _configuration_of(process: Process) -> LoadedFile | None:
@@ -854,7 +854,7 @@ class ProcessRoot:
         file or folder itself.  Each part is opened in the folder before it, and the system follows
         no link, so nothing outside of the root directory is reached.
         """
-        rest = [each for each in path.split("/")[::-1] if each]
+        rest = [part for part in path.split("/")[::-1] if part]
         way = [("/", os.fstat(self._handle))]
         folders: list[tuple[str, int]] = []
         links = 0
@@ -884,7 +884,7 @@ class ProcessRoot:
                 if target.startswith("/"):
                     while folders:
                         os.close(folders.pop()[1])
-                rest += [each for each in target.split("/")[::-1] if each]
+                rest += [part for part in target.split("/")[::-1] if part]
             last = folders[-1] if folders else ("/", self._handle)
             way.append((last[0], os.fstat(last[1])))
             yield last[1], way

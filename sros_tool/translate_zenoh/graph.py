@@ -107,7 +107,11 @@ def graph_rules(
     allowed, denied = tokens.of(rights)
     # A node of ``nodes`` stays, unless the denial is needed for others.
     denied += tokens.of_nodes_and_endpoints(
-        [each for each in without if any(map(each.meets, left)) or not any(map(each.meets, nodes))]
+        [
+            denial
+            for denial in without
+            if any(map(denial.meets, left)) or not any(map(denial.meets, nodes))
+        ]
     )
     everything = f"{GRAPH}/{domain}/{ANY_CHUNKS}"
     if allowed:
@@ -330,9 +334,9 @@ def _with_the_same_beginning(groups: Sequence[AnnouncedNodes]) -> Mapping[int, s
     return nearby
 
 
-def _have_common(one: AnnouncedNodes, other: AnnouncedNodes) -> bool:
+def _have_common(first: AnnouncedNodes, second: AnnouncedNodes) -> bool:
     """Return whether some node is in both groups."""
-    left, right = (names_of(nodes.allowed) - names_of(nodes.denied) for nodes in (one, other))
+    left, right = (names_of(nodes.allowed) - names_of(nodes.denied) for nodes in (first, second))
     return not (left & right).is_empty()
 
 

@@ -368,15 +368,15 @@ class _RuleOfPeer(NamedTuple):
         ]
 
 
-def _shared(one: _Place, other: _Place) -> tuple[Message, ...]:
+def _shared(first: _Place, second: _Place) -> tuple[Message, ...]:
     """Return the messages that two rules allow in the same direction."""
-    if one[0] is not other[0] or not (one[2] and other[2]):
+    if first[0] is not second[0] or not (first[2] and second[2]):
         return ()
-    return tuple(message for message in one[1] if message in other[1])
+    return tuple(message for message in first[1] if message in second[1])
 
 
-def _added_keys(some: tuple[str, ...], others: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(sorted({*some, *others})) if some else others
+def _added_keys(first_keys: tuple[str, ...], second_keys: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(sorted({*first_keys, *second_keys})) if first_keys else second_keys
 
 
 def narrowed_rights(rights: RemoteRights, most: Iterable[AccessRule], kept: str) -> RemoteRights:

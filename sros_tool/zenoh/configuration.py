@@ -393,7 +393,7 @@ class RenderedReader:
             elif _control(rights, once=False) != control:
                 return None
             remotes = tuple(
-                RemoteRights(each.name, tuple(map(self._rule, each.rules))) for each in rights
+                RemoteRights(right.name, tuple(map(self._rule, right.rules))) for right in rights
             )
             return replace(found, access_control=AccessControl(remotes), settings=settings)
         except (ValueError, KeyError, IndexError, TypeError, RecursionError):

@@ -77,12 +77,12 @@ class Delivery:
     @property
     def arrives(self) -> bool:
         """Whether the message arrives: a sample, a request or a token."""
-        return all(each.allowed for each in self.checks)
+        return all(check.allowed for check in self.checks)
 
     @property
     def answered(self) -> bool:
         """Whether the reply arrives, too."""
-        return self.arrives and all(each.allowed for each in self.replies)
+        return self.arrives and all(check.allowed for check in self.replies)
 
 
 Route = tuple[ZenohProcess, ...]

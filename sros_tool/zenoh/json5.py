@@ -118,10 +118,10 @@ def _is_deep(value: Any) -> bool:
     for _ in range(_MOST_DEPTH):
         if not level:
             return False
-        inner = [each.values() if isinstance(each, dict) else each for each in level
-                 if isinstance(each, dict | list)]  # fmt: skip
-        level = [each for of in inner for each in of]
-    return any(isinstance(each, dict | list) for each in level)
+        inner = [value.values() if isinstance(value, dict) else value for value in level
+                 if isinstance(value, dict | list)]  # fmt: skip
+        level = [value for of in inner for value in of]
+    return any(isinstance(value, dict | list) for value in level)
 
 
 def _tokens(text: str, maximum: int) -> Iterator[_Token]:

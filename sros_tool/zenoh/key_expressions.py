@@ -96,7 +96,9 @@ class KeyExpressions:
         wider, compared = {}, 0
         for expression in self.all:
             wider[expression] = candidates = self._beginning_as(expression)
-            compared += sum(len(same) for by_form in candidates for same in by_form.values())
+            compared += sum(
+                len(expressions) for by_form in candidates for expressions in by_form.values()
+            )
             if compared > _MOST_COMPARED:
                 return sorted(self.all)
         return sorted(
@@ -225,45 +227,45 @@ def widest_expression(expression: str) -> str:
     return canonical(chunk if chunk.startswith("@") else ANY_CHUNKS for chunk in chunks)
 
 
-def intersects(one: str, other: str) -> bool:
+def intersects(first: str, second: str) -> bool:
     """Return whether some key belongs to both expressions, as Zenoh decides."""
-    return sequences_intersect(_chunks(one), _chunks(other))
+    return sequences_intersect(_chunks(first), _chunks(second))
 
 
 @lru_cache(maxsize=_MANY)
-def sequences_intersect(one: tuple[str, ...], other: tuple[str, ...]) -> bool:
+def sequences_intersect(first: tuple[str, ...], second: tuple[str, ...]) -> bool:
     """Return whether some key belongs to both expressions, given as chunks."""
-    return _sequences_intersect(one, other, ANY_CHUNKS, chunks_intersect)
+    return _sequences_intersect(first, second, ANY_CHUNKS, chunks_intersect)
 
 
-def chunks_intersect(one: str, other: str) -> bool:
+def chunks_intersect(first: str, second: str) -> bool:
     """Return whether some key belongs to both of two chunks."""
-    if one == other:
+    if first == second:
         return True
-    if ANY_CHUNKS in (one, other):
-        return not (one + other).replace(ANY_CHUNKS, "").startswith("@")
-    if one.startswith("@") or other.startswith("@"):
+    if ANY_CHUNKS in (first, second):
+        return not (first + second).replace(ANY_CHUNKS, "").startswith("@")
+    if first.startswith("@") or second.startswith("@"):
         return False
-    if ANY_CHUNK in (one, other):
+    if ANY_CHUNK in (first, second):
         return True
-    if "*" not in one and "*" not in other:
+    if "*" not in first and "*" not in second:
         return False
     # "\0" is no character of a key: here it stands for any characters.
-    left, right = (chunk.replace(ANY_PART, "\0") for chunk in (one, other))
+    left, right = (chunk.replace(ANY_PART, "\0") for chunk in (first, second))
     return _sequences_intersect(left, right, "\0", lambda a, b: "\0" in (a, b) or a == b)
 
 
 def _sequences_intersect(
-    one: Sequence[str], other: Sequence[str], many: str, meet: Callable[[str, str], bool]
+    first: Sequence[str], second: Sequence[str], many: str, meet: Callable[[str, str], bool]
 ) -> bool:
     """Return whether two sequences can be equal; ``many`` stands for any number of members.
 
     ``meet`` returns whether two members can be equal.
     """
     reached = {0}
-    for left in (*one, None):
+    for left in (*first, None):
         for at in sorted(reached):
-            while at < len(other) and other[at] == many:
+            while at < len(second) and second[at] == many:
                 at += 1
                 reached.add(at)
         if left is None:
@@ -272,13 +274,13 @@ def _sequences_intersect(
         for at in sorted(reached):
             if left == many:
                 following.add(at)
-                while at < len(other) and meet(left, other[at]):
+                while at < len(second) and meet(left, second[at]):
                     at += 1
                     following.add(at)
-            elif at < len(other) and meet(left, other[at]):
-                following.add(at if other[at] == many else at + 1)
+            elif at < len(second) and meet(left, second[at]):
+                following.add(at if second[at] == many else at + 1)
         reached = following
-    return len(other) in reached
+    return len(second) in reached
 
 
 # ── what two expressions have in common ────────────────────────────────────────────────────
@@ -291,19 +293,19 @@ class TooManyExpressions(Exception):  # noqa: N818 - the caller makes an error o
     """The common keys of two key expressions take too many key expressions."""
 
 
-def common(one: str, other: str) -> list[str]:
+def common(first: str, second: str) -> list[str]:
     """Return key expressions for exactly the keys that both expressions include.
 
     Raises:
         TooManyExpressions: there are too many.
     """
-    if includes(one, other):
-        return [other]
-    if includes(other, one):
-        return [one]
-    if not intersects(one, other):
+    if includes(first, second):
+        return [second]
+    if includes(second, first):
+        return [first]
+    if not intersects(first, second):
         return []
-    shared = _common_parts(one.split("/"), other.split("/"), ANY_CHUNKS, common_chunks)
+    shared = _common_parts(first.split("/"), second.split("/"), ANY_CHUNKS, common_chunks)
     return KeyExpressions(canonical(chunks) for chunks in shared).needed()
 
 
@@ -312,18 +314,18 @@ _ANY_LETTERS = "\0"
 
 
 @lru_cache(maxsize=_MANY)
-def common_chunks(one: str, other: str) -> tuple[str, ...]:
+def common_chunks(first: str, second: str) -> tuple[str, ...]:
     """Return chunks that together match what both chunks match; ``**`` matches any chunk."""
-    if one == other:
-        return (one,)
-    if ANY_CHUNKS in (one, other):
-        chunk = other if one == ANY_CHUNKS else one
+    if first == second:
+        return (first,)
+    if ANY_CHUNKS in (first, second):
+        chunk = second if first == ANY_CHUNKS else first
         return () if chunk.startswith("@") else (chunk,)
-    if not chunks_intersect(one, other):
+    if not chunks_intersect(first, second):
         return ()
-    if ANY_CHUNK in (one, other):
-        return (other if one == ANY_CHUNK else one,)
-    left, right = (chunk.replace(ANY_PART, _ANY_LETTERS) for chunk in (one, other))
+    if ANY_CHUNK in (first, second):
+        return (second if first == ANY_CHUNK else first,)
+    left, right = (chunk.replace(ANY_PART, _ANY_LETTERS) for chunk in (first, second))
     shared = {
         "".join(letters).replace(_ANY_LETTERS, ANY_PART)
         for letters in _common_parts(left, right, _ANY_LETTERS, _common_letters)
@@ -331,15 +333,15 @@ def common_chunks(one: str, other: str) -> tuple[str, ...]:
     return tuple(sorted(shared))
 
 
-def _common_letters(one: str, other: str) -> tuple[str, ...]:
-    if _ANY_LETTERS in (one, other):
-        return (other if one == _ANY_LETTERS else one,)
-    return (one,) if one == other else ()
+def _common_letters(first: str, second: str) -> tuple[str, ...]:
+    if _ANY_LETTERS in (first, second):
+        return (second if first == _ANY_LETTERS else first,)
+    return (first,) if first == second else ()
 
 
 def _common_parts(
-    one: Sequence[str],
-    other: Sequence[str],
+    first_sequence: Sequence[str],
+    second_sequence: Sequence[str],
     many: str,
     meet: Callable[[str, str], tuple[str, ...]],
 ) -> set[tuple[str, ...]]:
@@ -350,17 +352,20 @@ def _common_parts(
 
     @cache
     def common_sequences_from(in_first: int, in_second: int) -> frozenset[tuple[str, ...]]:
-        left, right = one[in_first : in_first + 1], other[in_second : in_second + 1]
+        left, right = (
+            first_sequence[in_first : in_first + 1],
+            second_sequence[in_second : in_second + 1],
+        )
         if not left and not right:
             return frozenset({()})
         sequences: set[tuple[str, ...]] = set()
         first, second = (members[0] if members else "" for members in (left, right))
         if first == many == second:
             # One of them stands for no more than the other, which goes on.
-            for rest in common_sequences_from(in_first + 1, in_second) | common_sequences_from(
-                in_first, in_second + 1
-            ):
-                sequences.add(rest if rest[:1] == (many,) else (many, *rest))
+            for common_rest in common_sequences_from(
+                in_first + 1, in_second
+            ) | common_sequences_from(in_first, in_second + 1):
+                sequences.add(common_rest if common_rest[:1] == (many,) else (many, *common_rest))
         elif many in (first, second):
             sequences |= (
                 common_sequences_from(in_first + 1, in_second)
@@ -373,10 +378,14 @@ def _common_parts(
                     if first == many
                     else common_sequences_from(in_first + 1, in_second)
                 )
-                sequences |= {(member, *rest) for member in meet(first, second) for rest in more}
+                sequences |= {
+                    (member, *common_rest) for member in meet(first, second) for common_rest in more
+                }
         elif left and right:
             more = common_sequences_from(in_first + 1, in_second + 1)
-            sequences |= {(member, *rest) for member in meet(first, second) for rest in more}
+            sequences |= {
+                (member, *common_rest) for member in meet(first, second) for common_rest in more
+            }
         if len(sequences) > _MOST_COMMON:
             raise TooManyExpressions
         return frozenset(sequences)

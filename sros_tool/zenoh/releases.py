@@ -46,7 +46,7 @@ RELEASES = (
 
 def release_of(version: Version) -> RmwZenohRelease:
     """Return the latest release whose ``begin`` is not later than a version."""
-    begun = (each for each in reversed(RELEASES) if each.begin <= version)
+    begun = (release for release in reversed(RELEASES) if release.begin <= version)
     return next(begun, RELEASES[0])
 
 

@@ -72,14 +72,14 @@ def subtract_all(allowed: frozenset[Chunks], denied: frozenset[Chunks]) -> froze
     return frozenset(left)
 
 
-def _uncovered(some: frozenset[Chunks]) -> list[Chunks]:
+def _uncovered(expressions: frozenset[Chunks]) -> list[Chunks]:
     """Return the expressions that no other one covers; if there are many, perhaps more."""
     wide: list[Chunks] = []
     left: list[Chunks] = []
     for expression in sorted(
-        some, key=lambda chunks: (-chunks.count(ANY_CHUNKS), len(chunks), chunks)
+        expressions, key=lambda chunks: (-chunks.count(ANY_CHUNKS), len(chunks), chunks)
     ):
-        if not any(_covers(other, expression) for other in wide):
+        if not any(_covers(wider, expression) for wider in wide):
             left.append(expression)
             if "*" in "".join(expression) and len(wide) < _MOST_COMPARED:
                 wide.append(expression)
@@ -288,7 +288,9 @@ def _kinds(first: str, some: tuple[str, ...]) -> Mapping[frozenset[str], Chunks]
     shared_by_kind: dict[frozenset[str], Chunks] = {frozenset(): (first,)}
     for chunk in wild:
         for kind, both in list(shared_by_kind.items()):
-            if shared := tuple(c for other in both for c in common_chunks(other, chunk)):
+            if shared := tuple(
+                c for common_chunk in both for c in common_chunks(common_chunk, chunk)
+            ):
                 shared_by_kind[kind | {chunk}] = shared
         _check_number(len(shared_by_kind), _MOST_KINDS)
     kinds = {
@@ -323,7 +325,7 @@ def _chunks(first: str, some: tuple[str, ...], kinds: frozenset[frozenset[str]])
     every = _kinds(first, some)
 
     def are_allowed(others: Iterable[frozenset[str]]) -> bool:
-        return all(any(other <= kind for kind in kinds) for other in others)
+        return all(any(other_kind <= kind for kind in kinds) for other_kind in others)
 
     if are_allowed(every):
         return (first,)
@@ -334,7 +336,7 @@ def _chunks(first: str, some: tuple[str, ...], kinds: frozenset[frozenset[str]])
     chosen: dict[str, None] = {}
     for kind in sorted(kinds, key=sorted):
         others = frozenset(some) - kind
-        if are_allowed(other for other in every if kind <= other):
+        if are_allowed(kind_of_chunk for kind_of_chunk in every if kind <= kind_of_chunk):
             others = frozenset()
         chosen |= dict.fromkeys(c for chunk in every[kind] for c in _chunks_less(chunk, others))
     choices.append(tuple(chosen))
@@ -594,9 +596,9 @@ class Difference(NamedTuple):
         return [canonical((self.begin, *name)) + end for name in names]
 
 
-def _common_end(one: str, other: str) -> str | None:
+def _common_end(first: str, second: str) -> str | None:
     """Return what two endings share, or None; "/**" in one includes the other."""
-    end, longer = sorted((one, other), key=len)
+    end, longer = sorted((first, second), key=len)
     return end if longer in (end, f"{end}/{ANY_CHUNKS}") else None
 
 
@@ -733,13 +735,13 @@ def _common_of_differences(
 
 
 @lru_cache(maxsize=_MANY)
-def _common_of_tokens(one: KeyExpressions, other: KeyExpressions) -> frozenset[str]:
-    if one.all == other.all:
-        return one.all
-    shared = {token for token in one.all if other.include(token)}
-    not_included = [token for token in one.all if token not in shared]
-    for token in other.all if not_included else ():
-        if one.include(token):
+def _common_of_tokens(first: KeyExpressions, second: KeyExpressions) -> frozenset[str]:
+    if first.all == second.all:
+        return first.all
+    shared = {token for token in first.all if second.include(token)}
+    not_included = [token for token in first.all if token not in shared]
+    for token in second.all if not_included else ():
+        if first.include(token):
             shared.add(token)
         else:
             # Tokens of `one` that `other` includes are shared as they are.

@@ -280,7 +280,7 @@ def _form_findings(grant: Grant, name: str, file: str) -> Iterator[Finding]:
     problems = [text for rule in grant.rules for text in _domain_problems(rule.domains)]
     for problem in dict.fromkeys(problems):
         yield DOMAIN_RANGE.found(name, f"the range {problem}", file)
-    criteria = [each for rule in grant.rules for each in (*rule.publish, *rule.subscribe)]
+    criteria = [criterion for rule in grant.rules for criterion in (*rule.publish, *rule.subscribe)]
     if any(criterion.partitions for criterion in criteria):
         yield PARTITIONS.found(name, _partitions_text(grant), file)
     if any(not topic.strip() for criterion in criteria for topic in criterion.topics):
@@ -734,7 +734,10 @@ def _topic_rules(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
     if not any(covers(expression, ROS_DISCOVERY_TOPIC) for expression in expressions):
         yield NO_TOPIC_RULE, f"no topic rule matches {ROS_DISCOVERY_TOPIC}"
     elif "*" not in expressions:
-        of_ros = all(any(covers(expression, one) for expression in expressions) for one in _OF_ROS)
+        of_ros = all(
+            any(covers(expression, expression_of_ros) for expression in expressions)
+            for expression_of_ros in _OF_ROS
+        )
         yield NO_OTHER_TOPIC_RULE if of_ros else NO_TOPIC_RULE, "there is no rule for *"
     names = Names(expressions)
     first = {expression: index for index, expression in reversed([*enumerate(expressions)])}

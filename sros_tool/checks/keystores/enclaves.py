@@ -289,7 +289,7 @@ def _token_findings(enclave: CheckedEnclave, place: TokenUri) -> Iterator[Findin
     """Yield findings about a key on a token, without opening the token."""
     name, file = enclave.name, enclave.file(KEY_URI_FILE)
     yield ON_TOKEN.found(name, f"its key is {place.object!r} on the token {place.token!r}", file)
-    if any((enclave.folder / each).exists() for each in ZENOH_FILES):
+    if any((enclave.folder / zenoh_file).exists() for zenoh_file in ZENOH_FILES):
         yield TOKEN_ON_ZENOH.found(name, "it has no key.pem", file)
     here = not enclave.keystore.is_original or Path(place.pin_source).exists()
     for problem in (pin_file_problem(place), pin_line_break(place)) if here else ():
@@ -314,9 +314,9 @@ def _certificate_findings(
 ) -> Iterator[Finding]:
     name, file = enclave.name, enclave.file("cert.pem")
     # Other PKIs have names of their own, which no vendor compares with the folder.
-    said = common_name_of(certificate.subject)
-    of_another = said.startswith("/") or f"/{said}" in enclave.keystore.names
-    if of_another and said.removeprefix("/") != name.removeprefix("/"):
+    certified_name = common_name_of(certificate.subject)
+    of_another = certified_name.startswith("/") or f"/{certified_name}" in enclave.keystore.names
+    if of_another and certified_name.removeprefix("/") != name.removeprefix("/"):
         text = f"its subject is {subject_text(certificate.subject)}"
         yield NAME_MISMATCH.found(name, text, file)
     yield from key_findings(certificate, name, file)

@@ -118,8 +118,8 @@ NOT_IN_EXPORT = FindingKind(
     "keystore.not-in-export",
     NOTE,
     "enclaves of the policy that the export does not have",
-    "A robot needs only the enclaves of its own processes; a node that starts in another one fails "
-    "there.",
+    "A robot needs only the enclaves of its own processes; a node that starts in another enclave "
+    "fails there.",
     "rcl 9 (security.c).",
     "Export an enclave as well if a process of this robot runs in it: `sros distribute_key "
     "KEYSTORE ENCLAVE EXPORT`.",

@@ -141,7 +141,7 @@ def keystore_findings(
     stated = {} if vendors else _stated_distributions(keystore, names)
     deciding = {name: _vendors_of(each) for name, each in stated.items()}
     if stated:
-        union = {vendor for each in deciding.values() for vendor in each}
+        union = {vendor for vendors_of_one in deciding.values() for vendor in vendors_of_one}
         asked = asked if len(stated) < len(names) else asked_vendors(tuple(union))
     about_authorities = list(check_authorities(keystore))
     first, common = _governing(keystore, names)
@@ -194,7 +194,9 @@ def keystore_findings(
         parts = [
             replace(
                 policy,
-                enclaves=tuple(each for each in policy.enclaves if each.path in only_enclaves),
+                enclaves=tuple(
+                    enclave for enclave in policy.enclaves if enclave.path in only_enclaves
+                ),
             )
             if only_enclaves is not None
             else policy
@@ -225,7 +227,7 @@ def _stated_distributions(
 
 def _vendors_of(distributions: Sequence[Distribution]) -> tuple[Vendor, ...]:
     """Return the vendors that decide for some distributions, in the order of all vendors."""
-    shipped = {vendor for each in distributions for vendor in each.vendors}
+    shipped = {vendor for distribution in distributions for vendor in distribution.vendors}
     return tuple(vendor for vendor in TESTED if vendor in shipped)
 
 
@@ -250,9 +252,9 @@ def with_joined_findings(findings: Sequence[Finding]) -> list[Finding]:
     """Return findings; those that a shared file or a keystore setting causes are joined."""
     together: dict[tuple[object, ...], list[Finding]] = {}
     for finding in findings:
-        one = finding.accepted or finding.id in _OF_THE_KEYSTORE
+        joined = finding.accepted or finding.id in _OF_THE_KEYSTORE
         file = "" if finding.id in _OF_SEVERAL_FILES else finding.file
-        place = (finding.accepted,) if one else (file, finding.line, finding.text)
+        place = (finding.accepted,) if joined else (file, finding.line, finding.text)
         together.setdefault((finding.id, *place), []).append(finding)
     return [_joined_finding(group) for group in together.values()]
 

@@ -96,10 +96,10 @@ def check_capitals(enclaves: Mapping[str, frozenset[str]]) -> Iterator[Finding]:
     for enclave, names in sorted(enclaves.items()):
         for name in sorted(names):
             spelled.setdefault(name.lower(), {}).setdefault(name, enclave)
-    for some in spelled.values():
-        if len(some) > 1:
-            text = " and ".join(f"{name} (in {enclave})" for name, enclave in some.items())
-            yield CAPITALS.found(next(iter(some.values())), f"{text} differ only in capitals")
+    for spellings in spelled.values():
+        if len(spellings) > 1:
+            text = " and ".join(f"{name} (in {enclave})" for name, enclave in spellings.items())
+            yield CAPITALS.found(next(iter(spellings.values())), f"{text} differ only in capitals")
 
 
 def names_without_wildcards(grant: Grant) -> frozenset[str]:

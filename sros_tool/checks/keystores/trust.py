@@ -147,16 +147,18 @@ def _strangers(
     alike: dict[frozenset[_Kind], list[str]] = defaultdict(list)
     for shown, of_target in read.items():
         alike[frozenset(of_target)].append(shown)
-    parties = {same[0]: list(read[same[0]].values()) for same in alike.values()}
+    parties = {
+        targets_alike[0]: list(read[targets_alike[0]].values()) for targets_alike in alike.values()
+    }
     roles = range(1 if on_zenoh else len(ROLES))
     # Which targets each one is refused by, in which roles; targets with the same are one group.
     refused_by: dict[str, dict[str, tuple[int, ...]]] = {shown: {} for shown in parties}
-    for one, other in combinations(parties, 2):
-        if refused := _refused_roles(parties[one], parties[other], roles):
-            refused_by[one][other] = refused_by[other][one] = refused
+    for first_target, other in combinations(parties, 2):
+        if refused := _refused_roles(parties[first_target], parties[other], roles):
+            refused_by[first_target][other] = refused_by[other][first_target] = refused
     groups: dict[tuple[tuple[str, tuple[int, ...]], ...], list[str]] = defaultdict(list)
-    for same in alike.values():
-        groups[tuple(refused_by[same[0]].items())] += same
+    for targets_alike in alike.values():
+        groups[tuple(refused_by[targets_alike[0]].items())] += targets_alike
     for some, others in combinations(groups.values(), 2):
         if refused := refused_by[some[0]].get(others[0], ()):
             authorities = " and ".join(f"{ROLES[role]} CA" for role in refused)
@@ -176,8 +178,12 @@ def _refused_roles(
     () if one pair does not, or if no enclave can be read.
     """
     pairs = (
-        tuple(role for role in roles if not (one.accepts(other, role) and other.accepts(one, role)))
-        for one, other in product(some, others)
+        tuple(
+            role
+            for role in roles
+            if not (first_target.accepts(other, role) and other.accepts(first_target, role))
+        )
+        for first_target, other in product(some, others)
     )
     return min(pairs, key=len, default=())
 
@@ -196,7 +202,7 @@ def _parties(keystore: Keystore, enclaves: Sequence[str]) -> Iterator[tuple[_Kin
                 keystore.read(folder / PERMISSIONS_CA_FILE, "CA certificate"),
             )
             party = _Party(certificate, trusted)
-            issuers = tuple(issued_by(certificate, each) for each in party.trusted[0])
+            issuers = tuple(issued_by(certificate, authority) for authority in party.trusted[0])
             message = keystore.read(folder / PERMISSIONS_FILE, "permissions document")
             # Which of several CAs signed them differs only in a rotation.
             if (shown := (party.trusted, issuers)) in seen and len(party.trusted[1]) == 1:
@@ -301,7 +307,7 @@ class _Governed:
 
 def _domains_meet(some: Sequence[DomainSet], others: Sequence[DomainSet]) -> bool:
     pairs = list(product(some, others))
-    return not pairs or any((one & other).ranges for one, other in pairs)
+    return not pairs or any((first_target & other).ranges for first_target, other in pairs)
 
 
 class _Incompatibility(NamedTuple):
@@ -323,11 +329,11 @@ def _incompatible_governance_findings(
     shown_before: list[str] = []
     for shown, own in governed.items():
         found: dict[_Incompatibility, list[str]] = defaultdict(list)
-        for other in shown_before:
-            if frozenset((shown, other)) not in refused_pairs and (
-                incompatibility := _incompatibility_of(own, governed[other])
+        for other_shown in shown_before:
+            if frozenset((shown, other_shown)) not in refused_pairs and (
+                incompatibility := _incompatibility_of(own, governed[other_shown])
             ):
-                found[incompatibility].append(other)
+                found[incompatibility].append(other_shown)
         for incompatibility, others in found.items():
             groups[incompatibility, tuple(others)].append(shown)
         shown_before.append(shown)

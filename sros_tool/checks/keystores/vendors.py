@@ -179,7 +179,9 @@ def evaluate(
         }
         for number in numbers
     }
-    participants = [participant for some in by_domain.values() for participant in some.values()]
+    participants = [
+        participant for by_vendor in by_domain.values() for participant in by_vendor.values()
+    ]
     state = accepted_state(enclave.state, participants) if participants else enclave.state
     checked = CheckedEnclave(keystore, enclave.name, state)
     return EnclaveEvaluation(checked, by_domain, there.portable is not None, distributions)
@@ -343,13 +345,13 @@ def _differences(
         (verb, topic) for topic in topics for verb in (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
     ]
     for verb, topic in questions:
-        said: dict[Outcome, list[Vendor]] = {}
+        vendors_by_outcome: dict[Outcome, list[Vendor]] = {}
         for vendor, answer in answers.items():
-            said.setdefault(answer.decide(verb, topic).outcome, []).append(vendor)
-        if len({outcome.ok for outcome in said}) > 1:
+            vendors_by_outcome.setdefault(answer.decide(verb, topic).outcome, []).append(vendor)
+        if len({outcome.ok for outcome in vendors_by_outcome}) > 1:
             answers_text = ", ".join(
                 f"{', '.join(evaluation.titles(vendors))}: {outcome.value}"
-                for outcome, vendors in said.items()
+                for outcome, vendors in vendors_by_outcome.items()
             )
             yield f"{verb.value} {topic} ({answers_text})"
 
@@ -472,7 +474,7 @@ def with_start_finding(
             titles = evaluation.titles([participant.vendor for participant in running])
             where += f"on {' and '.join(titles)} "
         finding = NO_NODE.found(enclave.name, f"{where}{worst}", enclave.file(PERMISSIONS_FILE))
-        return [*(each for each in known_findings if not worst.explains(each)), finding]
+        return [*(finding for finding in known_findings if not worst.explains(finding)), finding]
     return [*known_findings]
 
 
@@ -481,8 +483,8 @@ def _states_all(grant: Grant) -> bool:
     if len(grant.rules) != 1 or not grant.rules[0].allow:
         return False
     published, subscribed = (
-        {topic for criteria in some for topic in criteria.topics}
-        for some in (grant.rules[0].publish, grant.rules[0].subscribe)
+        {topic for criteria in side_criteria for topic in criteria.topics}
+        for side_criteria in (grant.rules[0].publish, grant.rules[0].subscribe)
     )
     return (
         published.issuperset(topic for verb, topic in _ENDPOINTS if verb is AccessVerb.PUBLISH)
@@ -592,10 +594,10 @@ def _is_own(topic: str) -> bool:
 
 def with_causes(findings: Sequence[Finding]) -> list[Finding]:
     """Return the findings, with a common cause if several enclaves let no node start."""
-    same: dict[str, list[Finding]] = defaultdict(list)
+    similar_findings: dict[str, list[Finding]] = defaultdict(list)
     for finding in findings:
         if finding.kind is NO_NODE:
-            same[finding.text].append(finding)
+            similar_findings[finding.text].append(finding)
     causes = {
         text: Cause(
             f"{counted(len(group), 'enclave')} in which no ordinary ROS 2 node can start",
@@ -603,7 +605,7 @@ def with_causes(findings: Sequence[Finding]) -> list[Finding]:
             group[0].remedy,
             len(group),
         )
-        for text, group in same.items()
+        for text, group in similar_findings.items()
         if len(group) > 1
     }
     return [

@@ -42,7 +42,7 @@ UNSIGNED = FindingKind(
 OTHER_DOCUMENT = FindingKind(
     "zenoh.other-document",
     ERROR,
-    "a Zenoh configuration that is not the signed one next to it",
+    "a Zenoh configuration that differs from its signed copy",
     "Somebody changed it after it was signed, and Zenoh reads the changed file.",
     _SOURCE,
     f"Find out who changed it. {_AGAIN}",
@@ -188,7 +188,9 @@ def _drift_findings(keystore: CheckedKeystore, drifted: Drifted) -> Iterator[Fin
 
     file = keystore.shown(drifted.path)
     if drifted.kind is Drift.STALE:
-        yield LEFT_OVER.found(drifted.enclave, "the keystore has none for it", file)
+        yield LEFT_OVER.found(
+            drifted.enclave, "the keystore has no such file for the enclave", file
+        )
         return
     if drifted.kind is Drift.MISSING:
         yield MISSING.found(drifted.enclave, "it is missing, or cannot be read", file)

@@ -420,10 +420,10 @@ class _GrantRules:
         if entry.allow:
             if wanted is _DEFAULT_PARTITION is named:
                 return True
-            return all(_any_matches(style, named, each) for each in wanted)
+            return all(_any_matches(style, named, partition) for partition in wanted)
         if self._traits.deny_partitions is DenyPartitions.IGNORED:
             return True
-        return any(_any_matches(style, named, each) for each in wanted)
+        return any(_any_matches(style, named, partition) for partition in wanted)
 
 
 @lru_cache(maxsize=8192)  # several vendors, and several enclaves, have the same names

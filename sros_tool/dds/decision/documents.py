@@ -101,7 +101,7 @@ def is_plain_governance(governance: Governance) -> bool:
         if not (_are_plain_domains(rule.domains) and rule.topic_access_rules):
             return False
         rules: tuple[DomainRule | TopicRule, ...] = (rule, *rule.topic_access_rules)
-        if not all(_has_valid_values(each) for each in rules):
+        if not all(_has_valid_values(rule) for rule in rules):
             return False
         texts += [topic.topic_expression for topic in rule.topic_access_rules]
     return bool(texts) and all(texts) and _are_plain(texts)

@@ -110,7 +110,7 @@ class _Reader:
     def _take_special(self, stack: list[XmlElement]) -> None:
         """Read a declaration, comment, CDATA or anything else that begins with ``<?`` or ``<!``."""
         text, children = self._read_text, stack[-1].children
-        begin, end = next(each for each in _SPECIAL if text.startswith(each[0], self._index))
+        begin, end = next(marks for marks in _SPECIAL if text.startswith(marks[0], self._index))
         start = self._index + len(begin)
         stop = text.find(end, start)
         if stop < 0:

@@ -57,9 +57,12 @@ def other_fitting_enclaves(
         several = [having.get(plain(part), set()) for part in _SEPARATORS.split(own) if part]
         fitting = set.intersection(*sorted(several, key=len)) if several else set()
         others = tuple(
-            each
-            for each in sorted(fitting - {name})
-            if any(same_subject(traits.subjects, one.strip(), own) for one in granted[each])
+            holder
+            for holder in sorted(fitting - {name})
+            if any(
+                same_subject(traits.subjects, granted_subject.strip(), own)
+                for granted_subject in granted[holder]
+            )
         )
         if others:
             fitting_others[name] = others
@@ -70,8 +73,10 @@ def certified_text(traits: VendorTraits, subject: str) -> str:
     """Return the subject of a certificate as the vendor compares it."""
     if traits.escapes_subjects:
         return "".join(
-            each if each.isascii() else "".join(f"\\{octet:02X}" for octet in each.encode())
-            for each in subject
+            character
+            if character.isascii()
+            else "".join(f"\\{octet:02X}" for octet in character.encode())
+            for character in subject
         )
     if traits.longest_subject is None:
         return subject

@@ -402,7 +402,9 @@ CYCLONE_DDS = _releases("Cyclone DDS")
 
 WHOLE_PRODUCTS = {
     f"all-{vendor.value}": tuple(
-        each for each in TESTED if each.traits.product == vendor.traits.product
+        tested_vendor
+        for tested_vendor in TESTED
+        if tested_vendor.traits.product == vendor.traits.product
     )
     for vendor in PRINCIPAL
 }

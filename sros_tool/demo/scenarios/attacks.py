@@ -762,7 +762,7 @@ _TRUSTED_AS_SIGNER = _injection_row(
     Identity(Undefended(forger.enclave_among_the_signers), "guest"),
     RowStatus.HEARD,
     "every certificate in the file of the permissions CA may sign",
-    defence_removed="a permissions CA file with only the CA in it",
+    defence_removed="a permissions CA file that contains only the CA",
 )
 _SAME_SUBJECT = _injection_row(
     "permissions borrowed, the same subject",

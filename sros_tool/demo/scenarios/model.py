@@ -369,7 +369,7 @@ def together(rows: Sequence[Row]) -> Row:
         ValueError: two parties of one name differ.
     """
     parties: dict[str, Party] = {}
-    for party in (each for row in rows for each in row.parties):
+    for party in (party for row in rows for party in row.parties):
         if parties.setdefault(party.name, party) != party:
             raise ValueError(f"world {rows[0].world!r} has two parties {party.name!r}")
     return replace(

@@ -197,7 +197,7 @@ def _rule(name: str, keys: Iterable[str], permission: str = "allow", flow: str =
         "id": name,
         "permission": permission,
         "flows": [flow] if flow else list(_FLOWS),
-        "messages": [each.value for each in Message],
+        "messages": [message.value for message in Message],
         "key_exprs": list(keys),
     }
 
@@ -225,7 +225,7 @@ def denial_in_a_wildcard(copy: KeystoreCopy) -> None:
         }
         for name in enclave_names(copy.root):
             control["subjects"].append({"id": name, "cert_common_names": [name]})
-        others = [each["id"] for each in control["subjects"]]
+        others = [subject["id"] for subject in control["subjects"]]
         control["rules"] += [
             _rule(_EVERYBODY, ("**", "@ros2_lv/**")),
             _rule("denied", names, "deny", "ingress"),

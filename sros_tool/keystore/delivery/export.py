@@ -291,7 +291,9 @@ def _evaluated_until(files: Mapping[str, bytes], state: OpenedEnclave, now: date
 
 @lru_cache(maxsize=16)
 def _first_expiry(authorities: bytes) -> datetime:
-    return min(validity_of(each).not_after for each in load_certificates(authorities, ""))
+    return min(
+        validity_of(certificate).not_after for certificate in load_certificates(authorities, "")
+    )
 
 
 _OF_TIME = frozenset(

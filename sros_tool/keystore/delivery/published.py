@@ -144,7 +144,7 @@ def read_published(keystore: Keystore) -> Published:
         path, what = keystore.root / PUBLISHED, "list of what is published"
         value = parse_json(read_bytes(path, what, max_bytes=_MOST_BYTES))
         return Published(
-            {name: _robot(each) for name, each in value["robots"].items()},
+            {name: _robot(robot_value) for name, robot_value in value["robots"].items()},
             {name: check_count(version) for name, version in value["versions"].items()},
             {path: parse_iso(time) for path, time in value["superseded"].items()},
             str(value.get("folder", "")),

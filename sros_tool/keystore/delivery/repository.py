@@ -229,8 +229,8 @@ class Present:
             path.removeprefix(begin).removesuffix(end): PublishedRelease(
                 target.custom["number"], target.hashes["sha256"], target.length
             ).checked()
-            for each in self.bins.values()
-            for path, target in each.signed.targets.items()
+            for bin_metadata in self.bins.values()
+            for path, target in bin_metadata.signed.targets.items()
         }
 
     def follows(self, root: Root) -> bool:

@@ -128,7 +128,7 @@ class CaService:
         program = shutil.which(self.program)
         if program is None or not Path(program).is_absolute():
             raise self._error(asked, f"There is no program `{self.program}` on the PATH")
-        told = {
+        variables = {
             "SROS_ENCLAVE": asked.enclave,
             "SROS_SUBJECT": subject_text(asked.subject),
             "SROS_NOT_AFTER": iso(asked.validity.not_after),
@@ -143,7 +143,7 @@ class CaService:
                     stdin=request,
                     stdout=subprocess.PIPE,
                     stderr=subprocess.PIPE,
-                    env=os.environ | told,
+                    env=os.environ | variables,
                     start_new_session=True,
                 )
             except OSError as error:

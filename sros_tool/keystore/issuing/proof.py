@@ -274,12 +274,12 @@ def example_topics(expressions: Iterable[str]) -> tuple[str, ...]:
     known = sorted(set(expressions))
     wild = [expression for expression in known if is_expression(expression)]
     found: set[str | None] = {name for name in known if not is_expression(name)}
-    for index, one in enumerate(wild):
-        found.add(_uniquely_matched_name(one, known))
-        found.add(_matching_name(one))
-        for other in wild[index + 1 :]:
-            if overlap(one, other):
-                found.add(common_name([one, other], absolute=False))
+    for index, wildcard in enumerate(wild):
+        found.add(_uniquely_matched_name(wildcard, known))
+        found.add(_matching_name(wildcard))
+        for other_expression in wild[index + 1 :]:
+            if overlap(wildcard, other_expression):
+                found.add(common_name([wildcard, other_expression], absolute=False))
     for prefix in ("rt/*", "rq/*Request", "rr/*Reply", "*"):
         found.add(_uniquely_matched_name(prefix, known))
     return tuple(sorted(topic for topic in found if topic))
@@ -297,7 +297,9 @@ def _uniquely_matched_name(expression: str, known: list[str]) -> str | None:
     for letter in ("never_mentioned", "n", "0", ""):
         name = _SET.sub(_member_of_set, expression).replace("*", letter).replace("?", "n")
         if matches(expression, name) and not any(
-            matches(other, name) for other in known if other != expression
+            matches(other_expression, name)
+            for other_expression in known
+            if other_expression != expression
         ):
             return name
     return None

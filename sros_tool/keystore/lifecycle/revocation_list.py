@@ -475,8 +475,10 @@ class RevocationListSigner:
             own = {
                 int(entry.serial, 16) for entry in recorded.entries if entry.what == "revocation"
             }
-            needed = {each.serial for each in kept if expiries.get(each.serial, moment) >= moment}
-            new = {each.serial for each in new_entries}
+            needed = {
+                entry.serial for entry in kept if expiries.get(entry.serial, moment) >= moment
+            }
+            new = {entry.serial for entry in new_entries}
             return self._list_of_service(authority, needed & (own | new))
         # Without an earlier list that is authentic: above every number that was used, because each
         # list that is signed adds an entry to the ledger, and at most 2 to the number.

@@ -261,8 +261,8 @@ def _replaced_notes(root: Path, replaced: Mapping[str, bool]) -> Iterator[Note]:
         yield Note(
             REPLACED_AFTER_BACKUP,
             f"after the backup, the certificates of {first_few(tuple(replaced), _SHOWN)} were "
-            "replaced and revoked, and the keystore has only the revoked ones: give these enclaves "
-            f"new ones with {' and '.join(commands)}.",
+            "replaced and revoked, and the keystore has only the revoked certificates: give these "
+            f"enclaves new certificates with {' and '.join(commands)}.",
         )
 
 

@@ -486,8 +486,8 @@ class _Rotator:
             text = (
                 f"the new CA expires at {validity_of(new).not_after:%Y-%m-%d}, before the old one "
                 f"({validity_of(old).not_after:%Y-%m-%d}): authorities.validity of the settings is "
-                f"{span_text(self._template.authority_validity)}. --ca-validity would choose "
-                "another one."
+                f"{span_text(self._template.authority_validity)}. --ca-validity chooses "
+                "another validity."
             )
             # Both CAs usually have the same dates, and one note is enough then.
             note = Note("keystore.ca-expires-earlier", text)

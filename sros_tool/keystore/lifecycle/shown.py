@@ -447,13 +447,13 @@ def shown_lists(
         ],
         [
             OtherList(
-                subject_text(other.list.issuer),
-                other.number,
-                other.this_update,
-                other.next_update,
-                [f"{entry.serial:x}" for entry in other.revoked],
+                subject_text(other_list.list.issuer),
+                other_list.number,
+                other_list.this_update,
+                other_list.next_update,
+                [f"{entry.serial:x}" for entry in other_list.revoked],
             )
-            for other in lists[1:]
+            for other_list in lists[1:]
         ],
         restart=refreshed_by.restart if refreshed_by else (),
         changes=changes_below(root, refreshed_by.changes) if refreshed_by else (),
