@@ -50,13 +50,13 @@ class Letters:
 
     @classmethod
     def _joined_ranges(cls, ranges: Iterable[tuple[int, int]]) -> Letters:
-        found: list[tuple[int, int]] = []
+        joined_ranges: list[tuple[int, int]] = []
         for low, high in sorted(part for part in ranges if part[0] <= part[1]):
-            if found and low <= found[-1][1] + 1:
-                found[-1] = found[-1][0], max(high, found[-1][1])
+            if joined_ranges and low <= joined_ranges[-1][1] + 1:
+                joined_ranges[-1] = joined_ranges[-1][0], max(high, joined_ranges[-1][1])
             else:
-                found.append((low, high))
-        return cls(tuple(found))
+                joined_ranges.append((low, high))
+        return cls(tuple(joined_ranges))
 
     @classmethod
     def union(cls, sets: Iterable[Letters]) -> Letters:
@@ -267,14 +267,14 @@ def _forced_text(
     edges: Mapping[int, Sequence[tuple[Letters, int]]], at: int, stops: frozenset[int]
 ) -> str:
     """Return the text that must follow position ``at``, up to a fork or a position in ``stops``."""
-    found = ""
+    text = ""
     while at not in stops:
         ways = edges.get(at, ())
         if len(ways) != 1 or not (letter := ways[0][0].single()):
             break
-        found += letter
+        text += letter
         at = ways[0][1]
-    return found
+    return text
 
 
 def _have_same_value(first_text: str, second_text: str) -> bool:
@@ -282,17 +282,17 @@ def _have_same_value(first_text: str, second_text: str) -> bool:
 
 
 def _moves(edges: Iterable[tuple[int, int]]) -> _Moves:
-    found: dict[int, int] = {}
+    targets: dict[int, int] = {}
     for at, to in edges:
-        found[to - at] = found.get(to - at, 0) | 1 << at
-    return found
+        targets[to - at] = targets.get(to - at, 0) | 1 << at
+    return targets
 
 
 def _moved_places(positions: int, moves: _Moves) -> int:
     following = 0
     for by, places in moves.items():
-        some = positions & places
-        following |= some << by if by >= 0 else some >> -by
+        movable = positions & places
+        following |= movable << by if by >= 0 else movable >> -by
     return following
 
 
@@ -341,10 +341,10 @@ class _Some:
 
     @cached_property
     def _by_prefix(self) -> dict[str, list[Automaton]]:
-        found: dict[str, list[Automaton]] = {}
+        by_prefix: dict[str, list[Automaton]] = {}
         for automaton in self.automata:
-            found.setdefault(automaton.prefix, []).append(automaton)
-        return found
+            by_prefix.setdefault(automaton.prefix, []).append(automaton)
+        return by_prefix
 
     @cached_property
     def _prefixes(self) -> list[str]:
@@ -501,8 +501,8 @@ class NameSet:
         names.
         """
         joined = [
-            (cls.union(names for names, _ in same)._node, kept)
-            for kept, same in groupby(rules, key=lambda pair: pair[1])
+            (cls.union(names for names, _ in kept_rules)._node, kept)
+            for kept, kept_rules in groupby(rules, key=lambda pair: pair[1])
         ]
         if not otherwise and joined and not joined[-1][1]:
             joined.pop()  # it takes away what nothing accepts
@@ -571,7 +571,7 @@ class NameSet:
         return hash(self._node)
 
     def __contains__(self, name: str) -> bool:
-        return bool(self._node.truth(lambda some: some.has(name)))
+        return bool(self._node.truth(lambda leaf: leaf.has(name)))
 
     def stated(self) -> Iterator[str]:
         """Yield the exact names in this set, the shortest first; not the names of wildcards."""
@@ -595,11 +595,11 @@ class NameSet:
         limit = limit or SearchLimit()
         best: str | None = None
         for search in _searches(self._node, limit):
-            found = search.shortest(limit, longest)
-            if found is not None and (
-                best is None or _shortest_first(found) < _shortest_first(best)
+            example_name = search.shortest(limit, longest)
+            if example_name is not None and (
+                best is None or _shortest_first(example_name) < _shortest_first(best)
             ):
-                best = found
+                best = example_name
         return best
 
     def is_empty(self, limit: SearchLimit | None = None) -> bool:
@@ -663,9 +663,9 @@ def _including_set(
                 return None
         case _AtLeast():
             operands = list(node.of)
-    found = [_including_set(operand, rank) for operand in operands]
-    known = [surroundings for surroundings in found if surroundings is not None]
-    if len(known) < len(found):
+    surroundings_of_operands = [_including_set(operand, rank) for operand in operands]
+    known = [surroundings for surroundings in surroundings_of_operands if surroundings is not None]
+    if len(known) < len(surroundings_of_operands):
         return None
     return Surroundings(
         frozenset[str]().union(*(surroundings.exact for surroundings in known)),
@@ -763,7 +763,7 @@ def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
     if len(automata) > _MOST_AUTOMATA:
         raise _too_many_error()
     exact = frozenset[str]().union(*(leaf.exact for leaf in leaves))
-    everything = frozenset[Automaton]().union(*(leaf.everything for leaf in leaves))
+    all_required = frozenset[Automaton]().union(*(leaf.everything for leaf in leaves))
     around = _including_set(node, _fewest_automata_first)
     for own in sorted(automata if around is None else around.automata, key=_automaton_order):
         met = frozenset(
@@ -771,12 +771,12 @@ def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
         )
         if others := len(met) // _OF_A_STEP:
             limit.spend(others)
-        left = _simplified(node, everything | {own}, met)
+        left = _simplified(node, all_required | {own}, met)
         if left is not False:
             yield _Search(_accepted_names(own, left), frozenset(filter(own.matches, exact)))
-    none = frozenset[Automaton]()
-    if around is None and not everything and _simplified(node, none, none):
-        left = _simplified(node, none, None)
+    no_automata = frozenset[Automaton]()
+    if around is None and not all_required and _simplified(node, no_automata, no_automata):
+        left = _simplified(node, no_automata, None)
         yield _Search(_Not(_Some()) if isinstance(left, bool) else left, exact)
 
 
@@ -846,8 +846,8 @@ class _Search:
 
     def __init__(self, node: _Node, taken: frozenset[str]) -> None:
         self._node = node
-        found = {automaton for leaf in _leaves(node) for automaton in leaf.automata}
-        self._machine = _machine(tuple(sorted(found, key=_automaton_order)))
+        automata = {automaton for leaf in _leaves(node) for automaton in leaf.automata}
+        self._machine = _machine(tuple(sorted(automata, key=_automaton_order)))
         self._including_automata = _including_automata(node)
         self._taken = _ExcludedNames(name for name in taken if node.truth(_contains_test(name)))
 
@@ -872,9 +872,9 @@ class _Search:
                 return _letters_to(state, before)
             ways = taken.next_letters(place, machine.classes)
             limit.spend(len(ways) * (1 + machine.size // 1024))
-            for letter, moves, there in ways:
+            for letter, moves, reached_next in ways:
                 to = _moved_places(reached, moves) & machine.useful
-                new, paid = (to, there), cost + len(letter.encode())
+                new, paid = (to, reached_next), cost + len(letter.encode())
                 if (
                     costs.get(new, paid + 1) <= paid
                     or (left := self._fewest_letters_left(to)) is None
@@ -890,10 +890,10 @@ class _Search:
         """Return the fewest letters that complete a name, or None if no name begins in this way."""
         left = 0
         for need in self._including_automata:
-            some = self._machine.fewest_letters_left(need, positions)
-            if some is None:
+            fewest = self._machine.fewest_letters_left(need, positions)
+            if fewest is None:
                 return None
-            left = max(left, some)
+            left = max(left, fewest)
         return (
             None
             if self._node.truth(self._machine.longer_acceptance_test(positions)) is False
@@ -902,7 +902,7 @@ class _Search:
 
 
 def _contains_test(name: str) -> _Test:
-    return lambda some: some.accepts(name)
+    return lambda leaf: leaf.accepts(name)
 
 
 def _letters_to(
@@ -956,17 +956,17 @@ class _Machine:
 
     def acceptance_test(self, positions: int) -> _Test:
         """Return a test whether an automaton of a set accepts the text read so far."""
-        return lambda some: any(positions & self._ends[automaton] for automaton in some.automata)
+        return lambda leaf: any(positions & self._ends[automaton] for automaton in leaf.automata)
 
     def longer_acceptance_test(self, positions: int) -> _Test:
         """Return a test whether an automaton of a set may accept a longer text."""
 
-        def ask(some: _Some) -> _Truth:
-            if any(positions & self._endless[automaton] for automaton in some.automata):
+        def ask(leaf: _Some) -> _Truth:
+            if any(positions & self._endless[automaton] for automaton in leaf.automata):
                 return True
             return (
                 None
-                if any(positions & self._span[automaton] for automaton in some.automata)
+                if any(positions & self._span[automaton] for automaton in leaf.automata)
                 else False
             )
 
@@ -988,24 +988,24 @@ def _classes(edges: Iterable[tuple[int, Letters, int]]) -> tuple[_Class, ...]:
     kinds = list(by_letters)
     borders = {low for low, _ in _NO_LETTERS} | {high + 1 for _, high in _NO_LETTERS} | {0}
     borders |= {end for kind in kinds for low, high in kind.ranges for end in (low, high + 1)}
-    alike: dict[tuple[bool, ...], list[tuple[int, int]]] = {}
+    ranges_by_membership: dict[tuple[bool, ...], list[tuple[int, int]]] = {}
     ordered = sorted(borders | {_LAST + 1})
     for low, after in pairwise(ordered):
         if (letter := chr(low)) in _USABLE:
             key = tuple(letter in kind for kind in kinds)
-            alike.setdefault(key, []).append((low, after - 1))
-    found = []
-    for key, ranges in alike.items():
+            ranges_by_membership.setdefault(key, []).append((low, after - 1))
+    classes = []
+    for key, ranges in ranges_by_membership.items():
         letters = Letters(tuple(ranges))
         of = (by_letters[kind] for kind, has in zip(kinds, key, strict=True) if has)
-        found.append(
+        classes.append(
             _Class(
                 letters,
                 _best_letter(letters),
                 _moves(letters for same_class in of for letters in same_class),
             )
         )
-    return tuple(sorted(found, key=lambda each: _letter_rank(each.best)))
+    return tuple(sorted(classes, key=lambda each: _letter_rank(each.best)))
 
 
 def _best_letter(letters: Letters, excluded: Container[str] = ()) -> str:
@@ -1046,12 +1046,12 @@ class _ExcludedNames:
         """Return the next letters to try at a place, each with its moves and the next place."""
         if place not in self._ways:
             children = self._tree[place] if place >= 0 else {}
-            found = []
+            next_letters = []
             for letters, best, moves in classes:
                 other = _best_letter(letters, children) if best in children else best
                 if other:
-                    found.append((other, moves, -1))
+                    next_letters.append((other, moves, -1))
                 inner = ((letter, to) for letter, to in children.items() if letter in letters)
-                found += [(letter, moves, to) for letter, to in inner]
-            self._ways[place] = found
+                next_letters += [(letter, moves, to) for letter, to in inner]
+            self._ways[place] = next_letters
         return self._ways[place]

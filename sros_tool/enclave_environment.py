@@ -722,12 +722,12 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
     else:
         where = "in no enclave"
         every = {known for nodes in policy.nodes().values() for known in nodes}
-        alike = sorted(
+        similar_names = sorted(
             known for known in every if known.endswith(f"/{name}") and not is_expression(known)
         )
-        if alike:
-            why = f"It has the node {first_few(alike, 3)}."
-            other = quote(alike[0].rpartition("/")[0] or "/")
+        if similar_names:
+            why = f"It has the node {first_few(similar_names, 3)}."
+            other = quote(similar_names[0].rpartition("/")[0] or "/")
             remedy = (
                 f"Name the namespace: `-r __ns:={other}` after --ros-args. Or, if {full} is right, "
                 f'give it a profile: `<profile ns="{ns}" node="{name}">`.'

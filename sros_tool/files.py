@@ -239,8 +239,8 @@ _LONGEST_LINE = 4000  # characters: the parser takes quadratic time for a key wi
 _LONGEST_DOCUMENT = 256 * 1024  # characters
 
 
-def read_toml(data: bytes, what: str, remedy: str = "", *, longest: int = _LONGEST_DOCUMENT) -> Any:
-    """Return the tables of a TOML document in a file; ``what`` names the file in errors.
+def read_toml(data: bytes, name: str, remedy: str = "", *, longest: int = _LONGEST_DOCUMENT) -> Any:
+    """Return the tables of a TOML document in a file; ``name`` names the file in errors.
 
     Raises:
         DocumentError: the file is not TOML in UTF-8, too long, or nested too deeply.
@@ -248,13 +248,13 @@ def read_toml(data: bytes, what: str, remedy: str = "", *, longest: int = _LONGE
     try:
         return parse_toml(data.decode(), longest)
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise toml_error(error, what, remedy) from error
+        raise toml_error(error, name, remedy) from error
 
 
-def toml_error(error: ValueError, what: str, remedy: str = "") -> DocumentError:
-    """Return the error for a file, named ``what``, that the parser of TOML refused."""
+def toml_error(error: ValueError, name: str, remedy: str = "") -> DocumentError:
+    """Return the error for a file, named ``name``, that the parser of TOML refused."""
     why = str(error)
-    return DocumentError(f"{what} is not valid TOML", f"{why[:1].upper()}{why[1:]}.", remedy)
+    return DocumentError(f"{name} is not valid TOML", f"{why[:1].upper()}{why[1:]}.", remedy)
 
 
 def parse_toml(text: str, longest: int = _LONGEST_DOCUMENT) -> dict[str, Any]:

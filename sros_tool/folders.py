@@ -269,22 +269,24 @@ class Folder:
 
     def replace(self, source: str, target: str) -> None:
         """Rename ``source`` to ``target``; replace an existing file or link."""
-        here, name, there, new = self._two_places(source, target)
+        source_handle, name, target_handle, new = self._two_places(source, target)
         with self._adding_path_to_errors(target):
-            os.replace(name, new, src_dir_fd=here, dst_dir_fd=there)
+            os.replace(name, new, src_dir_fd=source_handle, dst_dir_fd=target_handle)
 
     def rename(self, source: str, target: str) -> None:
         """Rename the folder ``source`` to ``target``, which is missing or an empty folder."""
-        here, name, there, new = self._two_places(source, target)
+        source_handle, name, target_handle, new = self._two_places(source, target)
         with self._adding_path_to_errors(target):
-            os.rename(name, new, src_dir_fd=here, dst_dir_fd=there)
+            os.rename(name, new, src_dir_fd=source_handle, dst_dir_fd=target_handle)
         self.forget(source)
 
     def link(self, source: str, target: str) -> None:
         """Make ``target`` a second name (a hard link) of the file ``source``."""
-        here, name, there, new = self._two_places(source, target)
+        source_handle, name, target_handle, new = self._two_places(source, target)
         with self._adding_path_to_errors(target):
-            os.link(name, new, src_dir_fd=here, dst_dir_fd=there, follow_symlinks=False)
+            os.link(
+                name, new, src_dir_fd=source_handle, dst_dir_fd=target_handle, follow_symlinks=False
+            )
 
     def exchange(self, first: str, second: str) -> bool:
         """Atomically exchange two names (renameat2(2)).
@@ -374,14 +376,14 @@ class Folder:
             raise
 
     def _blocked_path_error(self, path: str, *, link: bool) -> KeystoreError:
-        whole = self.path / path
+        full_path = self.path / path
         if link:
             return KeystoreError(
-                f"'{whole}' is a symbolic link",
+                f"'{full_path}' is a symbolic link",
                 f"Files written below it would be stored elsewhere, outside of '{self.path}'.",
                 "Replace the link with a real folder.",
             )
-        return KeystoreError(f"'{whole}' is in the way", "It is not a folder.", "Move it away.")
+        return KeystoreError(f"'{full_path}' is in the way", "It is not a folder.", "Move it away.")
 
 
 def _has_one_name(state: os.stat_result) -> bool:

@@ -35,10 +35,10 @@ def fenced(text: str, language: str = "text") -> str:
     return f"{fence}{language}\n{lines}\n{fence}"
 
 
-def bounded_list(items: Iterable[str], maximum: int, rest: str) -> str:
+def bounded_list(items: Iterable[str], maximum: int, shown_by: str) -> str:
     """Return ``items`` as a Markdown list of at most ``maximum`` characters.
 
-    A last item counts those that do not fit, followed by ``rest``, a clause that says where to
+    A last item counts those that do not fit, followed by ``shown_by``, a clause that says where to
     read them.
     """
     lines: list[str] = []
@@ -50,7 +50,7 @@ def bounded_list(items: Iterable[str], maximum: int, rest: str) -> str:
         else:
             lines.append(f"- {item}")
     if out:
-        lines.append(f"- and {out} more, {rest}")
+        lines.append(f"- and {out} more, {shown_by}")
     return "\n".join(lines)
 
 

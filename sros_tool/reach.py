@@ -239,8 +239,8 @@ class Network:
         self._sides = {direction: _Direction(accesses) for direction, accesses in ends.items()}
         self._router_of = links.router_of if links else {}
         self._passing = {
-            router: _Direction(_writers_and_readers({None: given}, ignored)["publish"])
-            for router, given in (links.passing.items() if links else ())
+            router: _Direction(_writers_and_readers({None: passing}, ignored)["publish"])
+            for router, passing in (links.passing.items() if links else ())
         }
 
     @property
@@ -278,12 +278,14 @@ class Network:
         followed: _Followed = set()
         queue = deque(paths)
         while queue:
-            here = queue.popleft()
-            for hop in self._steps(here, forward, followed, paths):
-                there = hop.target if forward else hop.source
-                if there not in paths:
-                    paths[there] = (*paths[here], hop) if forward else (hop, *paths[here])
-                    queue.append(there)
+            enclave_here = queue.popleft()
+            for hop in self._steps(enclave_here, forward, followed, paths):
+                next_enclave = hop.target if forward else hop.source
+                if next_enclave not in paths:
+                    paths[next_enclave] = (
+                        (*paths[enclave_here], hop) if forward else (hop, *paths[enclave_here])
+                    )
+                    queue.append(next_enclave)
         return {enclave: path for enclave, path in paths.items() if path}
 
     def _steps(
@@ -325,8 +327,8 @@ class Network:
 def _domains_by_enclave(rights: DomainRights) -> dict[str, list[DomainSet | None]]:
     """Map enclaves to the sets of ROS domains in which they may do something."""
     joined: dict[str, list[DomainSet | None]] = defaultdict(list)
-    for domains, some in rights.items():
-        for enclave in {right.enclave for right in some if right.qualifier is not DENY}:
+    for domains, rights_there in rights.items():
+        for enclave in {right.enclave for right in rights_there if right.qualifier is not DENY}:
             joined[enclave].append(domains)
     return joined
 
@@ -354,8 +356,8 @@ def _writers_and_readers(
     Topics in ``ignored`` are left out.
     """
     ends: dict[str, list[_Access]] = {"publish": [], "subscribe": []}
-    for domains, some in rights.items():
-        for direction, accesses in _accesses(some, domains, ignored):
+    for domains, rights_there in rights.items():
+        for direction, accesses in _accesses(rights_there, domains, ignored):
             ends[direction] += accesses
     return ends
 

@@ -142,7 +142,7 @@ def hidden_protections(protection: DomainProtection) -> list[tuple[str, str]]:
     The protection of the first name never applies, because another rule decides on each of its DDS
     topics.  Narrow rules come first, so this is a rule for the same topics.
     """
-    found = []
+    protections = []
     earlier: list[tuple[str, str]] = []
     for named in protection.named:
         own = protected_topics(named.kind, named.name)
@@ -151,9 +151,9 @@ def hidden_protections(protection: DomainProtection) -> list[tuple[str, str]]:
             for name in own
         ]
         if all(by):
-            found.append((str(named), by[0]))
+            protections.append((str(named), by[0]))
         earlier += [(name, str(named)) for name in own]
-    return found
+    return protections
 
 
 def protected_topics(kind: str, name: str) -> list[str]:
@@ -240,8 +240,8 @@ def protection_for(governance: Governance) -> DomainProtection | None:
     protection = DomainProtection(
         **_terms(rule), default=TopicProtection(**_terms(last)), named=tuple(named)
     )
-    same = governance_for(protection, governance.domains().closed())
-    return protection if same == governance else None
+    governance_again = governance_for(protection, governance.domains().closed())
+    return protection if governance_again == governance else None
 
 
 def _terms(rule: DomainRule | TopicRule) -> dict[str, Any]:
@@ -280,14 +280,14 @@ def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
     publish = _all_topics(rule.publish)
     subscribe = _all_topics(rule.subscribe)
     rights: list[RosRight] = []
-    for kind, right, found in _candidates(publish, subscribe):
-        names = dds_names(right, found)
+    for kind, right, candidate_names in _candidates(publish, subscribe):
+        names = dds_names(right, candidate_names)
         if all(map(publish.get, names.publish)) and all(map(subscribe.get, names.subscribe)):
             continue  # all topics already belong to an action
         if all(map(publish.__contains__, names.publish)) and all(
             map(subscribe.__contains__, names.subscribe)
         ):
-            rights.append(RosRight(qualifier, right, kind, found))
+            rights.append(RosRight(qualifier, right, kind, candidate_names))
             if kind != "topics":
                 for topic in names.publish:
                     publish[topic] = True

@@ -163,12 +163,12 @@ def parse_span(text: str) -> Span:
     return Lifespan(start=start, end=_moment(rest, text))
 
 
-def _moment(text: str, whole: str) -> datetime:
+def _moment(text: str, range_text: str) -> datetime:
     try:
         return parse_iso(text).replace(microsecond=0)
     except (ValueError, OverflowError) as error:
         raise UsageError(
-            f"{whole!r} is neither a duration nor a date",
+            f"{range_text!r} is neither a duration nor a date",
             "",
             "Write for example 90d, 72h, 2027-06-01 or 2026-12-01/90d.",
         ) from error

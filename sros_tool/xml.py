@@ -55,15 +55,15 @@ def read_file(
     """Return the fstat(2) of a regular file, and its content as `read_bytes` does."""
     try:
         # Looked at first, because opening a pipe would wait for its writer.
-        there, data = path.stat(), b""
-        if stat.S_ISREG(there.st_mode) and 0 < there.st_size <= max_bytes:
-            there, data = _read_open(path, max_bytes)
-        if not stat.S_ISREG(there.st_mode):
+        state, data = path.stat(), b""
+        if stat.S_ISREG(state.st_mode) and 0 < state.st_size <= max_bytes:
+            state, data = _read_open(path, max_bytes)
+        if not stat.S_ISREG(state.st_mode):
             raise DocumentError(f"the {label} '{path}' is not a regular file")
-        if owner not in (None, there.st_uid):
+        if owner not in (None, state.st_uid):
             raise DocumentError(
                 f"the {label} '{path}' belongs to another user",
-                f"It belongs to user {there.st_uid}, not to user {owner}.",
+                f"It belongs to user {state.st_uid}, not to user {owner}.",
             )
     except (OSError, ValueError) as error:
         number = getattr(error, "errno", errno.ENOENT)  # ValueError: the path contains a NUL
@@ -72,13 +72,13 @@ def read_file(
         raise DocumentError(
             f"the {label} '{path}' cannot be read", f"{os.strerror(number)}."
         ) from error
-    if max(there.st_size, len(data)) > max_bytes:
+    if max(state.st_size, len(data)) > max_bytes:
         raise DocumentError(
             f"the {label} '{path}' is too large",
             f"It has more than {max_bytes // 1024**2} MiB.",
         ) from OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
     log_step("DEBUG", __name__, "read the %s '%s', %d bytes", label, path, len(data))
-    return there, data
+    return state, data
 
 
 def _read_open(path: Path, max_bytes: int) -> tuple[os.stat_result, bytes]:
@@ -208,10 +208,10 @@ def escape(text: str) -> str:
     Raises:
         DocumentError: it has a character that no XML document can have.
     """
-    if found := _NOT_XML.search(text):
+    if match := _NOT_XML.search(text):
         raise DocumentError(
             f"{text!a} cannot be written in XML",
-            f"It has the character U+{ord(found[0]):04X}, which no XML document can have.",
+            f"It has the character U+{ord(match[0]):04X}, which no XML document can have.",
             "Choose another name.",
         )
     return text.replace("&", "&amp;").replace(">", "&gt;").replace("<", "&lt;")

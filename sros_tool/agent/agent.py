@@ -253,14 +253,15 @@ class _Round:
     def _clock(self, proven_time: datetime | None) -> RobotClock:
         now = self._machine.now
         if proven_time and now + _TOLERANCE < proven_time:
-            what = (
+            documents_made = (
                 "documents that this robot verified were made at"
                 if self._state.latest
                 else "its certificates are not valid before"
             )
             self._problems.append(
-                f"The clock shows {iso(now)}, but {what} {iso(proven_time)}: the clock is at least "
-                f"{elapsed(proven_time - now)} behind. Nothing is restarted; set the clock."
+                f"The clock shows {iso(now)}, but {documents_made} {iso(proven_time)}: "
+                f"the clock is at least {elapsed(proven_time - now)} behind. "
+                "Nothing is restarted; set the clock."
             )
             return RobotClock.BEHIND
         return self._machine.clock()
@@ -680,16 +681,16 @@ class _Round:
 
     def _client_certificates(self) -> list[ClientCertificate]:
         """Return the certificates and keys for TLS that expire last, the last first."""
-        found: list[tuple[datetime, ClientCertificate]] = []
+        certificates_by_expiry: list[tuple[datetime, ClientCertificate]] = []
         for name in self._enclaves():
             place = enclave_path(self._folder, name)
             with suppress(SrosError, OSError):
                 until = validity_of(read_certificate(place / CERTIFICATE_FILE)).not_after
                 if (place / KEY_FILE).exists():
                     files = ClientCertificate(place / CERTIFICATE_FILE, place / KEY_FILE)
-                    found.append((until, files))
-        found.sort(key=lambda pair: pair[0], reverse=True)
-        return [files for _, files in found[:_MOST_CERTIFICATES]]
+                    certificates_by_expiry.append((until, files))
+        certificates_by_expiry.sort(key=lambda pair: pair[0], reverse=True)
+        return [files for _, files in certificates_by_expiry[:_MOST_CERTIFICATES]]
 
 
 def _sha256(folder: Folder, path: str) -> str:
@@ -746,7 +747,7 @@ def send(
     if not inbox.startswith(("https://", "http://")):
         _write_message(Path(inbox), robot, message)
         return
-    what = f"the inbox {inbox} does not take the message"
+    failure = f"the inbox {inbox} does not take the message"
     try:
         url = urlsplit(inbox)
         where = f"{url.path.rstrip('/')}/{quote(robot)}/{MESSAGE_FILE}"
@@ -764,10 +765,12 @@ def send(
                 raise TimeoutError(errno.ETIMEDOUT, "it takes too long")
     except (OSError, http.client.HTTPException, ValueError) as error:
         kind = RefusedError if ended_tls(error) else UnavailableError
-        raise kind(what, f"{error}.", ("The agent tries again at its next run.")) from error
+        raise kind(failure, f"{error}.", ("The agent tries again at its next run.")) from error
     if not 200 <= reply.status < 300:
         kind = RefusedError if reply.status in REFUSALS else UnavailableError
-        raise kind(what, f"It answers {reply.status} to PUT {where}.", "See the log of the server.")
+        raise kind(
+            failure, f"It answers {reply.status} to PUT {where}.", "See the log of the server."
+        )
 
 
 def _write_message(inbox: Path, robot: str, message: bytes) -> None:

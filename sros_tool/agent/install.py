@@ -350,8 +350,8 @@ def _check_not_older(folder: Folder, place: str, sent: OpenedEnclave, now: datet
         return
     same_authority = present.files.get(PERMISSIONS_CA_FILE) == sent.files.get(PERMISSIONS_CA_FILE)
     newer = [
-        f"its {what} is valid from {iso(here)}, the {what} in the release from {iso(there)}"
-        for what, here, there in (
+        f"its {document} is valid from {iso(here)}, the {document} in the release from {iso(there)}"
+        for document, here, there in (
             (
                 "certificate",
                 validity_of(present.certificate).not_before,
@@ -529,9 +529,11 @@ def _commit_lists(folder: Path, changes: Iterable[_Change]) -> None:
     """Write the new revocation lists of enclaves whose identity CAs stay, if there is room."""
     lists = []
     for change in changes:
-        found = {path: data for path, data in change.write.items() if path.endswith(f"/{CRL_FILE}")}
-        if found and not any(path.endswith(f"/{IDENTITY_CA_FILE}") for path in change.write):
-            lists.append(_Change(write=found))
+        crl_files = {
+            path: data for path, data in change.write.items() if path.endswith(f"/{CRL_FILE}")
+        }
+        if crl_files and not any(path.endswith(f"/{IDENTITY_CA_FILE}") for path in change.write):
+            lists.append(_Change(write=crl_files))
     with suppress(SrosError, OSError):
         if lists:
             _commit(folder, lists)

@@ -227,7 +227,7 @@ class Systemd:
         self._run("restart", unit, within=_RESTART_SECONDS)
 
     def _run(self, *words: str, within: float) -> str:
-        what = f"`{' '.join((*self._command, *words[:1], *words[-1:]))}` failed"
+        failure = f"`{' '.join((*self._command, *words[:1], *words[-1:]))}` failed"
         try:
             done = subprocess.run(
                 (*self._command, *words),
@@ -238,13 +238,13 @@ class Systemd:
                 stdin=subprocess.DEVNULL,
             )
         except subprocess.TimeoutExpired as error:
-            raise UnavailableError(what, f"It did not end within {within:.0f} s.") from error
+            raise UnavailableError(failure, f"It did not end within {within:.0f} s.") from error
         except OSError as error:
-            raise UnavailableError(what, f"{error.strerror or error}.") from error
+            raise UnavailableError(failure, f"{error.strerror or error}.") from error
         if done.returncode:
             error_text = plain(" ".join((done.stderr or done.stdout).split()), _LONGEST_PATH)
             raise UnavailableError(
-                what, f"{error_text or f'Its exit status is {done.returncode}'}."
+                failure, f"{error_text or f'Its exit status is {done.returncode}'}."
             )
         return done.stdout
 

@@ -168,8 +168,8 @@ def read_settings(folder: Path) -> AgentSettings:
             "Make it with `sros agent init`.",
         )
     check_owner(folder)
-    what = f"'{path}'"
-    return settings_from(read_toml(read_bytes(path, "agent's settings"), what), what)
+    shown_path = f"'{path}'"
+    return settings_from(read_toml(read_bytes(path, "agent's settings"), shown_path), shown_path)
 
 
 _TEXTS = {"robot": "robot", "from": "source", "inbox": "inbox", "tls_ca": "tls_ca"}
@@ -238,5 +238,5 @@ def _is_texts(value: object) -> bool:
     return isinstance(value, list) and all(isinstance(entry, str) for entry in value)
 
 
-def _invalid_settings_error(what: str, why: str) -> DocumentError:
-    return DocumentError(f"{what} are not the settings of an agent", f"{why}.", "Correct it.")
+def _invalid_settings_error(name: str, why: str) -> DocumentError:
+    return DocumentError(f"{name} are not the settings of an agent", f"{why}.", "Correct it.")

@@ -52,11 +52,11 @@ def folded_findings(
     others ("" if there are none).  Findings that share a cause, or that have a line or related
     places, stay as they are.
     """
-    alike: dict[Hashable, list[tuple[tuple[Finding, ...], str]]] = {}
+    similar_groups: dict[Hashable, list[tuple[tuple[Finding, ...], str]]] = {}
     for group, others in _merge_robots(groups, fleet):
         kind = group if others else _key_without_enclave(group)
-        alike.setdefault(kind, []).append((group, others))
-    for members in alike.values():
+        similar_groups.setdefault(kind, []).append((group, others))
+    for members in similar_groups.values():
         first, *more = members
         if len(more) < _FEWEST_ENCLAVES:
             yield from members
@@ -94,8 +94,8 @@ def _merge_robots(
                 robots[kind].add(robot)
 
     def largest(kinds: _Kinds, which: int, otherwise: Hashable) -> tuple[Hashable, str]:
-        every = ((kind[which], robot) for robot, kind in kinds.items())
-        return max(every, key=lambda one: len(robots[one[0]]), default=(otherwise, ""))
+        kinds_and_robots = ((kind[which], robot) for robot, kind in kinds.items())
+        return max(kinds_and_robots, key=lambda one: len(robots[one[0]]), default=(otherwise, ""))
 
     chosen = [(group, largest(kinds, 0, group), largest(kinds, 1, group)) for group, kinds in read]
     parts: dict[Hashable, set[Hashable]] = defaultdict(set)
@@ -147,9 +147,11 @@ def findings_markdown(chosen_findings: ChosenFindings, fleet: Fleet | None = Non
 
     Findings that differ only in one robot of ``fleet``, or in one enclave, are one item.
     """
-    rest = "which `sros check` shows"
+    shown_by = "which `sros check` shows"
     groups = folded_findings(group_by_cause(chosen_findings.shown), fleet)
-    listed = bounded_list((_markdown_item(group, others) for group, others in groups), _MOST, rest)
+    listed = bounded_list(
+        (_markdown_item(group, others) for group, others in groups), _MOST, shown_by
+    )
     title = f"### Findings: {plain(chosen_findings.summary())}"
     return "\n\n".join(part for part in (title, listed) if part) + "\n"
 

@@ -536,7 +536,8 @@ NO_PARAMETER_SERVICES = FindingKind(
     "Every node offers all six unless it was created without them, and fails when it starts if "
     "one is denied.",
     "ROS 2 Jazzy, rclcpp 28 (ParameterService) and rclpy 7 (start_parameter_services).",
-    f'Allow <services reply="ALLOW"> with ~/get_parameters and the others. {_INCLUDE_HINT}',
+    'Allow <services reply="ALLOW"> with ~/get_parameters and the other parameter services. '
+    f"{_INCLUDE_HINT}",
 )
 NO_PARAMETERS = FindingKind(
     "policy.without-parameters",
@@ -706,25 +707,25 @@ def _denied_at_start(lacking: Sequence[_Lacking]) -> str:
     """Return a sentence on actions of each starting node that the policy denies."""
     nodes = list(dict.fromkeys(gap.node for gap in lacking))
     kinds = Counter(gap.finding.kind for gap in lacking)
-    what = [
+    verbs = [
         verb if kinds[kind] == len(nodes) else f"{verb} ({counted(kinds[kind], 'node')})"
         for kind, verb in _STARTING.items()
         if kinds[kind]
     ]
     return (
-        f"{names_text(nodes)} may not {'; '.join(what)}. A node exits at its start if this is "
+        f"{names_text(nodes)} may not {'; '.join(verbs)}. A node exits at its start if this is "
         "denied."
     )
 
 
 def _different_common_part_cause(folder: str, lacking: Sequence[_Lacking]) -> Cause:
     """Return the common cause of findings: the included common part is not the one of sros."""
-    here, old = quote(folder), quote(f"{folder}.old")
+    new, old = quote(folder), quote(f"{folder}.old")
     return Cause(
         f"the included '{folder}/node.xml' lacks rights that the one of this sros has",
         _denied_at_start(lacking),
         f"'{folder}/node.xml' is included and differs from the file of this sros. Replace it: "
-        f"`mv {here} {old} && sros policies --copy {here}`. Files and changes of your own are then "
+        f"`mv {new} {old} && sros policies --copy {new}`. Files and changes of your own are then "
         f"in {old} only: copy them back.",
         len(lacking),
     )
@@ -772,8 +773,8 @@ def _lacking_basics(
             kind = NO_PARAMETERS
         lacks_others = True
         text = f"node {node} may not {right} {', '.join(missing)}"
-        found = kind.found(enclave.path, text, profile.source.file, profile.source.line)
-        yield _Lacking(found, node, listener, _common_folder(profile))
+        finding = kind.found(enclave.path, text, profile.source.file, profile.source.line)
+        yield _Lacking(finding, node, listener, _common_folder(profile))
 
 
 DOCUMENT_SIZE = FindingKind(
@@ -1029,9 +1030,9 @@ def _check_rules(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
 def _statement_findings(statement: _Statement, rules: Rules) -> Iterator[Finding]:
     denial = statement.right._replace(qualifier=DENY)
     if denials := rules.covering_rights(denial):
-        same = set(parts(denial)) == set(denials)
+        denies_all = set(parts(denial)) == set(denials)
         shown = ", ".join(sorted({f"{by.right} {by.name}" for by in denials}))
-        if same:
+        if denies_all:
             text = f"{statement.right.describe()} is allowed here and denied in the same enclave"
             yield statement.found(CONTRADICTION, text)
         else:
@@ -1051,13 +1052,13 @@ def _redundancy_findings(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         if statement.allows and is_expression(statement.name):
             wild[id(statement.profile), statement.right.right].append(statement.name)
     limit = ComparisonLimit()
-    names = {place: Names(found, limit) for place, found in wild.items()}
+    names = {place: Names(expressions, limit) for place, expressions in wild.items()}
     for statement in checked_policy.statements:
         # Included rights are the same for all nodes, so a redundant one is not a mistake.
         if not statement.allows or statement.source.file != statement.profile.source.file:
             continue
-        there = names.get((id(statement.profile), statement.right.right))
-        if there and (wide := next(there.covering(statement.name), "")):
+        place_names = names.get((id(statement.profile), statement.right.right))
+        if place_names and (wide := next(place_names.covering(statement.name), "")):
             yield statement.found(
                 REDUNDANT_RULE, f"{statement.right.describe()} is covered by {wide}"
             )
@@ -1304,8 +1305,8 @@ def _robots_on_one_domain(
     """
     seen = {robot.domain: robot for robot in others or ()}
     for robot in robots:
-        same = (seen.get(robot.domain), seen.get(None))
-        for other_robot in seen.values() if robot.domain is None else same:
+        enclaves = (seen.get(robot.domain), seen.get(None))
+        for other_robot in seen.values() if robot.domain is None else enclaves:
             if other_robot:
                 return other_robot, robot
         if others is None:

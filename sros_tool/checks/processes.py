@@ -179,10 +179,10 @@ def _file_findings(process: Process, *, now: datetime, zone: tzinfo) -> Iterator
         text = f"it started at {iso(process.started)}; {', '.join(newer)} of {name} changed later"
         yield PROCESS_OUTDATED.found(process.label, text)
     ends = {
-        what: window.not_after for what, window in loaded.windows.items() if window.not_after < now
+        file: window.not_after for file, window in loaded.windows.items() if window.not_after < now
     }
     if ends:
-        expired = ", ".join(f"{what} at {iso(end)}" for what, end in ends.items())
+        expired = ", ".join(f"{file} at {iso(end)}" for file, end in ends.items())
         remedy = _NEW_AUTHORITY if ends.keys() & set(_AUTHORITIES.values()) else ""
         yield PROCESS_EXPIRED.found(process.label, f"of {name} expired: {expired}", remedy=remedy)
     yield from _local_time_findings(process, loaded, now, zone)
@@ -279,13 +279,13 @@ _AUTHORITIES = {
 }
 
 
-def _last_entry(entries: Sequence[Entry], what: str) -> Entry | None:
-    return next((entry for entry in reversed(entries) if entry.what == what), None)
+def _last_entry(entries: Sequence[Entry], kind: str) -> Entry | None:
+    return next((entry for entry in reversed(entries) if entry.what == kind), None)
 
 
-def _recorded_window(what: str, entry: Entry) -> Mapping[str, Window]:
+def _recorded_window(kind: str, entry: Entry) -> Mapping[str, Window]:
     with suppress(SrosError, ValueError):
-        return {what: Window(parse_iso(entry.not_before), parse_iso(entry.not_after))}
+        return {kind: Window(parse_iso(entry.not_before), parse_iso(entry.not_after))}
     return {}
 
 
@@ -378,10 +378,10 @@ def _zone(text: str, otherwise: tzinfo) -> tzinfo:
     if not text:
         return otherwise
     name = text.removeprefix(":")
-    if found := _POSIX_ZONE.match(name):
-        west = timedelta(hours=int(found[2]), minutes=int(found[3] or 0))
+    if match := _POSIX_ZONE.match(name):
+        west = timedelta(hours=int(match[2]), minutes=int(match[3] or 0))
         if west < timedelta(days=1):
-            return timezone(west if found[1] == "-" else -west)
+            return timezone(west if match[1] == "-" else -west)
     try:
         return ZoneInfo(name.partition("zoneinfo/")[2] or name)
     except (ValueError, OSError, LookupError):
@@ -400,9 +400,9 @@ def _unsecured_because(process: Process) -> str:
         return ""
     if moments:  # its files may have been there
         return ""
-    what = f"has no {', '.join(enclave.lacking)}" if enclave.is_there else "is not there"
+    fault = f"has no {', '.join(enclave.lacking)}" if enclave.is_there else "is not there"
     keystore = plain(enclave.keystore, _LONGEST_PATH)
-    return f"{plain(enclave.name, _LONGEST_PATH)} in '{keystore}' {what}"
+    return f"{plain(enclave.name, _LONGEST_PATH)} in '{keystore}' {fault}"
 
 
 def _plain_path(text: str) -> str:
@@ -582,17 +582,17 @@ def process_findings(
     is not enabled here, all open nodes share one finding, unless ``finding_per_node`` is set.
     """
     is_secured_here = environment.get(ENABLE) == "true"
-    here = ("", environment.get(DOMAIN) or "0")
+    own_domain = ("", environment.get(DOMAIN) or "0")
     nodes = [process for process in running.processes if not process.is_daemon]
     security = {node.pid: _security_of(node) for node in nodes}
     secured = [node for node in nodes if security[node.pid] is Security.SECURED]
     closed = {_network_and_domain(node) for node in nodes if node.asks_for_security}
-    closed |= {here} if is_secured_here else set()
+    closed |= {own_domain} if is_secured_here else set()
     open_nodes: list[Process] = []
     for process in running.processes:
         if process.is_daemon:
             # Each domain has its own daemon; commands ask the daemon of their domain.
-            if is_secured_here and _network_and_domain(process) == here:
+            if is_secured_here and _network_and_domain(process) == own_domain:
                 yield from _daemon_findings(process, environment)
             continue
         yield from _zenoh_findings(process)
@@ -625,8 +625,8 @@ def _network_and_domain(process: Process) -> tuple[str, str]:
 
 
 def _domain_text(process: Process) -> str:
-    there = " of another network namespace" if process.network else ""
-    return f"in domain {process.domain}{there}"
+    network = " of another network namespace" if process.network else ""
+    return f"in domain {process.domain}{network}"
 
 
 def _daemon_findings(process: Process, wanted: Mapping[str, str]) -> Iterator[Finding]:
@@ -746,10 +746,10 @@ def _first_nodes(nodes: Sequence[Process]) -> str:
 def _group_by_network_and_domain(
     processes: Iterable[Process],
 ) -> Mapping[tuple[str, str], list[Process]]:
-    found: dict[tuple[str, str], list[Process]] = defaultdict(list)
+    groups: dict[tuple[str, str], list[Process]] = defaultdict(list)
     for process in processes:
-        found[_network_and_domain(process)].append(process)
-    return found
+        groups[_network_and_domain(process)].append(process)
+    return groups
 
 
 def _mixed_vendor_findings(
@@ -760,14 +760,14 @@ def _mixed_vendor_findings(
     ``environment`` is the environment of this shell if it enables security, otherwise None.
     """
     places = dict(_group_by_network_and_domain(secured))
-    here = ("", environment.get(DOMAIN) or "0") if environment is not None else None
-    if here:
-        places.setdefault(here, [])
+    own_domain = ("", environment.get(DOMAIN) or "0") if environment is not None else None
+    if own_domain:
+        places.setdefault(own_domain, [])
     for place, processes in places.items():
         rmws: dict[str, list[str]] = {}
         for process in processes:
             rmws.setdefault(plain(process.rmw), []).append(process.label)
-        if environment is not None and place == here:
+        if environment is not None and place == own_domain:
             named = environment.get(RMW) or DEFAULT_RMW
             rmws.setdefault(named, []).append("this environment")
         if len({"_".join(rmw.split("_")[:2]) for rmw in rmws}) > 1:
@@ -783,11 +783,11 @@ def _other_keystore_findings(
     The CA of most neighbours counts; in the network and domain of ``environment``, the CA of its
     enclave.
     """
-    here = ("", environment.get(DOMAIN) or "0") if environment is not None else None
+    own_domain = ("", environment.get(DOMAIN) or "0") if environment is not None else None
     own = _authorities_here(environment) if environment is not None else frozenset()
     for place, processes in _group_by_network_and_domain(secured).items():
         groups = _group_by_authorities(process for process in processes if not process.is_zenoh)
-        if own and place == here:
+        if own and place == own_domain:
             main = f"this environment has '{plain((environment or {})[KEYSTORE], _LONGEST_PATH)}'"
             others = [group for keys, group in groups if not keys & own]
         else:
@@ -805,8 +805,12 @@ def other_folder_findings(processes: Iterable[Process], folder: Path) -> Iterato
     """Yield a finding for each process that runs in an enclave of ``folder`` from another one."""
     for process in processes:
         assert process.enclave
-        there = _plain_path(process.enclave.keystore)
-        other = f"'{there}' of its own file system" if there == str(folder) else f"'{there}'"
+        process_folder = _plain_path(process.enclave.keystore)
+        other = (
+            f"'{process_folder}' of its own file system"
+            if process_folder == str(folder)
+            else f"'{process_folder}'"
+        )
         name = plain(f"/{process.enclave.name.strip('/')}", _LONGEST_PATH)
         text = f"{name} from {other}, not from '{folder}'"
         yield PROCESS_OTHER_FOLDER.found(process.label, text)
@@ -860,11 +864,11 @@ def _authorities_here(environment: Mapping[str, str]) -> _Keys:
 
 
 def _keys(certificates: Iterable[x509.Certificate]) -> _Keys:
-    found = set()
+    keys = set()
     for certificate in certificates:
         with suppress(ValueError, UnsupportedAlgorithm):
-            found.add(certificate.public_key().public_bytes(*_FORM))
-    return frozenset(found)
+            keys.add(certificate.public_key().public_bytes(*_FORM))
+    return frozenset(keys)
 
 
 _FORM = (Encoding.DER, PublicFormat.SubjectPublicKeyInfo)

@@ -155,14 +155,14 @@ class FindingNews:
 
         The number of unreadable processes changes all the time, so it is reported only once.
         """
-        found: dict[tuple[str, str], Finding] = {}
+        findings_by_key: dict[tuple[str, str], Finding] = {}
         for finding in findings:
-            found.setdefault((finding.id, finding.subject), finding)
-        before, self._before = self._before, found
+            findings_by_key.setdefault((finding.id, finding.subject), finding)
+        before, self._before = self._before, findings_by_key
         for key, finding in before.items():
-            if key not in found:
+            if key not in findings_by_key:
                 yield FindingChange(now, ChangeKind.OVER, finding)
-        for key, finding in found.items():
+        for key, finding in findings_by_key.items():
             if key not in before:
                 yield FindingChange(now, ChangeKind.NEW, finding)
             elif finding.text != before[key].text and finding.kind is not PROCESS_NOT_SEEN:

@@ -68,11 +68,11 @@ def path_findings(paths: Iterable[Path], circumstances: Circumstances) -> list[F
     findings: list[Finding] = []
     policies, paths = [], tuple(paths)
     for path in paths:
-        found = _findings_unless_policy(path, circumstances)
-        if found is None:
+        findings_at_path = _findings_unless_policy(path, circumstances)
+        if findings_at_path is None:
             policies.append(path)
         else:
-            findings += found
+            findings += findings_at_path
     if policies:
         findings += policy_findings(policies, circumstances)
     findings += findings_between_folders(paths, circumstances)

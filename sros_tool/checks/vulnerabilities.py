@@ -117,7 +117,7 @@ def robot_findings(
     }
     yield from _library_findings(by, advisories)
     if lacking:
-        parts = (what.format(names_text(names)) for what, names in lacking.items())
+        parts = (template.format(names_text(names)) for template, names in lacking.items())
         remedy = _UNSEEN_REMEDY if lacking.keys() == {_UNSEEN} else ""
         yield ROBOTS_UNKNOWN.found("DDS of robots", "; ".join(parts), remedy=remedy)
 

@@ -276,18 +276,18 @@ def _finding_at(
 
 def _link_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     endpoint_kinds = (("listen", document.listen), ("connect", document.connect))
-    for what, endpoints in endpoint_kinds:
+    for kind, endpoints in endpoint_kinds:
         for endpoint in endpoints:
             allowed = document.protocols is None or endpoint.protocol in document.protocols
             if not allowed:
                 text = (
-                    f"{what} has {endpoint.text}, and the protocols are {_protocols_text(document)}"
+                    f"{kind} has {endpoint.text}, and the protocols are {_protocols_text(document)}"
                 )
-                yield _finding_at(document, ENDPOINT_REFUSED, f"{what}/endpoints", text)
+                yield _finding_at(document, ENDPOINT_REFUSED, f"{kind}/endpoints", text)
             elif not endpoint.is_encrypted():
-                default = "" if f"{what}/endpoints" in document.lines else ", by default"
-                text = f"{what} has {endpoint.text}{default}"
-                yield _finding_at(document, PLAIN_ENDPOINT, f"{what}/endpoints", text)
+                default = "" if f"{kind}/endpoints" in document.lines else ", by default"
+                text = f"{kind} has {endpoint.text}{default}"
+                yield _finding_at(document, PLAIN_ENDPOINT, f"{kind}/endpoints", text)
     if not any(
         endpoint.is_encrypted() for _, endpoints in endpoint_kinds for endpoint in endpoints
     ):
@@ -393,8 +393,8 @@ def _subject_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     if pairs:
         first, second = pairs[0]
         least = "at least " if len(pairs) > _MOST_PAIRS else ""
-        more = f", and {least}{len(pairs) - 1} more pairs" if len(pairs) > 1 else ""
-        text = f"subjects {first.id} and {second.id} can match the same process{more}"
+        further = f", and {least}{len(pairs) - 1} more pairs" if len(pairs) > 1 else ""
+        text = f"subjects {first.id} and {second.id} can match the same process{further}"
         yield OVERLAPPING.found(f"subject {second.id}", text, document.name, second.line)
 
 
@@ -453,15 +453,15 @@ def _wildcard_that_circumvents(
     for flow, message in product(rule.flows, rule.messages):
         if message not in _WITH_WILDCARDS:
             continue
-        same = _rules_for(rules, flow, message)
-        denied = _keys(same, allows=False)
+        equal_rules = _rules_for(rules, flow, message)
+        denied = _keys(equal_rules, allows=False)
         for key in rule.key_expressions:
             if access.allows_by_default:
                 passing = [(widest_expression(key), "the default")]
             else:
                 passing = [
                     (wide, f"rule {allowing.id}")
-                    for allowing in same
+                    for allowing in equal_rules
                     if allowing.allows
                     for wide in allowing.key_expressions
                     if _values_intersect(wide, key, limit)
@@ -479,8 +479,8 @@ def _overruling_subject(
 ) -> str:
     """Return one of ``other_subjects`` that allows a message which ``rule`` denies, or ""."""
     for other, flow, message in product(other_subjects, rule.flows, rule.messages):
-        same = _rules_for(access.rules_of(other.id), flow, message)
-        denied, allowed = _keys(same, allows=False), _keys(same, allows=True)
+        other_rules = _rules_for(access.rules_of(other.id), flow, message)
+        denied, allowed = _keys(other_rules, allows=False), _keys(other_rules, allows=True)
         for key in rule.key_expressions:
             if access.allows_by_default:
                 passing = [key]

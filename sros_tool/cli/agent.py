@@ -316,10 +316,10 @@ def _round_lines(folder: Path, finished_round: Round) -> Iterator[str]:
         if finished_round.removed
         else []
     )
-    nothing = "nothing could be fetched"
+    no_change = "nothing could be fetched"
     if finished_round.fetched:
-        nothing = "nothing changed" if finished_round.problems else "nothing new"
-    yield f"{release}: {', '.join(changes) or nothing}"
+        no_change = "nothing changed" if finished_round.problems else "nothing new"
+    yield f"{release}: {', '.join(changes) or no_change}"
     yield from _due_lines(folder, finished_round.restart, finished_round.unseen)
     if finished_round.requests:
         yield f"asked for renewal of {counted(finished_round.requests, 'enclave')}"

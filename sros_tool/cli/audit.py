@@ -135,11 +135,11 @@ def audit(
         from sros_tool.distributions import unknown_distribution
 
         print_notes(unknown_distribution(os.environ))
-    everything = {**os.environ, **environment}
+    variables = {**os.environ, **environment}
     enclaves = audits.audited_enclaves(
         sources,
-        chosen_vendor(vendor, distro, everything)[0],
-        JoinContext(domain_from(everything) or 0, now(), local_zone(os.environ)),
+        chosen_vendor(vendor, distro, variables)[0],
+        JoinContext(domain_from(variables) or 0, now(), local_zone(os.environ)),
         read_fleet(fleet_file) if fleet_file else None,
     )
     observer = environment.get(ENCLAVE, "")
@@ -260,9 +260,9 @@ def _show(audited: Audit, enclaves: AuditedEnclaves, changing_seconds: float) ->
     """Print denied rights, unseen nodes and a verdict that says what the audit did not cover."""
     for line in (*audited.lines().values(), *(f"not seen: {node}" for node in audited.unseen)):
         echo(line)
-    what = [counted(len(audited.denied), "right")] if audited.denied else []
-    what += [counted(len(audited.refused), "whole enclave")] if audited.refused else []
-    verdict = f"{' and '.join(what) or 'nothing'} would be denied to "
+    problems = [counted(len(audited.denied), "right")] if audited.denied else []
+    problems += [counted(len(audited.refused), "whole enclave")] if audited.refused else []
+    verdict = f"{' and '.join(problems) or 'nothing'} would be denied to "
     verdict += f"{counted(len(audited.observation.nodes), 'node')} with "
     verdict += (
         f"{counted(audited.observation.endpoint_count, 'endpoint')}, on {enclaves.vendor.title}"

@@ -213,5 +213,5 @@ def _print_restart(
         text += f"; of those on Zenoh: {shown_names(zenoh.restart) or 'none'}"
     if exported and (published := publish_command(root)):
         text += f"; robots that fetch: {published} first"
-    again = "; if they run from an export, export them again first" if exported else ""
-    echo(text + again, err=True)
+    export_again = "; if they run from an export, export them again first" if exported else ""
+    echo(text + export_again, err=True)

@@ -321,8 +321,8 @@ def check(
             )
         chosen = selection.choose(map(_with_relative_paths, changed.findings))
         others = changed.enclaves - changed.compared
-        rest = f"; {others} already for {upgrade_to.title}" if others else ""
-        echo(f"compared {counted(changed.compared, 'enclave')}{rest}", err=True)
+        upgraded = f"; {others} already for {upgrade_to.title}" if others else ""
+        echo(f"compared {counted(changed.compared, 'enclave')}{upgraded}", err=True)
         _SHOW[form](chosen, selection)
         return _status(chosen, fail_on)
     if suggest:
@@ -339,12 +339,12 @@ def check(
         raise UsageError("--requirements-before needs --requirements", "", "Name the new file.")
     decide = _requirements(family, paths, requirements, earlier)
     with progress("checking"):
-        every = [*_findings(family, paths, at), *_stated_differences(paths, at)]
+        findings_of_paths = [*_findings(family, paths, at), *_stated_differences(paths, at)]
         if decide:
-            every += decide(lambda paths: _system(paths, at, template))
+            findings_of_paths += decide(lambda paths: _system(paths, at, template))
         findings = [
             _with_relative_paths(finding)
-            for finding in every
+            for finding in findings_of_paths
             if not _is_mended_by(template, finding)
         ]
     chosen = selection.choose(findings)
@@ -566,9 +566,9 @@ def _vendors(
 
 def _refuse_besides_upgrade() -> None:
     """Raise `UsageError` for options that --upgrade-to cannot follow."""
-    given = click.get_current_context().params
+    parameters = click.get_current_context().params
     for option in ("requirements", "suggest", "template", "all_distros", "policies"):
-        if given[option]:
+        if parameters[option]:
             name = "policy" if option == "policies" else option.replace("_", "-")
             raise UsageError(f"--upgrade-to and --{name} exclude each other", "", "Choose one.")
 
@@ -676,29 +676,31 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
 
     threshold = parse_threshold(text)
     keystore = Keystore(root)
-    found = due_enclaves(keystore, threshold, moment, keystore.template)
+    expiring = due_enclaves(keystore, threshold, moment, keystore.template)
     if form == "json":
-        print_json(expiring_enclaves(found))
+        print_json(expiring_enclaves(expiring))
     else:
-        lines = [describe_lifetime(enclave, moment) for enclave in found.due]
+        lines = [describe_lifetime(enclave, moment) for enclave in expiring.due]
         lines += [
             f"{unreadable_enclave.name}  unknown: {unreadable_enclave.error}"
-            for unreadable_enclave in found.unreadable
+            for unreadable_enclave in expiring.unreadable
         ]
-        none = "the 1 enclave does not need" if found.lasting == 1 else ""
-        none = f"{none or f'none of {found.lasting} enclaves needs'} to be renewed ({text})"
-        if found.short_lived and not found.lasting:
-            none = ""
-        left_out = found.short_lived_text()
+        none_due = "the 1 enclave does not need" if expiring.lasting == 1 else ""
+        none_due = (
+            f"{none_due or f'none of {expiring.lasting} enclaves needs'} to be renewed ({text})"
+        )
+        if expiring.short_lived and not expiring.lasting:
+            none_due = ""
+        left_out = expiring.short_lived_text()
         left_out = f"not counted: {left_out}" if left_out else ""
         if form == "markdown":
-            echo_lines(renewal_markdown(lines, "; ".join(filter(None, (none, left_out))), text))
+            echo_lines(renewal_markdown(lines, "; ".join(filter(None, (none_due, left_out))), text))
         else:
             for line in lines:
                 echo(line)
-            for remark in filter(None, ("" if lines else none, left_out)):
+            for remark in filter(None, ("" if lines else none_due, left_out)):
                 echo(remark, err=True)
-    return NOT_DONE if found.unreadable else 1 if found.due else 0
+    return NOT_DONE if expiring.unreadable else 1 if expiring.due else 0
 
 
 def renewal_markdown(lines: Sequence[str], text_if_none: str, text: str) -> str:

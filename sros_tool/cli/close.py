@@ -63,7 +63,9 @@ def _run(words: Sequence[str], shows_output: bool) -> tuple[int, str, str]:
 )
 @click.option("--apply", is_flag=True, help="Restart the robot's systemd units with security.")
 @click.option("--proof", "prove", is_flag=True, help="Prove that the robot is closed.")
-@click.option("--undo", is_flag=True, help="Restart the robot's systemd units open again.")
+@click.option(
+    "--undo", is_flag=True, help="Restart the robot's systemd units without security again."
+)
 @click.option(
     "--partial",
     is_flag=True,
@@ -263,8 +265,8 @@ def _show_end(robot: OpenRobot, closed: Closing, *, apply: bool, holds: bool) ->
         echo(f"the robot is closed{but}{_until(closed)}{following}", err=True)
     elif closed.proofs:
         accept = _ACCEPT if closed.is_proved(partial=True) else ""
-        again = f"ask again with sros close {folder} --proof, or go back with --undo"
-        echo(f"the robot is not proved closed; next: {accept}{again}", err=True)
+        next_command = f"ask again with sros close {folder} --proof, or go back with --undo"
+        echo(f"the robot is not proved closed; next: {accept}{next_command}", err=True)
     elif apply:
         for command, processes in closed.left_by_hand.items():
             stop = _started_together(processes)
@@ -298,16 +300,16 @@ def _show_undone(robot: OpenRobot, closed: Closing) -> None:
         stopped = not any(process.pid for process in closed.observed.processes)
         state = "no process of the robot runs" if stopped else "the robot is open"
         but = ""
-        if there := closed.observed.not_here:
-            but = f"; start {enumerated(there)}, on other machines, without sros run, too"
+        if other_machines := closed.observed.not_here:
+            but = f"; start {enumerated(other_machines)}, on other machines, without sros run, too"
         echo(f"{state}: sros sees no process in an enclave of this folder{but}", err=True)
 
 
 def _state(closed: Closing, *, apply: bool) -> str:
     """Return how far the processes run closed."""
     if not closed.secured:
-        nothing = "nothing was closed" if apply else "nothing is closed yet"
-        return "no process of the robot runs" if closed.stopped >= {*closed.left} else nothing
+        not_closed = "nothing was closed" if apply else "nothing is closed yet"
+        return "no process of the robot runs" if closed.stopped >= {*closed.left} else not_closed
     words = {
         name: _EARLIER
         if name in closed.secured

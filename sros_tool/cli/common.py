@@ -199,9 +199,9 @@ def advisories_of(file: Path | None) -> tuple[Advisory, ...] | None:
 
 def check_one_decider() -> None:
     """Raise `UsageError` if the verb that runs got --all-distros and another choice of vendors."""
-    given = click.get_current_context().params
+    parameters = click.get_current_context().params
     for parameter in ("vendor", "all_vendors", "distro"):
-        if given["all_distros"] and given.get(parameter):
+        if parameters["all_distros"] and parameters.get(parameter):
             option = f"--{parameter.replace('_', '-')}"
             raise UsageError(f"--all-distros and {option} exclude each other", "", "Choose one.")
 
@@ -472,10 +472,10 @@ def complete_robot(ctx: click.Context, _parameter: click.Parameter, incomplete: 
 
     words = ctx.params.get("arguments") or ctx.params.get("sources")
     words = words or (ctx.params.get("root") or ctx.params.get("folder"),)
-    given = words[0] or os.environ.get(KEYSTORE_VARIABLE)
+    keystore = words[0] or os.environ.get(KEYSTORE_VARIABLE)
     fleet = None
     with suppress(SrosError):
-        fleet = load_fleet(Keystore(Path(given))) if given else None
+        fleet = load_fleet(Keystore(Path(keystore))) if keystore else None
     return _completions(fleet.robots if fleet else (), incomplete)
 
 
@@ -738,8 +738,10 @@ def keyring(
     """
     from sros_tool.keystore.issuing.keyring import Keyring, absolute_place
 
-    given = {"identity": identity, "permissions": permissions}
-    places = {role: given[role] or os.environ.get(name, "") for role, name in _KEY_PLACES.items()}
+    keys_by_role = {"identity": identity, "permissions": permissions}
+    places = {
+        role: keys_by_role[role] or os.environ.get(name, "") for role, name in _KEY_PLACES.items()
+    }
     return Keyring(
         _Secrets(encrypt),
         {role: absolute_place(place) for role, place in places.items() if place},
@@ -761,13 +763,13 @@ class _Secrets:
         self._known: dict[str, str] = {}
         self._lines: dict[str, str] = {}
 
-    def __call__(self, what: str) -> str:
-        if what not in self._known:
-            self._known[what] = self._find(what)
-        return self._known[what]
+    def __call__(self, name: str) -> str:
+        if name not in self._known:
+            self._known[name] = self._find(name)
+        return self._known[name]
 
-    def _find(self, what: str) -> str:
-        is_pin = " PIN " in f" {what} "
+    def _find(self, name: str) -> str:
+        is_pin = " PIN " in f" {name} "
         value = _taken.get(_PIN if is_pin else _PASSPHRASE, "")
         file = "" if is_pin else _taken.get(_PASSPHRASE_FILE, "")
         if not value and file:
@@ -777,16 +779,16 @@ class _Secrets:
         if not value and sys.stdin.isatty():
             confirm = self._new and not is_pin
             with without_progress():
-                value = ask_secret(what, confirm=confirm)
+                value = ask_secret(name, confirm=confirm)
         if not value:
             names = _PIN if is_pin else f"{_PASSPHRASE} or {_PASSPHRASE_FILE}"
             raise PkiError(
-                f"{what} is needed", "There is no terminal to prompt on.", f"Set {names}."
+                f"{name} is needed", "There is no terminal to prompt on.", f"Set {names}."
             )
         try:
             value.encode()
         except UnicodeEncodeError:
-            raise PkiError(f"{what} is not UTF-8 text", "", "Choose another one.") from None
+            raise PkiError(f"{name} is not UTF-8 text", "", "Choose another one.") from None
         return value
 
 
@@ -807,8 +809,8 @@ def _first_line(path: Path) -> str:
 # ── files and pipes that the user names ─────────────────────────────────────────────────────
 
 
-def read_named(path: Path, what: str, *, max_bytes: int = 16 * 1024 * 1024) -> bytes:
-    """Return the bytes of a file, or of standard input for "-"; ``what`` describes it in errors.
+def read_named(path: Path, kind: str, *, max_bytes: int = 16 * 1024 * 1024) -> bytes:
+    """Return the bytes of a file, or of standard input for "-"; ``kind`` describes it in errors.
 
     At most one byte more than ``max_bytes`` (16 MiB) is read from standard input.
 
@@ -819,11 +821,11 @@ def read_named(path: Path, what: str, *, max_bytes: int = 16 * 1024 * 1024) -> b
     from sros_tool.xml import read_bytes
 
     if path != Path("-"):
-        return read_bytes(path, what, max_bytes=max_bytes)
+        return read_bytes(path, kind, max_bytes=max_bytes)
     data = sys.stdin.buffer.read(max_bytes + 1) if sys.stdin else b""
     if not data:
         raise DocumentError(
-            f"the {what} is empty",
+            f"the {kind} is empty",
             "Standard input had no data.",
             "Check the command that writes to the pipe.",
         )
@@ -969,9 +971,11 @@ def _wrapped_lines(text: str, indent: str) -> list[str]:
     """Return lines of at most 80 characters; text to copy stays on one line, however long."""
     from textwrap import wrap
 
-    whole = re.sub(r"`[^`]+`|<\w[^>]*/>", lambda m: m[0].replace(" ", "\0"), visible_line(text))
+    unbreakable = re.sub(
+        r"`[^`]+`|<\w[^>]*/>", lambda m: m[0].replace(" ", "\0"), visible_line(text)
+    )
     lines = wrap(
-        whole,
+        unbreakable,
         80,
         initial_indent=indent,
         subsequent_indent=indent,
@@ -988,14 +992,14 @@ def print_signed(groups: Sequence[Sequence[Finding]], files: Iterable[str]) -> N
     for group in groups[:_MOST_SHOWN]:
         echo_findings(group, err=True)
     hidden = Counter(finding.severity for group in groups[_MOST_SHOWN:] for finding in group)
-    more = [
+    hidden_counts = [
         counted(hidden[severity], severity.word)
         for severity in sorted(Severity, reverse=True)
         if hidden[severity]
     ]
-    if more:
+    if hidden_counts:
         command = f"sros check {' '.join(map(quote, dict.fromkeys(files)))}"
-        echo(f"and {', '.join(more)}: see `{command}`", err=True)
+        echo(f"and {', '.join(hidden_counts)}: see `{command}`", err=True)
 
 
 _MOST_SHOWN = 3
@@ -1049,10 +1053,10 @@ class _Line:
             done, total, left = self._tally.done(), self._tally.total, self._tally.left()
         count = f" {done} of {total}" if total and done else ""
         seconds = time.monotonic() - self._began
-        rest = (
+        time_left = (
             "" if left is None or seconds < _ESTIMATED else f", about {_duration_text(left)} left"
         )
-        redraw(f"{self._label}{count} ... {seconds:.0f} s{rest}")
+        redraw(f"{self._label}{count} ... {seconds:.0f} s{time_left}")
         self._drawn = True
 
 

@@ -449,8 +449,8 @@ def _show_signed(
     if as_json:
         from sros_tool.keystore.delivery.signing import shown_signed
 
-        more = file_change(answer, existed=existed) if answer and not stream else ()
-        print_changed(signed, shown_signed(signed, answer, more), restart=False)
+        answer_change = file_change(answer, existed=existed) if answer and not stream else ()
+        print_changed(signed, shown_signed(signed, answer, answer_change), restart=False)
         return
     if signed.dry_run:
         print_plan(signed.root, signed.changes)
@@ -579,9 +579,9 @@ def import_verb(
     shown = None
     if as_json:
         shown = shown_import(done, pinned=bool(pinned))
-    there = f"enclave {done.name} in '{folder}' is already up to date"
+    up_to_date = f"enclave {done.name} in '{folder}' is already up to date"
     if as_json or dry_run or not done.changes:
-        first = () if as_json or dry_run else (there,)
+        first = () if as_json or dry_run else (up_to_date,)
         print_changed(done, shown, first=first, restart=False)
         return
     print_changed(done, None, _imported_lines(done, pinned=bool(pinned)), exported=False)

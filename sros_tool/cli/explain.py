@@ -341,8 +341,10 @@ def explain(
         if by_machine and not distro:
             _note_unknown_distribution()
         chosen = chosen_vendor(None if vendor == ZENOH else vendor, distro, os.environ)
-        every = Compared.VENDORS if all_vendors else Compared.DISTRIBUTIONS if all_distros else None
-        explanation = explain_on_dds(asked, question, chosen, context, kind=kind, compared=every)
+        compared = (
+            Compared.VENDORS if all_vendors else Compared.DISTRIBUTIONS if all_distros else None
+        )
+        explanation = explain_on_dds(asked, question, chosen, context, kind=kind, compared=compared)
         lines = _vendor_lines(explanation)
     if as_json:
         print_json(explanation)
@@ -557,8 +559,10 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
             sign = "ok" if part.decision.outcome.ok else str(part.decision.outcome)
             yield _labelled_row("part", f"{part.part}: {sign}")
     if decision.rule is not None and grant:
-        what = f"{'allow' if grant.rules[decision.rule].allow else 'deny'} rule {decision.rule + 1}"
-        yield _labelled_row("rule", f"{what} of grant {grant.name}: {decision.expression}")
+        deciding_rule = (
+            f"{'allow' if grant.rules[decision.rule].allow else 'deny'} rule {decision.rule + 1}"
+        )
+        yield _labelled_row("rule", f"{deciding_rule} of grant {grant.name}: {decision.expression}")
     if answer.wildcard:
         yield _labelled_row("wildcard", f"{answer.wildcard} also matches other names")
     for line in answer.lines:
@@ -623,9 +627,9 @@ def _requirements_forbidding(answer: Answer) -> Sequence[Requirement]:
 
 def _place_text(source: Source) -> str:
     """Return file:line, with a relative path if the file is below the working directory."""
-    here = Path.cwd()
+    cwd = Path.cwd()
     file = Path(source.file)
-    return f"{file.relative_to(here) if file.is_relative_to(here) else file}:{source.line}"
+    return f"{file.relative_to(cwd) if file.is_relative_to(cwd) else file}:{source.line}"
 
 
 def _protection_words(answer: Answer) -> Iterator[str]:
@@ -723,8 +727,8 @@ def _zenoh_lines(explanation: ZenohExplanation) -> Iterator[str]:
     yield _labelled_row("why", answer.text)
     yield from _link_lines(answer)
     if dropped := answer.dropped:
-        what = f"{dropped.enforcer}: silently dropped, and {answer.enclave} gets no error"
-        yield _labelled_row("denied by", what)
+        dropper = f"{dropped.enforcer}: silently dropped, and {answer.enclave} gets no error"
+        yield _labelled_row("denied by", dropper)
     if allowed and answer.question.word in _DOES:
         yield from _reached_lines(answer)
     if allowed and answer.until:
@@ -826,8 +830,8 @@ def _show_who(
         from sros_tool.explain.vendors import VendorOfKeystore
         from sros_tool.runtime.rmw import vendor_here
 
-        every = (keystore.names if names is None else names) if stated else ()
-        distributions = {name: _stated_distribution(keystore, name) for name in every}
+        enclaves = (keystore.names if names is None else names) if stated else ()
+        distributions = {name: _stated_distribution(keystore, name) for name in enclaves}
         vendors = {of: vendor_here(os.environ, of) for of in {*distributions.values()} if of}
         if len({*distributions.values()}) == 1 and vendors:
             (chosen_vendor,) = vendors.values()
@@ -1023,11 +1027,11 @@ def _followed_lines(followed: FollowedReach) -> Iterator[str]:
 
     reach = followed.reach
     where = "" if followed.domain is None else f" in domain {followed.domain}"
-    for what, paths in (
+    for title, paths in (
         ("can influence", reach.influences),
         ("can learn from", reach.learns_from),
     ):
-        yield f"{reach.enclave} {what} {counted(len(paths), 'enclave')}{where}"
+        yield f"{reach.enclave} {title} {counted(len(paths), 'enclave')}{where}"
         in_order = sorted(paths.items(), key=lambda item: (len(item[1]), item[0]))
         lines = ((name, f"  {path_text(path)}") for name, path in in_order)
         yield from folded(followed.fleet, lines)
@@ -1058,9 +1062,9 @@ def _show_log(
     print_notes(explained.notes)
     if not explained.findings:
         lines = text.count("\n") + (not text.endswith("\n")) if text else 0
-        nothing = "looks like a message of DDS Security, or of a denial by Zenoh"
+        expected_line = "looks like a message of DDS Security, or of a denial by Zenoh"
         echo(
-            f"none of {counted(lines, 'line')} {nothing}: {_text_without_findings(text)}"
+            f"none of {counted(lines, 'line')} {expected_line}: {_text_without_findings(text)}"
             if lines
             else "the log is empty: it says nothing about its node. `sros check runtime` on that "
             "machine says how its processes run",
@@ -1075,14 +1079,15 @@ def _text_without_findings(log: str) -> str:
     """Return what a log without a message of security shows, and what to do next."""
     from sros_tool.runtime.vendor_log import SECURITY_DIRECTORY
 
-    found = SECURITY_DIRECTORY.search(log)
-    if found is None:
+    directory_match = SECURITY_DIRECTORY.search(log)
+    if directory_match is None:
         return (
             "no line says 'Found security directory': on DDS, its nodes ran open, or it is not the "
             "whole log. `sros check runtime` on that machine says how its processes run"
         )
     return (
-        f"a node ran in '{found['folder']}'. Where its peers refuse it, it often logs nothing: "
+        f"a node ran in '{directory_match['folder']}'. Where its peers refuse it, "
+        "it often logs nothing: "
         "explain the log of the other node, too. Both logs can be empty if the CAs, a revocation "
         "list, the governance or the domains of both ends do not fit: `sros check FOLDER OTHER` "
         "finds this in their keystores or exports. Both can also be empty if a clock is wrong: "

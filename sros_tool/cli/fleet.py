@@ -191,9 +191,9 @@ def _confirm(arguments: tuple[str, ...], robot: str, dry_run: bool, as_json: boo
 
     root, file = root_and_file(arguments, "fleet confirm takes a keystore and one file")
     recorded_fleet(Keystore(root)).robot(robot)
-    what = "standard input" if str(file) == "-" else f"'{file}'"
+    shown_file = "standard input" if str(file) == "-" else f"'{file}'"
     data = read_named(file, "confirmation", max_bytes=MAX_BYTES)
-    received = receive(data, robot, what, now=now())
+    received = receive(data, robot, shown_file, now=now())
     path = confirmation_file(robot)
     changes = file_change(root / path, existed=(root / path).exists())
     with nullcontext() if dry_run else locked_confirmations(root):
@@ -342,14 +342,14 @@ def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
         line += _outcome_numbers(asked, REQUEST_OUTCOMES, would)
     yield line
     by_outcome = sorted(collected.robots, key=lambda robot: MESSAGE_OUTCOMES.index(robot.outcome))
-    alike: dict[str, dict[str, str]] = {}
+    texts_by_outcome: dict[str, dict[str, str]] = {}
     for robot in by_outcome:
         why = (f"{robot.outcome}: {robot.why}",) if robot.why else ()
         for text in (*why, *robot.remarks):
             unnamed = _without_robot_name(text, robot.robot)
-            alike.setdefault(_DURATION.sub("", unnamed), {})[robot.robot] = unnamed
+            texts_by_outcome.setdefault(_DURATION.sub("", unnamed), {})[robot.robot] = unnamed
     names = [robot.robot for robot in collected.robots]
-    for texts in alike.values():
+    for texts in texts_by_outcome.values():
         yield f"{_robot_names(texts, names)}: {_joined_durations(texts)}"
     for name, request in sorted(
         requests, key=lambda request: REQUEST_OUTCOMES.index(request[1].outcome)
@@ -363,14 +363,16 @@ def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
 
 def _outcome_numbers(numbers: Mapping[str, int], outcomes: Sequence[str], verb_form: str) -> str:
     """Return the number of messages or requests with each outcome, in words."""
-    there = (outcome for outcome in outcomes if numbers.get(outcome))
-    return ", ".join(f"{numbers[name]} {verb_form}{name.replace('_', ' ')}" for name in there)
+    present_outcomes = (outcome for outcome in outcomes if numbers.get(outcome))
+    return ", ".join(
+        f"{numbers[name]} {verb_form}{name.replace('_', ' ')}" for name in present_outcomes
+    )
 
 
 def _durations(function: Decorated) -> Decorated:
     """Add an option for the validity of the metadata of each role."""
-    for role, what in reversed(_VALIDITIES.items()):
-        function = click.option(f"--{role}-validity", metavar="DURATION", help=what)(function)
+    for role, help_text in reversed(_VALIDITIES.items()):
+        function = click.option(f"--{role}-validity", metavar="DURATION", help=help_text)(function)
     return function
 
 
@@ -485,10 +487,12 @@ def _published_lines(published: PublishedFleet, moment: datetime) -> Iterator[st
     from sros_tool.validity import iso
 
     new, kept = (len(published.names(outcome)) for outcome in ("published", "kept"))
-    rest = f", unchanged: {counted(kept, 'robot')}" if kept else ""
+    unchanged = f", unchanged: {counted(kept, 'robot')}" if kept else ""
     would = "would publish" if published.dry_run else "published"
-    what = f"{would} new releases of {counted(new, 'robot')}" if new else f"{would} no new release"
-    yield f"{what} in '{published.folder}'{rest}"
+    releases = (
+        f"{would} new releases of {counted(new, 'robot')}" if new else f"{would} no new release"
+    )
+    yield f"{releases} in '{published.folder}'{unchanged}"
     if removed := published.names("removed"):
         took = "would remove" if published.dry_run else "removed"
         yield f"{took} the releases of robots without enclaves: {first_few(removed, _MOST_GROUPS)}"
@@ -504,14 +508,14 @@ def _published_lines(published: PublishedFleet, moment: datetime) -> Iterator[st
         yield f"robots pin {published.root}, SHA-256 {published.root_sha256}"
     if published.expires:
         end, role = min((end, role) for role, end in published.expires.items())
-        again = "publish again"
+        next_step = "publish again"
         if role == "root":
             where = f"{quote(str(published.keystore))} {quote(str(published.folder))}"
-            again = f"`sros fleet publish {where} --root-key FILE`"
+            next_step = f"`sros fleet publish {where} --root-key FILE`"
         yield (
-            f"robots accept these files until {iso(end)}: {again} before then"
+            f"robots accept these files until {iso(end)}: {next_step} before then"
             if end > moment
-            else f"robots refuse these files, because the root metadata has expired: {again}"
+            else f"robots refuse these files, because the root metadata has expired: {next_step}"
         )
 
 
@@ -799,7 +803,7 @@ def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     root = compared_fleet.status.keystore
     left = end - compared_fleet.at
     when = f"{end:%Y-%m-%d}" if left > timedelta(days=1) else iso(end)
-    what = "first expiry on a robot" if left > timedelta(0) else "expired on a robot since"
+    label = "first expiry on a robot" if left > timedelta(0) else "expired on a robot since"
     short_lived = [name for robot in soon for name in robot.short_lived]
     named = [*map(quote, short_lived[:_MOST_GROUPS])]
     named += ["..."] * (len(short_lived) > _MOST_GROUPS)
@@ -814,7 +818,7 @@ def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     if not command and all(robot.has_release for robot in soon):
         bring = "new files are published; the column `to do` says what to do"
     yield (
-        f"{what}: {when} ({first}, {_KINDS.get(kind, kind)}), within 30 "
+        f"{label}: {when} ({first}, {_KINDS.get(kind, kind)}), within 30 "
         f"days on {counted(len(soon), 'robot')}: {bring}"
     )
 
@@ -846,7 +850,7 @@ def _groups(compared_fleet: ComparedFleet, robots: Sequence[str]) -> list[_Group
     If ``robots`` are named, each robot is a group of its own.
     """
     status, places = compared_fleet.status, _robot_positions(compared_fleet.status.names)
-    alike: dict[tuple[str, ...], list[RobotStatus]] = {}
+    robots_by_texts: dict[tuple[str, ...], list[RobotStatus]] = {}
     current: list[RobotStatus] = []
     whats: dict[str, str] = {}
     for robot in sorted(status.robots, key=lambda robot: places[robot.robot]):
@@ -855,11 +859,11 @@ def _groups(compared_fleet: ComparedFleet, robots: Sequence[str]) -> list[_Group
             what = _CLOCK.sub("", _without_robot_name("; ".join(clauses), robot.robot))
             whats[robot.robot] = what
             row = (robot.state.value, robot.to_do, _DURATION.sub("", what))
-            alike.setdefault((*row, robot.robot if robots else ""), []).append(robot)
+            robots_by_texts.setdefault((*row, robot.robot if robots else ""), []).append(robot)
         else:
             current.append(robot)
     groups = []
-    for (state, to_do, *_), group in alike.items():
+    for (state, to_do, *_), group in robots_by_texts.items():
         what = _joined_durations({robot.robot: whats[robot.robot] for robot in group})
         groups.append(_Group(group, state, to_do, what))
     return [*groups, _Group(current, "current", "", "")] if current else groups
@@ -923,8 +927,10 @@ def _joined_durations(texts: Mapping[str, str]) -> str:
 
     The text of a single robot has its name in place of `_ROBOT`.
     """
-    found = [_DURATION.findall(text) for text in texts.values()]
-    ranges = iter([sorted(durations, key=_seconds) for durations in zip(*found, strict=True)])
+    durations_of_texts = [_DURATION.findall(text) for text in texts.values()]
+    ranges = iter(
+        [sorted(durations, key=_seconds) for durations in zip(*durations_of_texts, strict=True)]
+    )
     robot, text = next(iter(texts.items()))
 
     def with_range(_: re.Match[str]) -> str:

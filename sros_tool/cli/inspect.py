@@ -153,17 +153,17 @@ def _enclave_of(root: Path, name: str) -> Path:
 def _show_history(root: Path, policy: Path | None, as_json: bool) -> int:
     from sros_tool.keystore.describe import history
 
-    found = history(root, now=now())
+    changes = history(root, now=now())
     if policy:
         from sros_tool.policy.document import read_policy
 
         digests = {enclave.digest for enclave in read_policy(policy, placeholders=True).enclaves}
-        signed = tuple(item for item in found.entries if item.entry.policy in digests)
-        found = found._replace(entries=signed)
+        signed = tuple(item for item in changes.entries if item.entry.policy in digests)
+        changes = changes._replace(entries=signed)
     if as_json:
-        print_json(found)
+        print_json(changes)
     else:
-        for item in found.entries:
+        for item in changes.entries:
             entry = item.entry
             expires = entry.not_after and entry.what != "revocation"
             until = f"until {entry.not_after}" if expires else ""
@@ -174,20 +174,20 @@ def _show_history(root: Path, policy: Path | None, as_json: bool) -> int:
             line = "  ".join(word for word in words if word)
             shown = f"{entry.time}  {entry.what:11}  {item.status:10}  {line}"
             echo(shown.rstrip())
-        for name in found.unexplained:
+        for name in changes.unexplained:
             echo(f"NOT IN THE LEDGER  {name}")
-        for gap in found.gaps:
+        for gap in changes.gaps:
             echo(f"LEDGER DAMAGED  {gap}")
         if policy:
-            number = counted(len({item.entry.enclave for item in found.entries}), "enclave")
+            number = counted(len({item.entry.enclave for item in changes.entries}), "enclave")
             echo(
                 f"permissions of {number} were signed from '{policy}', as it is now; others can "
                 f"have the same rights from an earlier version: `sros diff_policy "
                 f"{quote(str(policy))} {quote(str(root))}` compares the rights",
                 err=True,
             )
-    nothing = policy is not None and not found.entries
-    return 1 if found.unexplained or found.gaps or nothing else 0
+    no_entry = policy is not None and not changes.entries
+    return 1 if changes.unexplained or changes.gaps or no_entry else 0
 
 
 def _keystore_lines(keystore: DescribedKeystore) -> Iterator[str]:

@@ -321,17 +321,17 @@ def _show(
 
 def _created_lines(result: Creation) -> Iterator[str]:
     """Yield what was done with each enclave."""
-    same = {
+    unchanged = {
         rights.enclave
         for rights in result.rights
         if not (rights.lost_text() or rights.gained_text())
     }
-    again = [name for name in result.changed if name in same]
-    others = [name for name in result.changed if name not in same]
+    signed_again = [name for name in result.changed if name in unchanged]
+    others = [name for name in result.changed if name not in unchanged]
     for names, text in (
         (result.created, "created enclave {}"),
         (others, "replaced the permissions of enclave {}"),
-        (again, "signed the permissions of enclave {} again, with the same rights"),
+        (signed_again, "signed the permissions of enclave {} again, with the same rights"),
         (result.completed, "completed enclave {}"),
     ):
         yield from enclave_lines(names, text)
@@ -754,13 +754,13 @@ def update_keystore(
         _show_update(update, (), "", as_json)
         return 0
     if not any(value not in (None, (), False) for value in chosen):
-        again = f"sros update_keystore {quote(str(root))} --template production --next"
+        command = f"sros update_keystore {quote(str(root))} --template production --next"
         raise UsageError(
             "no change is named",
             "The keystore does not record which settings the next stage has to make."
             if next_stage
             else "",
-            f"Repeat the options of the first stage, for example `{again}`."
+            f"Repeat the options of the first stage, for example `{command}`."
             if next_stage
             else "Name one with --template, --set, --rule or --domain.",
         )
@@ -820,8 +820,8 @@ def update_keystore(
     flags = ("--next", *(["--allow-looser"] * allow_looser))
     flags += ("--revoke-old",) * (revoke_old and domain is not None)
     words = [word for name, given in options.items() for value in given for word in (name, value)]
-    again = " ".join(map(quote, ("sros", "update_keystore", str(root), *words, *flags)))
-    _show_update(update, undone, again, as_json)
+    command = " ".join(map(quote, ("sros", "update_keystore", str(root), *words, *flags)))
+    _show_update(update, undone, command, as_json)
     refused = bool(update.looser) and not allow_looser
     if refused:  # only a dry run comes here
         echo("this would be refused: it needs --allow-looser", err=True)
@@ -857,10 +857,12 @@ def _named_rule(text: str) -> NamedValues:
     return NamedValues(kind, name, tuple(_key_and_value(word) for word in words[2:]))
 
 
-def _show_update(update: KeystoreUpdate, undone: Sequence[str], again: str, as_json: bool) -> None:
+def _show_update(
+    update: KeystoreUpdate, undone: Sequence[str], command: str, as_json: bool
+) -> None:
     """Print an update.
 
-    ``undone`` are clauses about the edits by hand that it undoes, ``again`` is the command of the
+    ``undone`` are clauses about the edits by hand that it undoes, ``command`` is the command of the
     stage that is left.
     """
     if as_json:
@@ -892,7 +894,7 @@ def _show_update(update: KeystoreUpdate, undone: Sequence[str], again: str, as_j
     if update.left:
         echo(
             f"stage {update.done[-1]} {'would be' if update.dry_run else 'is'} done; left: "
-            f"{', '.join(update.left)}. Once the processes were restarted, run `{again}`.",
+            f"{', '.join(update.left)}. Once the processes were restarted, run `{command}`.",
             err=True,
         )
 
@@ -910,9 +912,9 @@ def _update_lines(update: KeystoreUpdate, undone: Sequence[str]) -> Iterator[str
 
 
 def _issued_lines(update: KeystoreUpdate) -> Iterator[str]:
-    for outcome, what in (("renewed", "renewed"), ("signed", "signed the permissions of")):
+    for outcome, done in (("renewed", "renewed"), ("signed", "signed the permissions of")):
         if names := update.names(outcome):
-            yield f"{what} {shown_names(names)}"
+            yield f"{done} {shown_names(names)}"
 
 
 def _replaced_lines(update: KeystoreUpdate) -> Iterator[str]:

@@ -141,15 +141,15 @@ def _replaced_lines(result: Changed, *, has_new_keys: bool) -> Iterator[str]:
         yield "no enclave needs to be renewed"
     if result.works_until:
         end = iso(result.works_until)
-        what = f"the replaced certificates work until {end} at the latest"
+        validity = f"the replaced certificates work until {end} at the latest"
         if result.may_work_longer:
-            what = (
+            validity = (
                 f"the replaced certificates work at least until {end} (the keystore was restored "
                 "from a backup, and its ledger may lack later ones)"
             )
         elif len(result.outcomes) == 1:
-            what = f"the replaced certificate works until {end}"
-        yield f"{what}, unless revoked: see --revoke-old"
+            validity = f"the replaced certificate works until {end}"
+        yield f"{validity}, unless revoked: see --revoke-old"
     if result.outcomes and not result.restart:
         published = publish_command(result.root)
         deliver = f"publish ({published}) or export again" if published else "export again"
@@ -636,7 +636,8 @@ def _new_keys(identity: str | None, permissions: str | None, encrypt: bool) -> K
     from dataclasses import replace
 
     named = {"identity": identity, "permissions": permissions}
-    given = keyring(identity, permissions, encrypt=encrypt)
+    chosen_keyring = keyring(identity, permissions, encrypt=encrypt)
     return replace(
-        given, places={role: place for role, place in given.places.items() if named[role]}
+        chosen_keyring,
+        places={role: place for role, place in chosen_keyring.places.items() if named[role]},
     )

@@ -147,8 +147,8 @@ def observe(
     from sros_tool.validity import parse_duration
 
     seconds = None
-    everything = {**os.environ, **environment}
-    enclaves = _enclaves_by_identity(everything)
+    variables = {**os.environ, **environment}
+    enclaves = _enclaves_by_identity(variables)
 
     def identify(observation: Observation) -> Observation:
         return with_certified_enclaves(observation, enclaves)
@@ -162,7 +162,7 @@ def observe(
             elif spin_time is not None:
                 snapshot = look_for(graph, spin_time, time.monotonic)
             else:
-                settling = SECURED if everything.get(ENABLE) == "true" else Settling()
+                settling = SECURED if variables.get(ENABLE) == "true" else Settling()
                 snapshot = settle(graph, settling, time.monotonic)
             return replace(
                 snapshot,
@@ -630,8 +630,8 @@ def _show_lines(lines: Sequence[AskingLine], *, err: bool = False) -> None:
         echo("these lines of logs ask for it; a process can print any line:", err=err)
     for line in lines:
         by = line.process or "a process without a label"
-        what = f"{line.direction} {line.topic} in {line.enclave}"
-        echo(f"  {line.log}:{line.line}: {by}: {what}", err=err)
+        denial = f"{line.direction} {line.topic} in {line.enclave}"
+        echo(f"  {line.log}:{line.line}: {by}: {denial}", err=err)
 
 
 def _log_text(log: Path) -> str:

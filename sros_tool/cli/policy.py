@@ -120,10 +120,10 @@ def merge_policy(
     additions = [read_policy(path) for path in others]
     if nodes:
         additions = [policy_of_nodes(addition, nodes) for addition in additions]
-        there = {
+        known_nodes = {
             p.node for addition in additions for e in addition.enclaves for p in e.all_profiles()
         }
-        if missing := [node for node in nodes if node not in there]:
+        if missing := [node for node in nodes if node not in known_nodes]:
             raise UsageError(
                 f"--node {missing[0]}: no policy to merge has a node of this name",
                 "",
@@ -213,10 +213,10 @@ def _check_includes(policy: Path, output: Path, document: bytes) -> None:
     from sros_tool.policy.document import read_policy
 
     try:
-        same = read_policy(output, document) == read_policy(policy, document)
+        is_same = read_policy(output, document) == read_policy(policy, document)
     except PolicyError:
-        same = False
-    if not same:
+        is_same = False
+    if not is_same:
         raise PolicyError(
             f"the result cannot be written to '{output}'",
             f"From there, its relative includes lead to other files than from '{policy}'.",
@@ -350,22 +350,22 @@ def rights_markdown(
     lines += domain_lines(difference, first_source.fleet or second_source.fleet)
     lines += _protection_lines(difference.protections)
     parts = []
-    rest = "which `sros diff_policy` shows"
+    shown_by = "which `sros diff_policy` shows"
     for sign, title in (("~", "renamed"), ("+", "added"), ("-", "removed")):
         signed = [line.removeprefix(f"{sign} ") for line in lines if line.startswith(sign)]
         if signed:
             parts.append(f"**{len(signed)} {title}**")
-            parts.append(bounded_list(map(code, signed), _MOST_LINES, rest))
+            parts.append(bounded_list(map(code, signed), _MOST_LINES, shown_by))
     if unanswered := list(unanswered_lines(difference, second_source.fleet)):
         parts += [
             "**Nobody answers any more**",
-            bounded_list(map(code, unanswered), _MOST_LINES, rest),
+            bounded_list(map(code, unanswered), _MOST_LINES, shown_by),
         ]
     if difference.governance_differs:
         parts.append("**The governance differs**: see `sros diff_policy --no-new-access`")
     notes = [f"{note.id}: {note.text}" for note in (*first_source.notes, *second_source.notes)]
     if notes:
-        parts += ["**Notes**", bounded_list(map(code, notes), 4000, rest)]
+        parts += ["**Notes**", bounded_list(map(code, notes), 4000, shown_by)]
     differ = counted(len(lines), "difference") if lines else "no difference"
     title = f"### Rights: {plain(differ)}"
     if lines and drawn is None:
@@ -570,12 +570,12 @@ def _use_lines(enclave: MinimizedEnclave) -> Iterator[str]:
         yield "  wider than used"
     for wide in use.wildcards:
         used = ", ".join(right.describe() for right in wide.used) or "nothing"
-        instead = ", ".join(right.describe() for right in wide.replacement)
-        if instead == used:
-            yield f"    {wide.rule.describe()}  becomes  {instead}"
+        granted = ", ".join(right.describe() for right in wide.replacement)
+        if granted == used:
+            yield f"    {wide.rule.describe()}  becomes  {granted}"
         else:
             yield f"    {wide.rule.describe()}  covered {used}"
-            yield f"      {f'becomes {instead}' if instead else 'not needed: other rules give it'}"
+            yield f"      {f'becomes {granted}' if granted else 'not needed: other rules give it'}"
     if use.kept_for_every_node:
         number = len(use.kept_for_every_node)
         yield f"  never observed, but kept because every node needs it: {number}"
@@ -703,13 +703,13 @@ def _copy(source: Path, target: Path, *, as_json: bool, dry_run: bool) -> None:
     if is_keystore(target):
         raise UsageError(f"'{target}' already exists, as a keystore", "", "Name another folder.")
     changes = copy_policies(source, target, dry_run=dry_run)
-    what = "common parts of policies" if target.absolute().name == COMMON else "policies"
+    kind = "common parts of policies" if target.absolute().name == COMMON else "policies"
     if as_json:
         print_json(CopiedPolicies(target, dry_run, changes, ()))
     elif not changes:
-        echo(f"nothing to copy: '{target}' has the {what}")
+        echo(f"nothing to copy: '{target}' has the {kind}")
     else:
-        echo(f"{'would copy' if dry_run else 'copied'} the {what} to '{target}'")
+        echo(f"{'would copy' if dry_run else 'copied'} the {kind} to '{target}'")
 
 
 def _convert(
@@ -755,23 +755,23 @@ def _convert(
         )
     elif output is None and not dry_run:
         echo_document(document)
-    what = f"{counted(len(policy.enclaves), 'node')} of '{earlier}' to enclaves: {names}"
+    result = f"{counted(len(policy.enclaves), 'node')} of '{earlier}' to enclaves: {names}"
     if dry_run and not as_json:
-        echo(f"would convert {what}")
+        echo(f"would convert {result}")
         if output:
             echo(f"would {'replace' if output.exists() else 'write'} {output}")
     elif not dry_run:
-        echo(f"converted {what}", err=True)
+        echo(f"converted {result}", err=True)
     print_notes(converted.notes)
     for note in converted.left_out:
         echo(f"left out: {note.text}", err=True)
     if saved:
         echo(saved, err=True)
         if not complete:
-            again = f"{quote(str(earlier))} -o {quote(str(output))} --force"
+            new_arguments = f"{quote(str(earlier))} -o {quote(str(output))} --force"
             echo(
                 "no rights were added; nodes of a later ROS 2 need more, such as publishing "
-                f"/rosout from a namespace: add them with `sros policies --convert {again} "
+                f"/rosout from a namespace: add them with `sros policies --convert {new_arguments} "
                 "--with-node-rights`",
                 err=True,
             )
@@ -821,12 +821,12 @@ def added_lines(base: AccessSource, head: AccessSource, growth: Growth) -> list[
     from sros_tool.proof.growth import renamed_between
 
     renamed = renamed_between(base, head)
-    rest = growth.without_renames(renamed)
+    unrenamed = growth.without_renames(renamed)
     return [
         *_renamed_lines(renamed, head.fleet),
-        *_folded_gains(head, "+", rest.added, growth),
+        *_folded_gains(head, "+", unrenamed.added, growth),
         *(f"+ less protection: {change}" for change in growth.lost),
-        *_reach_lines(head, rest.reach),
+        *_reach_lines(head, unrenamed.reach),
     ]
 
 
@@ -845,11 +845,11 @@ def _removed_lines(base: AccessSource, head: AccessSource, growth: Growth) -> li
     from sros_tool.proof.growth import renamed_between
 
     removed = growth.without_renames(renamed_between(base, head)).removed
-    more = (
+    protections = (
         f"- more protection: {change.key} {change.after} -> {change.before}"
         for change in growth.gained
     )
-    return [*_folded_gains(base, "-", removed, growth), *more]
+    return [*_folded_gains(base, "-", removed, growth), *protections]
 
 
 def _folded_gains(
@@ -936,15 +936,15 @@ def access_summary(growth: Growth) -> str:
     return "; ".join(parts) + gone + basis
 
 
-def _count(number: int, what: str) -> str:
-    return f"1 {what} is" if number == 1 else f"{number} {what}s are"
+def _count(number: int, noun: str) -> str:
+    return f"1 {noun} is" if number == 1 else f"{number} {noun}s are"
 
 
 def access_markdown(base: AccessSource, head: AccessSource, growth: Growth) -> str:
     """Return the added and removed access of a change as Markdown."""
     from sros_tool.markdown import bounded_list, code, plain
 
-    rest = "which `sros diff_policy --no-new-access` shows"
+    shown_by = "which `sros diff_policy --no-new-access` shows"
     parts = [f"### New access: {plain('yes' if growth else 'none')}", plain(access_summary(growth))]
     added, removed = added_lines(base, head, growth), _removed_lines(base, head, growth)
     renamed = [line for line in added if line.startswith("~")]
@@ -955,5 +955,7 @@ def access_markdown(base: AccessSource, head: AccessSource, growth: Growth) -> s
     ):
         if lines:
             parts.append(f"**{len(lines)} {title}**")
-            parts.append(bounded_list((code(line[2:]) for line in lines), _MOST_CHARACTERS, rest))
+            parts.append(
+                bounded_list((code(line[2:]) for line in lines), _MOST_CHARACTERS, shown_by)
+            )
     return "\n\n".join(parts) + "\n"

@@ -364,14 +364,15 @@ def _outdated_dependency() -> str:
             if not mark or ";" in requirement:  # of an extra
                 continue
             try:
-                found = version(name)
+                installed_version = version(name)
             except PackageNotFoundError:
-                found = ""
-            if not found or _numbers(found) < _numbers(least):
-                here = f"version {found} is" if found else "none is"
+                installed_version = ""
+            if not installed_version or _numbers(installed_version) < _numbers(least):
+                present = f"version {installed_version} is" if installed_version else "none is"
                 return (
-                    f"sros needs the Python package {name} {least} or newer, and {here} installed "
-                    f"for {sys.executable}. Install it with the pip of that Python."
+                    f"sros needs the Python package {name} {least} or newer, "
+                    f"and {present} installed for {sys.executable}. "
+                    "Install it with the pip of that Python."
                 )
     return ""
 

@@ -367,8 +367,8 @@ def _sentence(result: Review, step: ReviewStep) -> str:
         case RightsChange(compared=compared, absolute=absolute, relative=relative):
             added, gone = len(compared.rights.only_second), len(compared.rights.only_first)
             clauses = [
-                f"{counted(count, what)} {said}"
-                for count, what, said in (
+                f"{counted(count, noun)} {verb}"
+                for count, noun, verb in (
                     (added, "written right", "added"),
                     (gone, "written right", "gone"),
                     (len(compared.protections), "stated protection", "changed"),
@@ -387,20 +387,20 @@ def _sentence(result: Review, step: ReviewStep) -> str:
             left_out = f"; not counted: {left_out}" if left_out else ""
             return f"{len(due)} of {count} enclaves need to be renewed{unread}{left_out}"
         case Facts(lines=lines):
-            more = f", and {len(lines) - 1} more" if len(lines) > 1 else ""
-            return f"'{lines[0][1]}' {lines[0][0]}{more}"
+            further = f", and {len(lines) - 1} more" if len(lines) > 1 else ""
+            return f"'{lines[0][1]}' {lines[0][0]}{further}"
         case error:
             return result.with_shown_paths(str(error))
 
 
 def _sentences(result: Review, steps: Sequence[ReviewStep]) -> Iterator[tuple[ReviewStep, str]]:
     """Yield each step with its result as a clause, which repeats no error of an earlier step."""
-    said = ""
+    sentence_begin = ""
     for step in steps:
         sentence = _sentence(result, step)
-        if isinstance(step.content, SrosError) and sentence in said:
+        if isinstance(step.content, SrosError) and sentence in sentence_begin:
             sentence = "could not be decided, for the same reason"
-        said += "\n".join((sentence, *map(result.with_shown_paths, _lines_to_read(step))))
+        sentence_begin += "\n".join((sentence, *map(result.with_shown_paths, _lines_to_read(step))))
         yield step, sentence
 
 
@@ -410,9 +410,9 @@ def _text(result: Review) -> list[str]:
     for step, sentence in _sentences(result, result.steps):
         subject = f" {result.with_shown_paths(step.subject)}" if step.subject else ""
         lines.append(f"{step.kind}{subject}: {sentence}")
-        said = _lines_to_read(step)
-        more = [f"and {len(said) - _MOST_REASONS} more (--summary FILE has all)"]
-        shown = said[:_MOST_REASONS] + more * (len(said) > _MOST_REASONS)
+        lines_to_read = _lines_to_read(step)
+        further = [f"and {len(lines_to_read) - _MOST_REASONS} more (--summary FILE has all)"]
+        shown = lines_to_read[:_MOST_REASONS] + further * (len(lines_to_read) > _MOST_REASONS)
         lines += [f"  {result.with_shown_paths(line)}" for line in shown]
     return [*lines, _verdict(result)]
 
@@ -562,18 +562,18 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
         chosen_findings = ChosenFindings(shown, chosen_findings.accepted, chosen_findings.hidden)
         return findings_markdown(chosen_findings, step.fleet)
 
-    rest = "which `sros review` prints"
+    shown_by = "which `sros review` prints"
     match step.content:
         case ChosenFindings() as chosen:
             return findings(chosen) if chosen.shown else ""
         case AccessChange(before=before, after=after, growth=growth) as change:
-            gone = bounded_list(map(code, _undenied_lines(change)), 6000, rest)
+            gone = bounded_list(map(code, _undenied_lines(change)), 6000, shown_by)
             return "\n\n".join(filter(None, (access_markdown(before, after, growth), gone)))
         case RightsChange(before=before, after=after, compared=compared) as change:
             parts = [rights_markdown(before, after, compared)] if compared else []
             if lines := list(_absolute_lines(change)):
                 title = f"### {counted(len(lines), 'name')} made absolute or relative"
-                parts += [title, bounded_list(map(code, lines), 6000, rest)]
+                parts += [title, bounded_list(map(code, lines), 6000, shown_by)]
             return "\n\n".join(part.rstrip("\n") for part in parts)
         case DroppedRequirements(chosen=chosen):
             title = "### Requirements that changed, checked as they were before the change"
@@ -583,8 +583,8 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
             lines += [f"{enclave.name}  unknown: {enclave.error}" for enclave in unreadable]
             return renewal_markdown(lines, "", "as asked") if lines else ""
         case Facts(lines=facts):
-            said = (f"{code(name)} {code(text)}" for text, name in facts)
-            return f"### {_TITLES[step.kind]}\n\n{bounded_list(said, 6000, rest)}"
+            facts_with_names = (f"{code(name)} {code(text)}" for text, name in facts)
+            return f"### {_TITLES[step.kind]}\n\n{bounded_list(facts_with_names, 6000, shown_by)}"
     return ""
 
 

@@ -174,11 +174,11 @@ def zenoh(
         "mode": mode,
         "domains": _domains(domain),
     }
-    given = {f"zenoh.{key}": text for key, text in chosen.items() if text}
+    chosen_settings = {f"zenoh.{key}": text for key, text in chosen.items() if text}
     further = [name.partition("=")[::2] for name in routers if "=" in name]
-    if off and (given or further or crossing):
+    if off and (chosen_settings or further or crossing):
         raise UsageError("--off takes no options of the network", "", "Leave one of them out.")
-    network = None if off else _network(settings, given, further, crossing)
+    network = None if off else _network(settings, chosen_settings, further, crossing)
     with progress("writing the Zenoh files"):
         work = read_consistently(set_zenoh) if only_check else set_zenoh
         result = work(root, network, now=now(), keyring=keyring(), dry_run=dry_run or only_check)
@@ -382,13 +382,13 @@ def _configuration_lines(
         yield from _key_lines("is denied, if no wildcard is used,", rights.denied)
 
 
-def _key_lines(what: str, pairs: Sequence[tuple[str, str]]) -> Iterator[str]:
+def _key_lines(kind: str, pairs: Sequence[tuple[str, str]]) -> Iterator[str]:
     from sros_tool.checks.zenoh import VERBS
 
     for right, word in VERBS.items():
         keys = [key for of, key in pairs if of == right]
         if keys:
-            yield f"  {what} {word} the keys {first_few(keys, _MOST_KEYS)}"
+            yield f"  {kind} {word} the keys {first_few(keys, _MOST_KEYS)}"
 
 
 def _kind(document: ConfigurationDocument) -> str:

@@ -431,8 +431,8 @@ def run_by_hand(node: HandNode, say: Callable[[str], None]) -> int:
     if stopped.is_set():
         say("stopped")
     elif last and last.stage is ProcessStage.ENDPOINT and os.environ.get(ENABLE) == "true":
-        what = "publish" if node.role is Role.TALKER else "subscribe"
-        asked = shlex.join((os.environ.get(KEYSTORE, ""), os.environ.get(ENCLAVE) or "/", what))
+        verb = "publish" if node.role is Role.TALKER else "subscribe"
+        asked = shlex.join((os.environ.get(KEYSTORE, ""), os.environ.get(ENCLAVE) or "/", verb))
         say(f"whether its enclave may do that: sros explain {asked} {node.topic}")
     elif status and node.backend == RCLPY:
         say("`sros doctor` says whether rclpy on this machine can be secured")

@@ -420,7 +420,7 @@ def _best_first(
 def _service_cast(rights: Mapping[str, Grant]) -> dict[str, str]:
     """Return the cast of a server and a client of one service; empty if there is none.
 
-    A client that may not serve is preferred, and one that names the service.
+    A client that may not serve is preferred, and a client whose permissions name the service.
     """
     cast: dict[str, str] = {}
     best = -1
@@ -681,8 +681,8 @@ def _names(
             yield name
             continue
         # With more nodes than names, two nodes share a name: DDS allows that in a process.
-        alike = [enclave for enclave in free_names if name[1:] in enclave.lower()]
-        chosen = (alike or free_names or named)[0]
+        similar_names = [enclave for enclave in free_names if name[1:] in enclave.lower()]
+        chosen = (similar_names or free_names or named)[0]
         if chosen in free_names:
             free_names.remove(chosen)
         yield chosen

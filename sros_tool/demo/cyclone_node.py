@@ -48,8 +48,8 @@ class CycloneNode:
     def types(self, name: str, *, of_publishers: bool) -> Sequence[str]:
         """Return the ROS type of each discovered publisher, or else subscription, of a topic."""
         participant, topic = self._participant, self.wire_name(name)
-        found = participant.publications() if of_publishers else participant.subscriptions()
-        return [ros_type(endpoint.type_name) for endpoint in found if endpoint.topic == topic]
+        endpoints = participant.publications() if of_publishers else participant.subscriptions()
+        return [ros_type(endpoint.type_name) for endpoint in endpoints if endpoint.topic == topic]
 
     def count(self, name: str, kind: str, on_count: Callable[[int], None]) -> str:
         """Count the messages of a type."""

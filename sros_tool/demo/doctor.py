@@ -121,8 +121,8 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
     for stack in diagnosis.stacks:
         identity = f"{stack.dds} {stack.version}".strip() if stack.present else ""
         lines.append(f"{stack.name:<{width}}  {_answer(stack):<19}  {identity}".rstrip())
-        said = stack.advice in diagnosis.conclusion
-        lines += _indented([stack.evidence, stack.where, "" if said else stack.advice])
+        is_concluded = stack.advice in diagnosis.conclusion
+        lines += _indented([stack.evidence, stack.where, "" if is_concluded else stack.advice])
     return "\n".join(lines)
 
 
@@ -323,16 +323,18 @@ class _PrivateDataRemover:
         words |= dict.fromkeys((*names, user.pw_name if user else ""), "USER")
         hosts = (socket.gethostname(), environment.get("HOSTNAME", ""))
         words |= dict.fromkeys((*hosts, *(host.split(".")[0] for host in hosts)), "HOST")
-        self._words = {word: instead for word, instead in words.items() if word not in ("", "root")}
+        self._words = {
+            word: replacement for word, replacement in words.items() if word not in ("", "root")
+        }
 
     def __call__(self, text: str) -> str:
         """Return the text on one line, without private data."""
         text = re.sub(r"-----BEGIN.*?(-----END[^-]*-----|\Z)", "KEY", text, flags=re.DOTALL)
         for word in sorted(self._words, key=len, reverse=True):
-            instead = self._words[word]
-            bound = instead in ("USER", "HOST") or len(word) < 4
+            replacement = self._words[word]
+            bound = replacement in ("USER", "HOST") or len(word) < 4
             pattern = rf"(?<!\w){re.escape(word)}(?!\w)" if bound else re.escape(word)
-            text = re.sub(pattern, instead, text)
+            text = re.sub(pattern, replacement, text)
         text = re.sub(r"pkcs11:\S+", "pkcs11:…", text)
         text = re.sub(r"\b\d{1,3}(\.\d{1,3}){3}\b(?!\.)", "ADDRESS", text)
         text = re.sub(r"\b[0-9a-fA-F]{0,4}(:[0-9a-fA-F]{0,4}){4,7}\b", "ADDRESS", text)

@@ -292,7 +292,7 @@ def edited_permissions(copy: KeystoreCopy) -> None:
     """Write one more topic into the guest's signed permissions."""
     signed = copy.read("guest", PERMISSIONS_FILE)
     topic = f"<topics>\r\n            <topic>{copy.dds_topic}</topic>".encode()
-    edited = re.sub(rb"(<publish>\s*)<topics>", lambda found: found[1] + topic, signed, count=1)
+    edited = re.sub(rb"(<publish>\s*)<topics>", lambda match: match[1] + topic, signed, count=1)
     if edited == signed:
         raise DocumentError(
             "the signed permissions cannot be edited", "They do not allow publishing anything."

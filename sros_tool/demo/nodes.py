@@ -281,8 +281,8 @@ class OtherTypes:
             self._events.report(EventKind.HEARD, text, count=number)
 
     def _kind_text(self, kind: str) -> str:
-        what = "publisher" if self._count else "subscription"
-        text = f"{self._topic} has {counted(self._seen[kind], what)} of {kind}"
+        endpoint_kind = "publisher" if self._count else "subscription"
+        text = f"{self._topic} has {counted(self._seen[kind], endpoint_kind)} of {kind}"
         if kind == self._own:
             return text
         if self._count is None:

@@ -201,10 +201,10 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
                 rows = tuple(
                     _with_default_template_status(
                         user.row_if_allowed(row, topic),
-                        _with_expectation(same, backend, strong, topic),
+                        _with_expectation(scenario_row, backend, strong, topic),
                         options,
                     )
-                    for row, same in zip(rows, scenario.rows, strict=True)
+                    for row, scenario_row in zip(rows, scenario.rows, strict=True)
                 )
             scenario = replace(scenario, rows=rows)
             keystores = create_keystores(scenario_folder, scenario, spec, user)

@@ -211,8 +211,10 @@ def _observe(record: RowRecord) -> _Finding:
         return _Finding(status, wrong[0].detail)
     for claim, finding in controls:
         if finding.status is not claim.expected:
-            what = f"{claim.subject} {claim.relation} {claim.talker}".strip()
-            return _undecided(f"the control failed ({what}: {finding.status}, {finding.detail})")
+            claim_text = f"{claim.subject} {claim.relation} {claim.talker}".strip()
+            return _undecided(
+                f"the control failed ({claim_text}: {finding.status}, {finding.detail})"
+            )
     details = [finding.detail for _, finding in claims]
     details += [f"control: {finding.detail}" for _, finding in controls]
     return _Finding(record.row.expected, "; ".join(details))
@@ -227,8 +229,8 @@ def _missing_import(party: Party, record: PartyRecord) -> str:
         for e in record.events
         if e.kind is EventKind.FAILED and e.stage is ProcessStage.IMPORT
     )
-    what = "rclpy" if party.role is Role.OBSERVER else f"the {party.role}"
-    return next((f"{what} cannot be loaded here: {text}" for text in failed), "")
+    module = "rclpy" if party.role is Role.OBSERVER else f"the {party.role}"
+    return next((f"{module} cannot be loaded here: {text}" for text in failed), "")
 
 
 class _Case:
@@ -357,10 +359,10 @@ def _judge_replay(case: _Case) -> _Finding:
     claim, injected = case.claim, case.record.injected
     if injected is None or not injected.packets:
         return _undecided("no packets of the talker were captured to send again")
-    again = sum(event.time >= injected.time for event in case.heard())
+    repeated = sum(event.time >= injected.time for event in case.heard())
     return case.result(
-        again > 0,
-        f"{claim.subject} heard {again} messages in {injected.packets} packets of the "
+        repeated > 0,
+        f"{claim.subject} heard {repeated} messages in {injected.packets} packets of the "
         f"{claim.talker} that were sent again, twice, after the talker had left",
     )
 
@@ -432,8 +434,8 @@ def _judge_wire(case: _Case) -> _Finding:
         shown = count.topics if claim.wire is Wire.TOPIC else count.certificates
         if not shown and not count.protected:
             return _undecided("no packets of the row were captured")
-        what = f"the {claim.wire}" if claim.wire is Wire.TOPIC else f"a {claim.wire}"
-        return case.result(shown > 0, f"{shown} packets show {what}")
+        packet_kind = f"the {claim.wire}" if claim.wire is Wire.TOPIC else f"a {claim.wire}"
+        return case.result(shown > 0, f"{shown} packets show {packet_kind}")
     if count.plain:
         return case.result(True, f"{count.plain} packets show the text")
     sent = len(case.messages_sent(case.subject))
@@ -671,8 +673,8 @@ class UsedLibrary(NamedTuple):
             return f"{name} has no known vulnerability{unclear}."
         number = counted(len(self.vulnerabilities), "known vulnerability", "known vulnerabilities")
         ids = first_few(self.vulnerabilities, maximum)
-        them = "it" if len(self.vulnerabilities) == 1 else "them"
-        unless = f", unless its package fixes {them}" if self.packaged else ""
+        pronoun = "it" if len(self.vulnerabilities) == 1 else "them"
+        unless = f", unless its package fixes {pronoun}" if self.packaged else ""
         return f"{name} has {number}{unless}: {ids}{unclear}."
 
 

@@ -217,7 +217,7 @@ class _Injector:
     A packet socket does not work here: the kernel drops its packets with loopback addresses.
 
     Raises:
-        PermissionError: it needs CAP_NET_RAW.
+        PermissionError: the process lacks CAP_NET_RAW.
     """
 
     def __init__(self) -> None:

@@ -450,8 +450,8 @@ class Answer(NamedTuple):
             case Outcome.CRASHES:
                 return "nobody: the process crashes when it starts"
             case Outcome.DENIED if self.part in self.question.parts:
-                what = _CREATED.get(self.question.word, "it")
-                return f"DDS in the process itself: {what} is not created"
+                entity = _CREATED.get(self.question.word, "it")
+                return f"DDS in the process itself: {entity} is not created"
             case _:
                 return "DDS in the process itself: no node of the enclave starts"
 

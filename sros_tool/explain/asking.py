@@ -190,11 +190,11 @@ def not_in_policy_error(policy: Policy, name: str, file: Path) -> PolicyError:
     """Return the error for an enclave that a policy does not have."""
     from sros_tool.keystore.selection import likely_names
 
-    there = [enclave.path for enclave in policy.enclaves]
-    meant = likely_names(name, there)
+    known_enclaves = [enclave.path for enclave in policy.enclaves]
+    meant = likely_names(name, known_enclaves)
     return PolicyError(
         f"unable to find enclave {name} in the policy '{file}'",
-        f"It has {', '.join(there)}.",
+        f"It has {', '.join(known_enclaves)}.",
         f"Perhaps you mean {' or '.join(meant)}." if meant else "",
     )
 

@@ -499,7 +499,7 @@ def _enclaves_of(
     shown = process[0].enclaves
     if shown and shown != UNSHOWN:
         return frozenset(shown).intersection(known.by_enclave), True
-    each_for = [found for node in process if (found := known.enclaves_for(node.fqn))]
+    each_for = [enclaves for node in process if (enclaves := known.enclaves_for(node.fqn))]
     common = frozenset.intersection(*each_for) if each_for else frozenset[str]()
     if common:
         return common, True
@@ -573,8 +573,8 @@ def _endpoints(right: str, name: str) -> tuple[Endpoint, ...]:
     )
 
 
-def _without_enclave(node: ObservedNode, what: str) -> Iterator[DeniedRight]:
-    reason = f"the {what} has no enclave for this node"
+def _without_enclave(node: ObservedNode, source: str) -> Iterator[DeniedRight]:
+    reason = f"the {source} has no enclave for this node"
     for enclave in node.enclaves:
         for right, needed in _rights_of(node, enclave):
             yield DeniedRight(right, (node.fqn,), reason, False, True, needed)

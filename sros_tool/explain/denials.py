@@ -119,8 +119,8 @@ def _denials_of(process: str, numbered: list[tuple[int, str]]) -> Iterator[Denia
     for index, (number, line) in enumerate(numbered):
         if named := SECURITY_DIRECTORY.search(line):
             enclave, folder = named["enclave"] or "/", named["folder"]
-        if found := denied_topic(line):
-            vendor, match = found
+        if denial := denied_topic(line):
+            vendor, match = denial
             topic = match["topic"]
             remote, direction = _direction(lines[index : index + 1 + _NEAR_LINES], topic)
             by_rule = "deny" in match["how"].lower()
@@ -155,7 +155,12 @@ def propose(denials: Iterable[Denial]) -> MissingRights:
     service, and a denied service of an action to a right to the action.
     """
     rights: dict[str, set[NodeRight]] = {}
-    rest: dict[str, list[Denial]] = {"unclear": [], "by_rule": [], "remote": [], "foreign": []}
+    unproposed: dict[str, list[Denial]] = {
+        "unclear": [],
+        "by_rule": [],
+        "remote": [],
+        "foreign": [],
+    }
     for denial in denials:
         kind = (
             "remote" if denial.remote
@@ -165,12 +170,12 @@ def propose(denials: Iterable[Denial]) -> MissingRights:
             else ""
         )  # fmt: skip
         if kind:
-            rest[kind].append(denial)
+            unproposed[kind].append(denial)
         else:
             rights.setdefault(denial.enclave, set()).add(_right(denial))
     return MissingRights(
         {enclave: _without_parts(right) for enclave, right in rights.items()},
-        **{kind: tuple(found) for kind, found in rest.items()},
+        **{kind: tuple(denials_of_kind) for kind, denials_of_kind in unproposed.items()},
     )
 
 
@@ -295,8 +300,8 @@ def as_learned(
         present = _profiles(policy, path)
         for profile, denied in sorted(_rights_by_profile(rights, node, present).items()):
             if present and node is None and profile not in (_ANY_NODE, *present):
-                there = ", ".join(sorted(map(_full_name, present)))
-                others[_full_name(profile)] = f"enclave {path} has {there}"
+                profile_names = ", ".join(sorted(map(_full_name, present)))
+                others[_full_name(profile)] = f"enclave {path} has {profile_names}"
                 continue
             has = present.get(profile, frozenset())
             parts = _denied_common_part(denied, profile, has, common) if common else ()
@@ -313,13 +318,13 @@ def as_learned(
         if enclave and path not in ("", enclave)
     }
     notes = [
-        Note(name, text.format("; ".join(f"{who}: {what}" for who, what in found.items())))
-        for name, text, found in (
+        Note(name, text.format("; ".join(f"{who}: {reason}" for who, reason in denials.items())))
+        for name, text, denials in (
             ("log.other-node", _OTHER, others),
             ("log.common-part", _WHOLE, wholes),
             ("log.other-enclave", _ELSEWHERE, elsewhere),
         )
-        if found
+        if denials
     ]
     return Learned(tuple(profiles), (*_notes(missing_rights), *notes), source=RightsFound.LOG)
 
@@ -328,7 +333,7 @@ def _rights_by_enclave(
     missing_rights: MissingRights, enclave: str
 ) -> dict[str, frozenset[NodeRight]]:
     """Return the rights by enclave; only of ``enclave`` if it is not ""."""
-    found: dict[str, frozenset[NodeRight]] = {}
+    rights_by_enclave: dict[str, frozenset[NodeRight]] = {}
     for named, rights in missing_rights.rights.items():
         if enclave and named not in ("", enclave):
             continue
@@ -339,8 +344,8 @@ def _rights_by_enclave(
                 "Name it with --enclave.",
             )
         path = check_enclave_name(named or enclave)
-        found[path] = found.get(path, frozenset()) | rights
-    return found
+        rights_by_enclave[path] = rights_by_enclave.get(path, frozenset()) | rights
+    return rights_by_enclave
 
 
 def _rights_by_profile(
@@ -352,16 +357,18 @@ def _rights_by_profile(
     if node is not None:
         return {node: rights}
     own = nodes_served((right.right, right.name) for right in rights)
-    found: dict[tuple[str, str], set[NodeRight]] = {}
+    rights_by_profile: dict[tuple[str, str], set[NodeRight]] = {}
     (only,) = present if len(present) == 1 else (None,)
     (only_profile,) = own if len(own) == 1 else (None,)
-    rest = only or (
+    default_profile = only or (
         _profile_of_node(only_profile, present) if only_profile and not present else _ANY_NODE
     )
     for right in rights:
         served = nodes_served([(right.right, right.name)])
-        found.setdefault(_profile_of_node(served[0], present) if served else rest, set()).add(right)
-    return {profile: frozenset(node_rights) for profile, node_rights in found.items()}
+        rights_by_profile.setdefault(
+            _profile_of_node(served[0], present) if served else default_profile, set()
+        ).add(right)
+    return {profile: frozenset(node_rights) for profile, node_rights in rights_by_profile.items()}
 
 
 def _profile_of_node(fqn: str, present: Iterable[tuple[str, str]]) -> tuple[str, str]:

@@ -187,8 +187,10 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
         enclave: the name of the enclave.
         file: the enclave's file that has the fault, if known.
     """
-    found = cause if isinstance(cause, Fault) else FAULTS.get(cause, _BY_REASON.get(cause, ""))
-    fault, text = (found, "") if isinstance(found, Fault) else (None, found)
+    fault_or_text = (
+        cause if isinstance(cause, Fault) else FAULTS.get(cause, _BY_REASON.get(cause, ""))
+    )
+    fault, text = (fault_or_text, "") if isinstance(fault_or_text, Fault) else (None, fault_or_text)
     if fault:
         file = file or (GOVERNANCE_FILE if fault in _OF_GOVERNANCE else "")
         text = fault.remedy_in(file)
@@ -424,9 +426,11 @@ def _similar_names(
     name: str, names: AbstractSet[str], is_service: bool, *, or_only: bool
 ) -> tuple[str, ...]:
     last = name.rpartition("/")[2]
-    same = sorted(other_name for other_name in names if other_name.rpartition("/")[2] == last)
-    if (is_service and last in NODE_SERVICES) or 0 < len(same) <= _SHOWN:
-        return tuple(same) if len(same) <= _SHOWN else ()
+    same_name_elsewhere = sorted(
+        other_name for other_name in names if other_name.rpartition("/")[2] == last
+    )
+    if (is_service and last in NODE_SERVICES) or 0 < len(same_name_elsewhere) <= _SHOWN:
+        return tuple(same_name_elsewhere) if len(same_name_elsewhere) <= _SHOWN else ()
     if not names:
         return ()
     from difflib import get_close_matches  # for this alone, which is asked last

@@ -175,7 +175,7 @@ class SearchedKeystore:
 
     @cached_property
     def _by_node(self) -> Mapping[str, tuple[str, ...]]:
-        found: dict[str, set[str]] = {}
+        enclaves_by_node: dict[str, set[str]] = {}
         try:
             rights = load_rights(self._keystore).rights
         except SrosError:  # its documents do not tell
@@ -183,8 +183,8 @@ class SearchedKeystore:
         for right in rights:
             if right.qualifier is ALLOW:
                 for node in nodes_served([(right.right, right.name)]):
-                    found.setdefault(node, set()).add(right.enclave)
-        return {node: tuple(sorted(enclaves)) for node, enclaves in found.items()}
+                    enclaves_by_node.setdefault(node, set()).add(right.enclave)
+        return {node: tuple(sorted(enclaves)) for node, enclaves in enclaves_by_node.items()}
 
 
 FindEnclave = Callable[[str], LoadedEnclave | None]
@@ -338,13 +338,13 @@ def _log_hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
             if enclaves[process] == "/":
                 yield _Hit(number, " ".join(rest.split()), process, "/", RUNS_OPEN, {})
             continue
-        if following and (whole := _rejoined_message(process, line, rest, following[0][1])):
+        if following and (rejoined := _rejoined_message(process, line, rest, following[0][1])):
             following.popleft()
-            line = rest = whole
+            line = rest = rejoined
         text = " ".join(rest.split())
         meaning, match = _meaning_of(line, rest)
         if match:
-            fields = {name: found or "" for name, found in match.groupdict().items()}
+            fields = {name: value or "" for name, value in match.groupdict().items()}
             if domain := DOMAIN_OF_LINE.search(line):
                 fields["domain"] = domain[1]
             yield _Hit(number, text, process, enclaves.get(process, ""), meaning, fields)
@@ -369,12 +369,12 @@ def _rejoined_message(process: str, line: str, rest: str, following: str) -> str
 
 def _meaning_of(line: str, rest: str) -> tuple[LogText, re.Match[str] | None]:
     """Return the meaning of a line, and its match, if any; ``rest`` is the line without label."""
-    if found := zenoh_text(line):
-        return found
+    if text := zenoh_text(line):
+        return text
     if ZENOH_LINE.search(rest):  # what is not in the table is no trouble of security
         return UNKNOWN, None
-    if found := log_text(line):
-        return found
+    if text := log_text(line):
+        return text
     return UNKNOWN, None if denied_topic(line) else UNKNOWN.pattern.search(rest)
 
 
@@ -459,11 +459,11 @@ def _dropped_message_findings(
         kind = message.message, message.ingress is not lacks_own
         _, name = name_of_key(message.key)
         right = _DROPPED.get(kind, "") if name else ""
-        what = f"{right} {name}" if right else _GRAPH.get(kind, "")
-        what = what or f"pass {message.message} of {message.key}"
-        group = message.process, message.name or message.zid, lacks_own, what
+        dropped_right = f"{right} {name}" if right else _GRAPH.get(kind, "")
+        dropped_right = dropped_right or f"pass {message.message} of {message.key}"
+        group = message.process, message.name or message.zid, lacks_own, dropped_right
         groups.setdefault(group, []).append(message)
-    for (process, who, lacks_own, what), messages in groups.items():
+    for (process, who, lacks_own, dropped_right), messages in groups.items():
         first = messages[0]
         if lacks_own:
             enclave, lacking = own, own or "the process that wrote this log"
@@ -478,21 +478,23 @@ def _dropped_message_findings(
             f"{first.message} ({'ingress' if first.ingress else 'egress'}) on {first.key}",
             process,
             enclave,
-            f"{lacking} may not {what}: the process that logged this drops the message by its "
-            "rules, and reports it nowhere else",
-            _remedy_for_dropped(first, enclave, what, root),
+            f"{lacking} may not {dropped_right}: the process that logged this drops the message "
+            "by its rules, and reports it nowhere else",
+            _remedy_for_dropped(first, enclave, dropped_right, root),
             zenoh=True,
         )
 
 
-def _remedy_for_dropped(dropped: DroppedMessage, enclave: str, what: str, root: str) -> str:
-    """Return the remedy if ``enclave``, "" if unknown, may not do ``what``."""
+def _remedy_for_dropped(
+    dropped: DroppedMessage, enclave: str, dropped_right: str, root: str
+) -> str:
+    """Return the remedy if ``enclave``, "" if unknown, may not do ``dropped_right``."""
     if not dropped.name:
         return (
             "The log line with `on Interface(...)+CertCommonName(...)` and this zid has the name "
             "of the process. No rule applies to a process without a name."
         )
-    asked = what if name_of_key(dropped.key)[1] else ""
+    asked = dropped_right if name_of_key(dropped.key)[1] else ""
     if not asked:
         return (
             "If it is an enclave of the keystore, `sros zenoh KEYSTORE --check` shows whether the "
@@ -567,13 +569,13 @@ class _Examiner:
         causes = causes or list(self._wrong_domain_cause(enclave, answer, first))
         remedies = list(dict.fromkeys(remedy for _, remedy in causes if remedy))
         unseen = self._with_names(meaning.unseen, enclave, first)
-        nothing = f"{_nothing_found(enclave)} {unseen}".rstrip()
+        nothing_found = f"{_nothing_found(enclave)} {unseen}".rstrip()
         return replace(
             plain,
             enclave=enclave.name,
             found=tuple(text for text, _ in causes),
             checked=True,
-            remedy=" ".join(remedies) if remedies else nothing,
+            remedy=" ".join(remedies) if remedies else nothing_found,
         )
 
     def _other_folder_remedy(self, path: str, remedy: str) -> str:

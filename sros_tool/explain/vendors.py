@@ -206,11 +206,11 @@ def explain_on_dds(
         *_earlier_permissions_notes(answer, context.at),
         *_note_on_anybody(_anybody_may(evaluator, question), refuse),
     )
-    what = Asked(enclave.name, question, context)
+    asked = Asked(enclave.name, question, context)
     if compared is Compared.VENDORS:
         others = {v: Evaluator(v, enclave, context) for v in Vendor if v is not vendor}
         answers = [answer if v is vendor else explain(others[v], question) for v in Vendor]
-        return Comparison(what, answers, None, beside, answer.allowed, notes)
+        return Comparison(asked, answers, None, beside, answer.allowed, notes)
     if compared is Compared.DISTRIBUTIONS:
         deciding = {v for distribution in SUPPORTED for v in distribution.vendors}
         by_vendor = {v: Evaluator(v, enclave, context).answer(question) for v in deciding}
@@ -219,14 +219,14 @@ def explain_on_dds(
             for distribution in SUPPORTED
             for shipped in distribution.shipped
         ]
-        return Comparison(what, None, by_distribution, beside, answer.allowed, notes)
+        return Comparison(asked, None, by_distribution, beside, answer.allowed, notes)
     tested = [
         answer if v is vendor else Evaluator(v, enclave, context).answer(question)
         for v in PRINCIPAL
     ]
     if len({tested_vendor.outcome for tested_vendor in tested}) > 1:
         notes = (*notes, Note("explain.vendors-differ", f"{_vendor_differences(tested)}."))
-    return VendorExplanation(what, answer, why, beside, notes)
+    return VendorExplanation(asked, answer, why, beside, notes)
 
 
 def _vendor_differences(answers: Sequence[Answer]) -> str:
@@ -300,9 +300,9 @@ def _not_a_topic_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[
         return
     kinds = {right.kind for right in asked_enclave.other_rights(name) if right.name == name}
     if kinds & {"services", "actions"} and "topics" not in kinds:
-        what, word = ("an action", "execute") if "actions" in kinds else ("a service", "serve")
+        kind, word = ("an action", "execute") if "actions" in kinds else ("a service", "serve")
         text = (
-            f"in the policy or keystore, {name} is {what}, not a topic: ask about call or {word}."
+            f"in the policy or keystore, {name} is {kind}, not a topic: ask about call or {word}."
         )
         yield Note("explain.no-topic", text)
 

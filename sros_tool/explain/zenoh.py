@@ -685,7 +685,7 @@ class ZenohEvaluator:
         self, process: ZenohProcess, other: ZenohProcess
     ) -> tuple[Delivery, Delivery]:
         """Return the deliveries that announce a node of ``process`` and show it other nodes."""
-        everything = f"@ros2_lv/{self.domain}/**"
+        whole_domain = f"@ros2_lv/{self.domain}/**"
         router = self._router_of(process.name).process
         assert router
         access, announcing = router.access, (Flow.INGRESS, Message.LIVELINESS_TOKEN)
@@ -695,8 +695,8 @@ class ZenohEvaluator:
             access.allowed_keys(process.name, *announcing),
             lambda key: access.decide(Remote(process.name), *announcing, key).allowed,
         )
-        return deliver_token((process, other), node, everything), deliver_token(
-            (other, process), everything, everything
+        return deliver_token((process, other), node, whole_domain), deliver_token(
+            (other, process), whole_domain, whole_domain
         )
 
     def _reached_enclaves(
@@ -835,10 +835,10 @@ def _with_equal_rules(evaluator: ZenohEvaluator, domains: DomainSet) -> Iterator
     """Yield parts of ``domains``: the routers have the same rules for all domains of a part."""
     keys: dict[str, set[object]] = defaultdict(set)
     for router, file in evaluator.routers.items():
-        for what, expressions in _rules(file.process.access) if file.process else ():
+        for rule, expressions in _rules(file.process.access) if file.process else ():
             for key in expressions:
                 domain, _, rest = key.removeprefix(f"{GRAPH}/").partition("/")
-                keys[domain].add((router, what, rest))
+                keys[domain].add((router, rule, rest))
     parts: dict[frozenset[object], list[int]] = defaultdict(list)
     for number in domains:
         parts[frozenset(keys.get(str(number), ()))].append(number)
@@ -1064,8 +1064,8 @@ def explain_on_zenoh(
         *_notes(answer, by_permissions, outdated),
         *(() if joins else note_on_lacking_keys(keystore)),
     )
-    what = Asked(enclave.name, question, context)
-    return ZenohExplanation(what, why, answer, outdated, by_permissions, keystore.root, notes)
+    asked = Asked(enclave.name, question, context)
+    return ZenohExplanation(asked, why, answer, outdated, by_permissions, keystore.root, notes)
 
 
 def _notes(answer: ZenohAnswer, stated: Answer, outdated: Sequence[str] | None) -> Iterator[Note]:

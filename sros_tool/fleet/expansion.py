@@ -304,10 +304,10 @@ def unobserved_robots(policy: FleetPolicy, observed: Iterable[Right]) -> dict[st
     """
     seen = _rights_by_enclave(observed)
     missing: dict[str, list[str]] = defaultdict(list)
-    some = {policy.stated(path)[0].path for path in seen if path in policy}
+    stated_enclaves = {policy.stated(path)[0].path for path in seen if path in policy}
     for path in policy:
         enclave, robot = policy.stated(path)
-        if robot and enclave.path in some and path not in seen:
+        if robot and enclave.path in stated_enclaves and path not in seen:
             missing[enclave.path].append(robot.name)
     return missing
 
@@ -324,9 +324,11 @@ def check_narrowed(policy: FleetPolicy, result: MinimizedPolicy, observed: Itera
     for path in policy:
         if path not in seen and policy.stated(path)[0].path not in replaced:
             continue
-        allowed, rest = (policy_rights(Policy((side[path],))) for side in (policy, after))
-        before, now = Rules(allowed), Rules(rest)
-        wrong = [right for right in rest if right.qualifier is ALLOW and not before.cover(right)]
+        allowed, narrowed = (policy_rights(Policy((side[path],))) for side in (policy, after))
+        before, now = Rules(allowed), Rules(narrowed)
+        wrong = [
+            right for right in narrowed if right.qualifier is ALLOW and not before.cover(right)
+        ]
         used = (e for e in unfolded(seen.get(path, ())) if before.allow(path, e.right, e.name))
         wrong += (right for right in used if not now.cover(right))
         if wrong:

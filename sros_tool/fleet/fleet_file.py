@@ -71,9 +71,9 @@ def read_fleet(path: Path) -> Fleet:
     """
     data, ending = read_bytes(path, "fleet file", max_bytes=MAX_BYTES), path.suffix.lower()
     if ending in _OF_INVENTORIES:
-        what = f"the inventory '{path}'"
-        table = _fleet_table(data, what, is_json=ending == ".json" or _is_json(data))
-        return _Reader(what, _SHOWN).fleet(table)
+        shown_path = f"the inventory '{path}'"
+        table = _fleet_table(data, shown_path, is_json=ending == ".json" or _is_json(data))
+        return _Reader(shown_path, _SHOWN).fleet(table)
     try:
         return parse_fleet(data, f"the fleet file '{path}'")
     except DocumentError as error:
@@ -147,9 +147,9 @@ class _Reader:
             if robot.router and robot_of(fleet, router_of(fleet, robot)) != robot:
                 text = f"{routers} is not a path of the enclaves of {robot.name}."
                 raise self._invalid_value_error("routers", routers, text)
-        if both := sorted(fleet.robots.keys() & fleet.groups.keys()):
+        if ambiguous := sorted(fleet.robots.keys() & fleet.groups.keys()):
             raise self._error(
-                f"{_short_value(both[0])} is a robot and a group",
+                f"{_short_value(ambiguous[0])} is a robot and a group",
                 "Ansible would confuse them.",
                 "Give one of them another name.",
             )
@@ -170,14 +170,14 @@ class _Reader:
         origin: dict[str, str] = {}
         for group in member:
             for key, value in groups.get(group, {}).items():
-                here = f"groups.{group}.{key}"
+                group_key = f"groups.{group}.{key}"
                 if key in given and key not in values and given[key] != value:
                     raise self._error(
                         f"the robot {name} gets its {key} from two groups",
-                        f"{origin[key]} and {here} differ.",
+                        f"{origin[key]} and {group_key} differ.",
                         f"Write {at}.{key}.",
                     )
-                given[key], origin[key] = value, here
+                given[key], origin[key] = value, group_key
         own = {key: value for key, value in values.items() if key != "groups"}
         given = self._read_values(given, origin, name) | self._read_values(
             own, {key: f"{at}.{self._word(key)}" for key in own}
@@ -256,8 +256,8 @@ class _Reader:
     def _invalid_value_error(self, at: str, value: object, problem: str) -> DocumentError:
         return self._error(f"{at} has {_short_value(value)}, which is not valid", problem)
 
-    def _error(self, what: str, why: str = "", remedy: str = "") -> DocumentError:
-        return DocumentError(f"{self._what}: {what}", why, remedy)
+    def _error(self, problem: str, why: str = "", remedy: str = "") -> DocumentError:
+        return DocumentError(f"{self._what}: {problem}", why, remedy)
 
 
 def _short_value(value: object) -> str:
@@ -587,8 +587,8 @@ class _Inventory:
             raise self._error(f"{str(at)[:80]!r} is not a mapping")
         return value
 
-    def _error(self, what: str, why: str = "", remedy: str = "") -> DocumentError:
-        return DocumentError(f"{self._what}: {what}", why, remedy)
+    def _error(self, problem: str, why: str = "", remedy: str = "") -> DocumentError:
+        return DocumentError(f"{self._what}: {problem}", why, remedy)
 
 
 # ── writing ────────────────────────────────────────────────────────────────────────────────

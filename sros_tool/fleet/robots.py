@@ -491,10 +491,10 @@ def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[st
         if foldings[2:] and len(targets[foldings[2][0]]) > _MOST_TARGETS:
             folding, robot = foldings[2]
         groups.setdefault(folding, []).append((robot, text))
-    for folding, same in groups.items():
-        names = list(dict.fromkeys(name for name, _ in same))
+    for folding, members in groups.items():
+        names = list(dict.fromkeys(name for name, _ in members))
         if len(names) == 1:
-            yield from (text for _, text in same)
+            yield from (text for _, text in members)
         else:
             yield f"{folding.text}  ({_robots_text(fleet, names, folding)})"
 

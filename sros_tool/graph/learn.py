@@ -296,8 +296,8 @@ def groups_of(rights: Iterable[NodeRight], ns: str, node: str) -> tuple[Group, .
     """
     rights = tuple(rights)
     groups = []
-    for kind, both in RIGHTS.items():
-        for kind_of_right in both:
+    for kind, rights_of_kind in RIGHTS.items():
+        for kind_of_right in rights_of_kind:
             names = sorted(
                 name_as_written(right.name, ns, node)
                 for right in rights
@@ -849,10 +849,10 @@ def write(plan: Draft) -> None:
 
 def _check(plan: Draft) -> None:
     try:
-        again = policy_rights(read_policy(plan.path, plan.document))
-        if plan.least <= again <= plan.most:
+        learned_rights = policy_rights(read_policy(plan.path, plan.document))
+        if plan.least <= learned_rights <= plan.most:
             return
-        why = f"The written policy would differ in {min(again ^ plan.least, key=order)}."
+        why = f"The written policy would differ in {min(learned_rights ^ plan.least, key=order)}."
     except DocumentError as error:
         why = f"{error}"
     raise PolicyError(
@@ -980,8 +980,8 @@ def with_common_parts(path: Path, merged: bytes, others: Sequence[Policy]) -> by
             groups = _groups_not_given(common.included_rights(includes, ns, node), profile)
             profiles.append(LearnedProfile(enclave.path, ns, node, rights, includes, groups))
     document, _ = _with_includes(path, before, merged, profiles)
-    same = policy_rights(read_policy(path, document)) == policy_rights(policy)
-    return document if same else merged
+    is_same = policy_rights(read_policy(path, document)) == policy_rights(policy)
+    return document if is_same else merged
 
 
 def _groups_not_given(given_rights: frozenset[NodeRight], profile: Profile) -> tuple[Group, ...]:

@@ -107,8 +107,8 @@ class Observation(NamedTuple):
         endpoints: dict[tuple[str, str, str], frozenset[Endpoint]] = {}
         for node in (*self.nodes, *other.nodes):
             before = enclaves.get(node.participant, node.enclaves)
-            both = tuple(enclave for enclave in before if enclave in node.enclaves)
-            enclaves[node.participant] = both or tuple(sorted({*before, *node.enclaves}))
+            common = tuple(enclave for enclave in before if enclave in node.enclaves)
+            enclaves[node.participant] = common or tuple(sorted({*before, *node.enclaves}))
             key = (node.participant, node.ns, node.name)
             endpoints[key] = endpoints.get(key, frozenset()) | node.endpoints
         nodes = sorted(

@@ -179,13 +179,13 @@ class RosGraph:
                 f"It exited with status {ended}." if ended is not None else "It does not answer."
             )
             return ObserverError("the process that observes the ROS graph failed", reason, output)
-        what = {
+        summary = {
             "import": "rclpy cannot be imported",
             "participant": "rclpy cannot start",
             "node": "rclpy cannot start a node to observe the graph",
             "session": "the observer cannot connect to the Zenoh router",
         }[answer["failed"]]
-        return ObserverError(what, f"{answer['reason']}".rstrip(".") + ".", output)
+        return ObserverError(summary, f"{answer['reason']}".rstrip(".") + ".", output)
 
 
 def _require(module: str) -> None:
@@ -262,26 +262,26 @@ class Snapshot:
 def settle(source: GraphSource, settling: Settling, clock: Clock) -> Snapshot:
     """Return the graph once it stops changing, at the latest after ``settling.most`` seconds."""
     begin = changed = clock()
-    seen = everything = Observation()
+    seen = all_seen = Observation()
     while True:
         now = clock()
         if now - begin >= settling.most:
-            return Snapshot(seen, everything, now - begin, False)
+            return Snapshot(seen, all_seen, now - begin, False)
         if now - begin >= settling.least and now - changed >= settling.still:
-            return Snapshot(seen, everything, now - begin, True)
+            return Snapshot(seen, all_seen, now - begin, True)
         news = source.next(_TICK)
         if news is not None:
-            seen, everything, changed = news, everything.union(news), clock()
+            seen, all_seen, changed = news, all_seen.union(news), clock()
 
 
 def look_for(source: GraphSource, seconds: float, clock: Clock) -> Snapshot:
     """Return the graph after exactly ``seconds`` seconds."""
     begin = clock()
-    seen = everything = Observation()
+    seen = all_seen = Observation()
     while (left := begin + seconds - clock()) > 0:
         if news := source.next(min(left, _TICK)):
-            seen, everything = news, everything.union(news)
-    return Snapshot(seen, everything, seconds, True)
+            seen, all_seen = news, all_seen.union(news)
+    return Snapshot(seen, all_seen, seconds, True)
 
 
 def watch(
@@ -307,11 +307,11 @@ def watch(
         news = source.next(_TICK)
         now = clock()
         if news is not None:
-            seen, both = news, union.union(news)
-            if both != union:
+            seen, joined = news, union.union(news)
+            if joined != union:
                 if reported is union:
                     grown = now
-                union, changed = both, now
+                union, changed = joined, now
         if union is not reported and (now - changed >= still or now - grown >= patience):
             report(union)
             reported = union

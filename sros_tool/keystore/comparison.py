@@ -306,7 +306,7 @@ def compare_settings(old: Template, new: Template, now: datetime) -> tuple[Setti
 
 
 def _settings_changes(old: Template, new: Template, now: datetime) -> Iterator[SettingChange]:
-    for key, name, what in (
+    for key, name, setting in (
         ("certificates.validity", "certificate_validity", "certificates"),
         ("permissions.validity", "permissions_validity", "permissions"),
     ):
@@ -314,7 +314,7 @@ def _settings_changes(old: Template, new: Template, now: datetime) -> Iterator[S
         if before != after:
             longer = _expiry_of_span(after, now) > _expiry_of_span(before, now)
             effect = Effect.LOOSER if longer else Effect.TIGHTER
-            meaning = f"{what} expire {'later' if longer else 'earlier'}"
+            meaning = f"{setting} expire {'later' if longer else 'earlier'}"
             yield SettingChange(effect, key, span_text(before), span_text(after), meaning)
     yield from _short_lived_changes(old, new)
     for key, name, open_value, words in _CHOICES:

@@ -563,18 +563,22 @@ def last_confirmation(root: Path, robot: str) -> Received | None:
     path = root / confirmation_file(robot)
     if not os.path.lexists(path):
         return None
-    what = f"'{path}'"
+    shown_path = f"'{path}'"
     try:
         value = parse_json(read_bytes(path, "confirmation", max_bytes=2 * MAX_BYTES))
     except ValueError as error:
-        raise _invalid_confirmation_error(what, "it is not JSON") from error
+        raise _invalid_confirmation_error(shown_path, "it is not JSON") from error
     if not isinstance(value, dict) or value.keys() - {"message"} != {"received", "confirmation"}:
-        raise _invalid_confirmation_error(what, 'its keys are not "received" and "confirmation"')
-    confirmation = _confirmation_from(value["confirmation"], what)
+        raise _invalid_confirmation_error(
+            shown_path, 'its keys are not "received" and "confirmation"'
+        )
+    confirmation = _confirmation_from(value["confirmation"], shown_path)
     if confirmation.robot != robot:
-        raise _invalid_confirmation_error(what, f"it is the confirmation of {confirmation.robot}")
-    message = _message_from(value["message"], what) if "message" in value else None
-    return Received(confirmation, _moment(value["received"], what), message)
+        raise _invalid_confirmation_error(
+            shown_path, f"it is the confirmation of {confirmation.robot}"
+        )
+    message = _message_from(value["message"], shown_path) if "message" in value else None
+    return Received(confirmation, _moment(value["received"], shown_path), message)
 
 
 def _message_from(value: Any, label: str) -> LastMessage:
@@ -856,8 +860,8 @@ def _moment(text: object, label: str) -> datetime:
 _AGAIN = "Make the confirmation again on the robot."
 
 
-def _invalid_confirmation_error(what: str, why: str, remedy: str = _AGAIN) -> DocumentError:
-    return DocumentError(f"{what} is not a confirmation: {why}", "", remedy)
+def _invalid_confirmation_error(name: str, why: str, remedy: str = _AGAIN) -> DocumentError:
+    return DocumentError(f"{name} is not a confirmation: {why}", "", remedy)
 
 
 def _shortened(value: object) -> str:

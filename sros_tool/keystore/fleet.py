@@ -122,8 +122,8 @@ def _edit_text(ledger: Ledger, data: bytes | None) -> str:
         return "" if data is None else "was not written by sros"
     if data is None:
         return f"is missing, although sros wrote it at {last.time}"
-    same = hashlib.sha256(data).hexdigest() == last.sha256
-    return "" if same else f"is not the file that sros wrote at {last.time}"
+    is_unedited = hashlib.sha256(data).hexdigest() == last.sha256
+    return "" if is_unedited else f"is not the file that sros wrote at {last.time}"
 
 
 def _read(keystore: Keystore) -> bytes | None:
@@ -332,16 +332,16 @@ def left_enclave_notes(root: Path, before: Fleet, after: Fleet) -> Iterator[Note
     """
     left: dict[str, set[str]] = {}
     for robot in before.robots.values():
-        same = after.robots.get(robot.name)
-        kept = set(enclaves_of(after, same) if same else ())
-        if same and robot.router and not same.router:
+        same_robot = after.robots.get(robot.name)
+        kept = set(enclaves_of(after, same_robot) if same_robot else ())
+        if same_robot and robot.router and not same_robot.router:
             router = router_of(before, robot)
             kept.add(router)
             if has_enclave(root, router):
                 yield _lost_router_note(root, robot.name, router)
         names = (name for name in enclaves_of(before, robot) if name not in kept)
-        if found := {name for name in names if has_enclave(root, name)}:
-            left[robot.name] = found
+        if left_names := {name for name in names if has_enclave(root, name)}:
+            left[robot.name] = left_names
     # Also what an earlier change of the fleet left.
     earlier = unrecorded_enclaves(before, enclave_names(root), left) if left else {}
     for name, enclaves in left.items():

@@ -856,7 +856,7 @@ class _Known:
         if confirmed is None:
             return ()
         problems = [text for text in confirmed.problems or () if lacks_key(text)]
-        found = {
+        enclaves_without_key = {
             name for name in compared_robot.enclaves if any(f"{name} " in text for text in problems)
         }
         folders = {path.rpartition("/")[0] for path in confirmed.files}
@@ -866,8 +866,8 @@ class _Known:
                 now = self._issued.get(file.present[0])
                 has_other_key = before and now and before.key and now.key and before.key != now.key
                 if has_other_key or file.path.rpartition("/")[0] not in folders:
-                    found.add(enclave_of(file.path))
-        keys = {name: enclave_path(self._root, name) / KEY_FILE for name in found}
+                    enclaves_without_key.add(enclave_of(file.path))
+        keys = {name: enclave_path(self._root, name) / KEY_FILE for name in enclaves_without_key}
         return tuple(sorted(name for name, key in keys.items() if os.path.lexists(key)))
 
     def reads_copy(self, compared_robot: _ComparedRobot, heard: datetime | None) -> bool:
@@ -883,8 +883,10 @@ class _Known:
             return False
         if not all(EXPIRED_METADATA in problem for problem in confirmed.problems or ()):
             return False
-        since = self._releases.get(published)
-        return (confirmed.release or 0) < published and bool(since and heard - since > _SILENCE)
+        released_at = self._releases.get(published)
+        return (confirmed.release or 0) < published and bool(
+            released_at and heard - released_at > _SILENCE
+        )
 
     @property
     def _last_release(self) -> int:
@@ -937,7 +939,7 @@ class _Known:
     def file(self, robot: Robot, difference: _Difference) -> ConfirmedFile:
         """Return the state and the origin of a robot's file that differs from the keystore."""
         kind, name = _kind_of(difference.path), enclave_of(difference.path)
-        state, since, owner = self._identify(difference, kind, name)
+        state, issued_at, owner = self._identify(difference, kind, name)
         if not difference.own and state is not State.REVOKED:
             if name in self._revoked and not has_enclave(self._root, name):
                 state = State.REVOKED
@@ -948,7 +950,7 @@ class _Known:
             difference.path,
             kind,
             state,
-            since,
+            issued_at,
             owner,
             other_robot.name if other_robot else "",
             surplus=difference.exported is False,

@@ -625,16 +625,16 @@ def locate_enclave(folder: Path) -> tuple[Path, str]:
         DocumentError: ``folder`` is not below a folder named ``enclaves``.
         KeystoreError: ``folder`` is that of a node in a keystore of ROS 2 Eloquent or earlier.
     """
-    whole = Path(os.path.abspath(folder))  # noqa: PTH100 - must not follow links
-    for above in (whole, *whole.parents):
+    absolute = Path(os.path.abspath(folder))  # noqa: PTH100 - must not follow links
+    for above in (absolute, *absolute.parents):
         if above.name == ENCLAVES:
-            return above.parent, f"/{'/'.join(whole.relative_to(above).parts)}"
-    for above in whole.parents:
+            return above.parent, f"/{'/'.join(absolute.relative_to(above).parts)}"
+    for above in absolute.parents:
         refuse_earlier(above)
     raise DocumentError(
         f"'{folder}' is not below a folder named {ENCLAVES}",
         "rcl finds an enclave by its path below that folder.",
         "Name the keystore, or the enclave's folder in it. If you have only this folder, "
         f"put it where rcl looks for it, and check it: `mkdir -p robot/{ENCLAVES} && cp -a "
-        f"{quote(str(whole))} robot/{ENCLAVES}/ && sros check robot`.",
+        f"{quote(str(absolute))} robot/{ENCLAVES}/ && sros check robot`.",
     )

@@ -208,15 +208,15 @@ def clock_behind(root: Path, now: datetime) -> str:
     return ""
 
 
-def behind_clause(now: datetime, last: datetime | None, what: str) -> str:
-    """Return, as a clause, how far the clock is behind the moment ``last`` of ``what``; "" if not.
+def behind_clause(now: datetime, last: datetime | None, event: str) -> str:
+    """Return, as a clause, how far the clock is behind the moment ``last`` of ``event``; "" if not.
 
     A small difference is ignored.
     """
     if last is None or last - now <= _CLOCK_TOLERANCE:
         return ""
     return (
-        f"the clock of this machine shows {iso(now)}, {elapsed(last - now)} behind {what}, of "
+        f"the clock of this machine shows {iso(now)}, {elapsed(last - now)} behind {event}, of "
         f"{iso(last)}"
     )
 
@@ -483,14 +483,14 @@ class LedgerFile:
             known = self._files
             files = known or self._read()
             try:
-                found = self._indexed_lines(files, terms)
+                lines = self._indexed_lines(files, terms)
             except IndexDamagedError:
                 if self._restore_index():
                     continue
-                files, found = files._replace(ledger_index=None), None
-            if found:
+                files, lines = files._replace(ledger_index=None), None
+            if lines:
                 self._files = files
-                return self._compared_with_head(files, found)
+                return self._compared_with_head(files, lines)
             reading = self._compared_with_head(files, self._lines(files, needed_text))
             # A transaction of another process may have ended between the reading of the two files.
             kept = known is not None and known.lines is not None
@@ -604,10 +604,10 @@ class LedgerFile:
         with suppress(OSError):
             state = (self.root / LEDGER).stat()
         if state is None or files.state is None:
-            same = state is files.state
+            is_same = state is files.state
         else:
-            same = os.path.samestat(state, files.state)
-        return same and self._read_head(read_bytes) == files.head
+            is_same = os.path.samestat(state, files.state)
+        return is_same and self._read_head(read_bytes) == files.head
 
     def _lines(self, files: _Files, needed_text: bytes) -> _Lines:
         stated = files.head.lines if files.head else 0
@@ -789,8 +789,8 @@ def _last_line(file: BinaryIO, size: int) -> str:
     if os.fstat(file.fileno()).st_size != size:
         return ""
     file.seek(max(0, size - _LONGEST_LINE))
-    before, ended, nothing = file.read().rpartition(b"\n")
-    return _digest(before.rpartition(b"\n")[2]) if ended and not nothing else ""
+    before, ended, after_last = file.read().rpartition(b"\n")
+    return _digest(before.rpartition(b"\n")[2]) if ended and not after_last else ""
 
 
 class _Lines(NamedTuple):
@@ -959,14 +959,14 @@ def _parse(line: bytes) -> Entry | None:
     match = _WRITTEN.fullmatch(line.decode()) if line.isascii() else None
     if not match or (match["serial"] and not match["serial"].strip("0")):
         return _parse_any(line)
-    (time, what, enclave, subject, serial, sha256, begin, end, policy, reason, key) = match.groups(
+    (time, kind, enclave, subject, serial, sha256, begin, end, policy, reason, key) = match.groups(
         ""
     )[:11]
     number, settings, nodes, previous = match.groups("")[11:]
     # Texts that many lines have are in the memory once.
     return Entry(
         intern(time),
-        intern(what),
+        intern(kind),
         intern(enclave),
         intern(subject),
         serial,

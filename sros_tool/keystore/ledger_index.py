@@ -211,13 +211,15 @@ class LedgerIndex:
         Raises:
             IndexDamagedError: the names have changed since the head was signed.
         """
-        there = dict(self._rows("SELECT bucket, names FROM buckets"))
-        buckets = [self._checked_bucket(there.get(i, b""), 2 * i) for i in range(_BUCKETS)]
+        stored_buckets = dict(self._rows("SELECT bucket, names FROM buckets"))
+        buckets = [self._checked_bucket(stored_buckets.get(i, b""), 2 * i) for i in range(_BUCKETS)]
         if not parts:
             return _split(b"\n".join(filter(None, buckets)))
         texts = [part.encode("utf-8", "surrogatepass") for part in parts]
-        some = [data for data in buckets if any(text in data for text in texts)]
-        return [name for name in _split(b"\n".join(some)) if any(part in name for part in parts)]
+        matching = [data for data in buckets if any(text in data for text in texts)]
+        return [
+            name for name in _split(b"\n".join(matching)) if any(part in name for part in parts)
+        ]
 
     def bucket(self, bucket: int) -> tuple[bytes, bytes]:
         """Return the names and the postings in a bucket, verified.
@@ -411,8 +413,8 @@ def _connect(path: Path, mode: str, *, is_new: bool = False) -> sqlite3.Connecti
         if is_new:
             for table in _SCHEMA:
                 connection.execute(table)
-        found = connection.execute("SELECT sql FROM sqlite_schema ORDER BY name").fetchall()
-        if found != [(table,) for table in _SCHEMA]:
+        schema = connection.execute("SELECT sql FROM sqlite_schema ORDER BY name").fetchall()
+        if schema != [(table,) for table in _SCHEMA]:
             raise IndexDamagedError(f"'{path}' is not an index of a ledger")
     except BaseException:
         connection.close()

@@ -454,11 +454,11 @@ def evaluated(
     ``domain`` is the ROS domain to join; None for the first domain of its documents.
     """
     number = domain if domain is not None else next(iter(state.joined_domains() or ()), 0)
-    there, context = (
+    loaded, context = (
         loaded_enclave(name, folder, state, moment=moment),
         JoinContext(number, moment, zone),
     )
-    participants = tuple(VendorParticipant(vendor, there, context) for vendor in vendors)
+    participants = tuple(VendorParticipant(vendor, loaded, context) for vendor in vendors)
     return EvaluatedEnclave(accepted_state(state, participants), participants)
 
 

@@ -964,9 +964,9 @@ class _EnclaveFiles:
             self._add(KEY_FILE, "it is not the key of cert.pem", Fault.KEY_MISMATCH)
         elif certificate and isinstance(public_key, rsa.RSAPublicKey):
             names = ("an RSA key", "an RSA key for RSA-PSS alone")
-            said, wanted = is_key_for_pss(key), is_for_pss(certificate)
-            if said != wanted:
-                text = f"it is {names[said]}, and cert.pem is for {names[wanted]}"
+            is_pss, wanted = is_key_for_pss(key), is_for_pss(certificate)
+            if is_pss != wanted:
+                text = f"it is {names[is_pss]}, and cert.pem is for {names[wanted]}"
                 self._add(KEY_FILE, text, Fault.KEY_MISMATCH)
         return public_key
 
@@ -1058,8 +1058,8 @@ class _EnclaveFiles:
             return parse(document, name)
         except SrosError as error:
             kind = kind_of(document)
-            what = f"its signed content is {kind}, not XML in UTF-8"
-            text = error.clause if kind in ("", XML) else what
+            content_fault = f"its signed content is {kind}, not XML in UTF-8"
+            text = error.clause if kind in ("", XML) else content_fault
             self._add(name, text, malformed)
             return None
 
@@ -1128,12 +1128,12 @@ def _state(root: Path) -> object:
 
     It identifies the file of the ledger.
     """
-    found: list[tuple[int, int, int] | None] = []
+    file_states: list[tuple[int, int, int] | None] = []
     for name in (LEDGER, SETTINGS):
         try:
             state = os.stat(root / name)  # noqa: PTH116 - the link of a change under way, too
         except OSError:
-            found.append(None)
+            file_states.append(None)
         else:
-            found.append((state.st_ino, state.st_size, state.st_mtime_ns))
-    return found
+            file_states.append((state.st_ino, state.st_size, state.st_mtime_ns))
+    return file_states

@@ -204,8 +204,8 @@ def rights_grouped_by_domains(
             robot = robot_of(fleet, enclave) if fleet else None
             domain = robot.domain if robot else None
             divided = iter([(None if domain is None else DomainSet.of((domain, domain)), own)])
-        for domains, some in divided:
-            result.setdefault(domains, set()).update(some)
+        for domains, group in divided:
+            result.setdefault(domains, set()).update(group)
     return result
 
 
@@ -218,8 +218,8 @@ def _divide_by_keys(
     """Yield the rights of an enclave on Zenoh, divided by the ROS domains of their keys."""
     domains = {domain for right in rights for domain in domains_of[right]}
     for domain in domains:
-        some = [right for right in rights if not domains_of[right].isdisjoint((domain, None))]
-        yield None if domain is None else DomainSet.of((domain, domain)), some
+        group = [right for right in rights if not domains_of[right].isdisjoint((domain, None))]
+        yield None if domain is None else DomainSet.of((domain, domain)), group
 
 
 def _divide_by_rules(rights: Collection[Right], enclave: str, permissions: Permissions) -> _Divided:
@@ -421,12 +421,12 @@ def _keystore_rights(
     for name in names:
         file = enclave_path(root, name) / PERMISSIONS_FILE
         try:
-            found, scope = reader.permissions(file, name)
+            permissions, scope = reader.permissions(file, name)
         except SrosError as error:
             reader.sound = False
             reader.notes.append(Note("rights.unreadable", f"{name}: {error}"))
             continue
-        rights |= found
+        rights |= permissions
         enclaves.update(scope)
         if foreign := sorted(set(scope) - {name}):
             text = f"{name}: its permissions are for {', '.join(foreign)}, and DDS refuses them."

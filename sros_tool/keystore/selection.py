@@ -183,7 +183,7 @@ def _robots_enclaves(
             f"Name the fleet's file with `sros generate_artifacts -k {quote(str(root))} -p "
             "POLICY_FILE --fleet FILE`, or the enclaves with --match.",
         )
-    found: list[str] = []
+    enclaves: list[str] = []
     for name in robots:
         own = enclaves_of_robot(root, fleet, fleet.robots[name]) if name in fleet.robots else ()
         own += unrecorded[name].below if name in unrecorded else ()
@@ -201,8 +201,8 @@ def _robots_enclaves(
                 "",
                 f"See `sros list_enclaves {quote(str(root))}`.",
             )
-        found += own
-    return found
+        enclaves += own
+    return enclaves
 
 
 def _enclaves_named_after(keystore: Keystore, robot: str) -> list[str]:
@@ -228,23 +228,23 @@ def missing_enclave_error(
     root = keystore.root
     if revocation := revocation_of(keystore, name):
         return _revoked_enclave_error(root, revocation)
-    what = f"enclave {name} does not exist in keystore '{root}'"
+    missing = f"enclave {name} does not exist in keystore '{root}'"
     names = sorted(existing_enclaves)
     if below := [existing for existing in names if name and existing.startswith(f"{name}/")]:
         return KeystoreError(
-            what,
+            missing,
             f"It is the namespace of {counted(len(below), 'enclave')}, such as {below[0]}.",
             f"Name one of them; a verb that takes several also has --match '{name}/*'.",
         )
     if of_node := _enclaves_of_node(keystore, name, names):
         return KeystoreError(
-            what,
+            missing,
             f"{name} is a node of {first_few(of_node, _SHOWN)}.",
             f"Name the enclave: {of_node[0]}.",
         )
     meant = likely_names(name, existing_enclaves)
     if meant:
-        return KeystoreError(what, "", f"Perhaps you mean {' or '.join(meant)}.")
+        return KeystoreError(missing, "", f"Perhaps you mean {' or '.join(meant)}.")
     try:
         check_enclave_name(name)
     except InvalidNameError as error:
@@ -253,7 +253,7 @@ def missing_enclave_error(
     if robot := folder_of_closed_robot(root):
         folder, policy = quote(str(robot)), quote(str(robot / CLOSED_POLICY))
         return KeystoreError(
-            what,
+            missing,
             why,
             f"If it is not a typo, write its rights into {policy}, and run `sros close {folder}`. "
             f"To learn them: `sros close {folder} --undo`, start the robot open with this "
@@ -261,22 +261,22 @@ def missing_enclave_error(
         )
     if not keystore.is_original:
         where = f"`sros distribute_key KEYSTORE {name} {quote(str(root))}`"
-        return KeystoreError(what, why, f"If it is not a typo, export it with {where}.")
+        return KeystoreError(missing, why, f"If it is not a typo, export it with {where}.")
     if not may_create:
-        return KeystoreError(what, why, f"See `sros list_enclaves {quote(str(root))}`.")
+        return KeystoreError(missing, why, f"See `sros list_enclaves {quote(str(root))}`.")
     create = f"`sros create_enclave {quote(str(root))} {name}`"
-    return KeystoreError(what, why, f"If it is not a typo, create it with {create}.")
+    return KeystoreError(missing, why, f"If it is not a typo, create it with {create}.")
 
 
 def _enclaves_of_node(keystore: Keystore, node: str, names: Sequence[str]) -> list[str]:
     """Return the enclaves whose permissions let a node of this full name serve its parameters."""
     topic = f">rr{node}/get_parametersReply<".encode()
-    found = []
+    enclaves = []
     for name in names:
         with suppress(SrosError, OSError):
             if topic in keystore.read(keystore.folder(name) / PERMISSIONS_FILE, "permissions"):
-                found.append(name)
-    return found
+                enclaves.append(name)
+    return enclaves
 
 
 def revocation_of(keystore: Keystore, name: str) -> Entry | None:
@@ -318,16 +318,16 @@ def likely_names(name: str, existing_enclaves: Collection[str]) -> tuple[str, ..
     if end == "/":
         return ()
     lower = {enclave: enclave.lower() for enclave in existing_enclaves}
-    found = [enclave for enclave in existing_enclaves if lower[enclave].endswith(end)]
-    if not found:
+    similar_names = [enclave for enclave in existing_enclaves if lower[enclave].endswith(end)]
+    if not similar_names:
         last = {enclave: text.rpartition("/")[2] for enclave, text in lower.items()}
-        found = _similar_enclaves(end.rpartition("/")[2], last, _ALIKE)
-    return tuple(sorted(found or _similar_enclaves(end, lower, _WHOLE_ALIKE))[:3])
+        similar_names = _similar_enclaves(end.rpartition("/")[2], last, _ALIKE)
+    return tuple(sorted(similar_names or _similar_enclaves(end, lower, _WHOLE_ALIKE))[:3])
 
 
 def _similar_enclaves(text: str, texts: Mapping[str, str], least: float) -> list[str]:
     """Return the enclaves (keys of ``texts``) whose value is similar to ``text``."""
     import difflib
 
-    alike = difflib.get_close_matches(text, set(texts.values()), n=3, cutoff=least)
-    return [enclave for enclave, written in texts.items() if written in alike]
+    similar_texts = difflib.get_close_matches(text, set(texts.values()), n=3, cutoff=least)
+    return [enclave for enclave, written in texts.items() if written in similar_texts]

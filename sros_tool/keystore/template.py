@@ -81,12 +81,12 @@ class Template:
 
     def longest_validity(self, enclave: str) -> timedelta | None:
         """Return the longest validity of a short-lived enclave; None for all others."""
-        found = (
+        validities = (
             short_lived.validity
             for short_lived in self.short_lived
             if matches(short_lived.name, enclave)
         )
-        return min(found, default=None)
+        return min(validities, default=None)
 
 
 def template_names() -> tuple[str, ...]:
@@ -121,14 +121,14 @@ def read_template(path: Path) -> Template:
     return decode_template(read_bytes(path, "template"), path, "template", "")
 
 
-def decode_template(data: bytes, path: Path, what: str, remedy: str) -> Template:
-    """Return the template in ``data``; ``path``, ``what`` and ``remedy`` are for errors."""
+def decode_template(data: bytes, path: Path, kind: str, remedy: str) -> Template:
+    """Return the template in ``data``; ``path``, ``kind`` and ``remedy`` are for errors."""
     try:
         return parse_template(data.decode(), path.stem)
     except _TemplateError as error:
-        raise DocumentError(f"the {what} '{path}' is not valid", f"{error}.", remedy) from error
+        raise DocumentError(f"the {kind} '{path}' is not valid", f"{error}.", remedy) from error
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise toml_error(error, f"the {what} '{path}'", remedy) from error
+        raise toml_error(error, f"the {kind} '{path}'", remedy) from error
 
 
 class _TemplateError(ValueError):
@@ -336,7 +336,7 @@ def settings_values(template: Template) -> dict[str, str]:
 
     The protection of single names has keys such as ``protection.topic /camera/*.data``.
     """
-    found: dict[str, str] = {}
+    values: dict[str, str] = {}
 
     def add(key: str, value: object) -> None:
         if isinstance(value, dict):
@@ -344,16 +344,16 @@ def settings_values(template: Template) -> dict[str, str]:
                 add(f"{key}.{name}" if key else name, inner)
         elif isinstance(value, list):
             if not all(isinstance(entry, dict) for entry in value):
-                found[key] = ",".join(map(str, value))
+                values[key] = ",".join(map(str, value))
                 return
             for entry in value:
                 for name in entry["names"]:
                     add(f"{key} {name}", {k: v for k, v in entry.items() if k != "names"})
         else:
-            found[key] = json.dumps(value) if isinstance(value, bool) else str(value)
+            values[key] = json.dumps(value) if isinstance(value, bool) else str(value)
 
     add("", parse_toml(render_template(template)))
-    return found
+    return values
 
 
 def with_values(

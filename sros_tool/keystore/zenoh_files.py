@@ -522,8 +522,8 @@ def zenoh_documents(
             revoked if direct else "",
         )
 
-    def sessions(some: Sequence[str]) -> dict[str, bytes]:
-        return {_session_path(name): session(name) for name in some}
+    def sessions(names: Sequence[str]) -> dict[str, bytes]:
+        return {_session_path(name): session(name) for name in names}
 
     size = 0
     chosen = [name for name in rules if not only_enclaves or name in only_enclaves]
@@ -744,9 +744,9 @@ class _RightsReader:
         """Return the results of `read`, doing each step for all enclaves before the next step."""
         left_out: dict[str, str] = {}
 
-        def results_of(some: Iterable[str], step: Callable[[str], Result]) -> dict[str, Result]:
+        def results_of(names: Iterable[str], step: Callable[[str], Result]) -> dict[str, Result]:
             done = {}
-            for name in some:
+            for name in names:
                 try:
                     done[name] = step(name)
                 except SrosError as error:
@@ -872,8 +872,10 @@ def _prove(
     foreign = announced is None
     check_meaning(foreign, False, f"that {enclave} announces nodes of another enclave")
     if _are_exactly(passing, stated_rights):
-        more = announced != _to_announce(stated_rights)
-        check_meaning(more, False, f"that {enclave} announces names that it has no right to")
+        announces_more = announced != _to_announce(stated_rights)
+        check_meaning(
+            announces_more, False, f"that {enclave} announces names that it has no right to"
+        )
         return
     nodes = _example_nodes(enclave, control)
     kinds = {right: kind for kind, right in _ANNOUNCED.items()}

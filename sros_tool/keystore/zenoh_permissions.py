@@ -114,12 +114,12 @@ def rights_in_domain(enclave: str, grant: Grant, domain: int) -> tuple[StatedRig
     rights = set(grant_rights(enclave, grant._replace(rules=_joined_rules(rules))))
     raw = {right for right in rights if not right.name.startswith("/")}
     rights -= raw
-    everything = {right for right in raw if right.name == "*" and right.qualifier is ALLOW}
-    if {right.right for right in everything} == {"publish", "subscribe"}:
+    allow_all = {right for right in raw if right.name == "*" and right.qualifier is ALLOW}
+    if {right.right for right in allow_all} == {"publish", "subscribe"}:
         rights |= {
             Right(enclave, ALLOW, right, "/*") for right in (*RIGHTS["topics"], *RIGHTS["services"])
         }
-        raw -= everything
+        raw -= allow_all
     for right in sorted(raw):
         if right.name.startswith(f"{_TOPICS}*"):
             rights |= {right._replace(name=right.name.removeprefix(_TOPICS))}
@@ -270,7 +270,7 @@ def _vendors_differ_error(
     decisions: Mapping[Vendor, GrantedAccess],
 ) -> PolicyError:
     """Return the error about a topic on which vendors, or vendors and Zenoh, decide differently."""
-    what = f"{source}: {verb} {topic} cannot be expressed in Zenoh"
+    difference = f"{source}: {verb} {topic} cannot be expressed in Zenoh"
     reasons: dict[str, list[str]] = {}
     for vendor, decision in decisions.items():
         reasons.setdefault(decision.reason(verb, topic), []).append(vendor.title)
@@ -285,13 +285,13 @@ def _vendors_differ_error(
             f"{reason} ({', '.join(joined_titles(of))})" for reason, of in reasons.items()
         )
         return PolicyError(
-            f"{what}, because DDS vendors do not {'read its rules' if are_alike else 'decide'} "
-            "alike",
+            f"{difference}, because DDS vendors do not "
+            f"{'read its rules' if are_alike else 'decide'} alike",
             f"{differing[:1].upper()}{differing[1:]}.",
             _REMEDY,
         )
     return PolicyError(
-        f"{what}, because the order of its rules matters",
+        f"{difference}, because the order of its rules matters",
         f"On DDS {next(iter(reasons))}, and rule {denying[0]} comes too late to deny it. On Zenoh, "
         "as in a policy, a deny rule wins wherever it stands.",
         f"List the names to {verb} in a policy, without that deny rule, and sign it with `sros "

@@ -207,7 +207,7 @@ class Settings(Enum):
     IGNORED = "nothing"
     READ = "settings, which have no effect"
     OF_ANY_USE = "settings that must not restrict the certificate"
-    OF_DOCUMENTS = "settings that must let it be trusted for S/MIME"
+    OF_DOCUMENTS = "settings that must trust the certificate for S/MIME"
 
 
 def load_certificate(
@@ -228,13 +228,13 @@ def load_certificate(
 def _first_certificate(
     data: bytes, name: str, trusted: bool, settings: Settings
 ) -> x509.Certificate:
-    what = f"the certificate {name} cannot be read"
+    unreadable = f"the certificate {name} cannot be read"
     labels = pem_file.CERTIFICATES if trusted else pem_file.CERTIFICATES[:-1]
-    for block in _blocks(data, what):
+    for block in _blocks(data, unreadable):
         if block.label in labels:
-            return _certificate_in(block, what, settings)
+            return _certificate_in(block, unreadable, settings)
     why = f"It is not a PEM certificate: {pem_file.missing_block_reason(data, 'CERTIFICATE')}."
-    raise PkiError(what, why, _RESTORE)
+    raise PkiError(unreadable, why, _RESTORE)
 
 
 @lru_cache(maxsize=16)
@@ -248,18 +248,18 @@ def load_certificates(
             trust ``settings`` of a ``TRUSTED CERTIFICATE`` forbid its use.
     """
     load_certificate(data, name)
-    what = f"the certificates {name} cannot be read"
+    unreadable = f"the certificates {name} cannot be read"
     certificates: list[x509.Certificate] = []
-    for block in list(_blocks(data, what)):
+    for block in list(_blocks(data, unreadable)):
         if block.label in pem_file.CERTIFICATES:
             why = "A certificate after the first one is damaged." if certificates else _UNREADABLE
             of_block = settings if block.label == pem_file.CERTIFICATES[-1] else Settings.IGNORED
-            certificates.append(_certificate_in(block, what, of_block, why))
+            certificates.append(_certificate_in(block, unreadable, of_block, why))
         elif block.label == "X509 CRL":
-            with reading(what, "A revocation list in it is damaged.", _RESTORE):
+            with reading(unreadable, "A revocation list in it is damaged.", _RESTORE):
                 tolerant.check_list(block.content)
         elif block.label in KEY_LABELS and not block.headers:
-            with reading(what, "A private key in it is damaged.", _RESTORE):
+            with reading(unreadable, "A private key in it is damaged.", _RESTORE):
                 check_key(block.content)
     return tuple(certificates)
 
@@ -287,17 +287,19 @@ def _known_blocks(data: bytes) -> tuple[tuple[pem_file.Block, ...], str]:
 
 
 def _certificate_in(
-    block: pem_file.Block, what: str, settings: Settings, why: str = _UNREADABLE
+    block: pem_file.Block, unreadable: str, settings: Settings, why: str = _UNREADABLE
 ) -> x509.Certificate:
     if block.headers:
         why = f"It has PEM headers ('{block.headers.splitlines()[0].decode('ascii', 'replace')}')."
-        raise PkiError(what, why, "Remove the lines between '-----BEGIN' and the certificate.")
-    with reading(what, why, _RESTORE):
-        certificate, rest = der.split(block.content)
-        if not rest or settings is Settings.IGNORED or _permits(rest, settings):
+        raise PkiError(
+            unreadable, why, "Remove the lines between '-----BEGIN' and the certificate."
+        )
+    with reading(unreadable, why, _RESTORE):
+        certificate, remainder = der.split(block.content)
+        if not remainder or settings is Settings.IGNORED or _permits(remainder, settings):
             return _load_der(certificate)
     why = "It is a TRUSTED CERTIFICATE that is not trusted for this use."
-    raise PkiError(what, why, "Write it with the label CERTIFICATE.")
+    raise PkiError(unreadable, why, "Write it with the label CERTIFICATE.")
 
 
 def _permits(trust_settings: bytes, settings: Settings) -> bool:
@@ -472,10 +474,10 @@ def _algorithms(certificate: x509.Certificate) -> tuple[der.Value, der.Value]:
     OpenSSL compares them when it verifies the signature; it does not verify the signature of a
     self-signed CA (RFC 5280, 4.1.1.2).
     """
-    whole = der.first_value(
+    certificate_value = der.first_value(
         _normalized(certificate, certificate.public_bytes(serialization.Encoding.DER))
     )
-    signed, outer, _ = der.children(whole.content)
+    signed, outer, _ = der.children(certificate_value.content)
     parts = der.children(signed.content)
     return parts[2 if parts[0].tag == der.CONTEXT_0 else 1], outer
 
@@ -707,8 +709,8 @@ def _time(value: der.Value) -> str:
 
 
 def _form(certificate: bytes) -> CertificateForm:
-    (whole,) = der.children(certificate)
-    signed, signature_algorithm, _ = der.children(whole.content)
+    (certificate_value,) = der.children(certificate)
+    signed, signature_algorithm, _ = der.children(certificate_value.content)
     parts = der.children(signed.content)
     version = parts.pop(0).whole if parts[0].tag == der.CONTEXT_0 else b""
     serial, algorithm, issuer, validity, subject, key, *more = parts
@@ -797,7 +799,7 @@ def load_request(data: bytes, label: str) -> SigningRequest:
             request.public_key(),
             request.signature_hash_algorithm,
         )
-        said = subject_text(subject)
+        stated_name = subject_text(subject)
     if not (
         isinstance(public, ec.EllipticCurvePublicKey) and public.curve.name == "secp256r1"
     ) and (not (isinstance(public, rsa.RSAPublicKey) and public.key_size == 2048)):
@@ -821,7 +823,7 @@ def load_request(data: bytes, label: str) -> SigningRequest:
         )
     if len(list(subject)) != 1 or not common_name_of(subject):
         raise PkiError(
-            f"the request {label} is for {said or 'an empty subject'}",
+            f"the request {label} is for {stated_name or 'an empty subject'}",
             "The subject of a request has to be one common name, the name of the enclave, and "
             "nothing else.",
             "Create it with `sros create_request`.",

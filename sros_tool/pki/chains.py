@@ -476,16 +476,16 @@ def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
     valid: set[ObjectIdentifier] = {_ANY_POLICY}
     for certificate in reversed(chain[:-1]):
         name = subject_text(certificate.subject)
-        found = extension(certificate, x509.CertificatePolicies)
-        named = [policy.policy_identifier for policy in found or ()]
+        policies = extension(certificate, x509.CertificatePolicies)
+        named = [policy.policy_identifier for policy in policies or ()]
         if len(named) != len(set(named)):
             yield f"{name} has a certificate policy twice"
         maps = any(
             extension.oid == ExtensionOID.POLICY_MAPPINGS for extension in certificate.extensions
         )
-        if maps and found is not None:
+        if maps and policies is not None:
             yield f"{name} has policyMappings, not known to sros"
-        asked = _ALWAYS_ASKED if found is None else _OF_POLICIES
+        asked = _ALWAYS_ASKED if policies is None else _OF_POLICIES
         if any(
             extension.oid in asked and is_unread(extension) for extension in certificate.extensions
         ):

@@ -85,7 +85,7 @@ _IN_NAMES = (0x03, 0x0C, 0x12, 0x13, 0x14, 0x16, 0x1C, _BMP_STRING)
 
 
 @contextmanager
-def reading(what: str, why: str, remedy: str = "") -> Iterator[None]:
+def reading(unreadable: str, why: str, remedy: str = "") -> Iterator[None]:
     """Turn all errors of `cryptography` in the ``with`` block into a `PkiError` with these texts.
 
     For a damaged or hostile document it raises errors of more than ten classes, most of them at the
@@ -96,7 +96,7 @@ def reading(what: str, why: str, remedy: str = "") -> Iterator[None]:
         yield
     except BaseException as error:
         if may_be_read_error(error):
-            raise PkiError(what, why, remedy) from error
+            raise PkiError(unreadable, why, remedy) from error
         raise
 
 

@@ -72,8 +72,8 @@ def _encrypted(key: bytes, passphrase: str) -> bytes:
     )
     cipher = _algorithm(_AES_256_CBC, der.encode(der.OCTET_STRING, start))
     scheme = _algorithm(_PBES2, der.encode(der.SEQUENCE, scrypt, cipher))
-    whole = der.encode(der.SEQUENCE, scheme, der.encode(der.OCTET_STRING, content))
-    lines = textwrap.wrap(base64.b64encode(whole).decode(), 64)
+    encrypted_key = der.encode(der.SEQUENCE, scheme, der.encode(der.OCTET_STRING, content))
+    lines = textwrap.wrap(base64.b64encode(encrypted_key).decode(), 64)
     kind = "ENCRYPTED PRIVATE KEY-----"
     return "\n".join((f"-----BEGIN {kind}", *lines, f"-----END {kind}", "")).encode()
 
@@ -246,7 +246,7 @@ def _check_derivation(pem: bytes, name: str) -> None:
 
     Source: RFC 5958, 3; RFC 8018, A; RFC 7914, 7.
     """
-    if (found := _INITIAL_VALUE.search(pem)) and len(found[2]) < _HEX_DIGITS.get(found[1], 32):
+    if (match := _INITIAL_VALUE.search(pem)) and len(match[2]) < _HEX_DIGITS.get(match[1], 32):
         raise _unreadable_key_error(name)  # `cryptography` panics
     for block in _ENCRYPTED.findall(pem):
         try:

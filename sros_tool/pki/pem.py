@@ -197,8 +197,8 @@ def kind_of(data: bytes) -> str:
     if data[:1] == bytes((der.SEQUENCE,)) and (kind := _kind_of_der(data)):
         return kind
     text = data.removeprefix(b"\xef\xbb\xbf")
-    if found := _LABEL.search(text):
-        return _kind_of_label(found[1].decode("ascii", "replace"))
+    if match := _LABEL.search(text):
+        return _kind_of_label(match[1].decode("ascii", "replace"))
     if _HEADER.match(text):
         return _kind_of_message(text)
     if text.lstrip()[:1] == b"<":

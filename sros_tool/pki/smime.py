@@ -119,7 +119,7 @@ def _cms(content: bytes, certificate: x509.Certificate, key: PrivateKey) -> byte
     It has the form that `cryptography` gives it from release 42 on: earlier ones write capabilities
     that are not as RFC 8551, 2.5.2, has them.  The attributes are in the order of a DER set.
     """
-    whole, issuer_and_serial = _signer_parts(certificate)
+    certificate_der, issuer_and_serial = _signer_parts(certificate)
     attributes = b"".join((
         _TYPE_OF_DATA,
         _attribute(_SIGNING_TIME, der.encode(der.UTC_TIME, _now())),
@@ -145,7 +145,7 @@ def _cms(content: bytes, certificate: x509.Certificate, key: PrivateKey) -> byte
         der.encode_integer(1),
         der.encode(der.SET, _SHA256),
         der.encode(der.SEQUENCE, der.encode(der.OID, _DATA)),
-        der.encode(der.CONTEXT_0, whole),
+        der.encode(der.CONTEXT_0, certificate_der),
         der.encode(der.SET, signer),
     )
     wrapped = der.encode(der.CONTEXT_0, signed_data)
@@ -160,10 +160,10 @@ def _now() -> bytes:
 @lru_cache(maxsize=16)
 def _signer_parts(certificate: x509.Certificate) -> tuple[bytes, bytes]:
     """Return a signer's certificate in DER, and its IssuerAndSerialNumber."""
-    whole = certificate.public_bytes(Encoding.DER)
+    certificate_der = certificate.public_bytes(Encoding.DER)
     parts = der.children(der.first_value(certificate.tbs_certificate_bytes).content)
     serial, _, issuer = parts[parts[0].tag == der.CONTEXT_0 :][:3]
-    return whole, der.encode(der.SEQUENCE, issuer.whole, serial.whole)
+    return certificate_der, der.encode(der.SEQUENCE, issuer.whole, serial.whole)
 
 
 def _algorithm(dotted: str, *parameters: bytes) -> bytes:

@@ -356,16 +356,16 @@ def _entries(values: list[der.Value]) -> Iterator[_TolerantEntry]:
     damaged = False
     for value in values:
         serial, date, *rest = _sequence(value)
-        found = _read(_sequence(rest[0]) if rest else [], _parse_in_entry, _LOOSE_OF_ENTRIES)
+        entries = _read(_sequence(rest[0]) if rest else [], _parse_in_entry, _LOOSE_OF_ENTRIES)
         if damaged:
-            found = x509.Extensions([])
+            entries = x509.Extensions([])
         elif any(
-            is_unread(extension) and extension.oid in _DECODED_OF_ENTRIES for extension in found
+            is_unread(extension) and extension.oid in _DECODED_OF_ENTRIES for extension in entries
         ):
             damaged = True
-            found = x509.Extensions([])
+            entries = x509.Extensions([])
         moment = _date(date) or datetime.min.replace(tzinfo=UTC)
-        yield _TolerantEntry(der.integer(serial), moment, found)
+        yield _TolerantEntry(der.integer(serial), moment, entries)
 
 
 _DECODED_OF_ENTRIES = (CRLEntryExtensionOID.CERTIFICATE_ISSUER, CRLEntryExtensionOID.CRL_REASON)

@@ -646,11 +646,13 @@ class _Reader:
                 "",
                 f"Remove the element, or name one: <{item}>NAME</{item}>.",
             )
-        whole = all(at.file == place.file for _, at in items)  # names can be included one by one
+        is_one_file = all(
+            at.file == place.file for _, at in items
+        )  # names can be included one by one
         for level, members in by_level.items():
             names, lines = tuple(name for name, _ in members), tuple(line for _, line in members)
             source = self._source_of(element, place)
-            yield Group(kind, tuple(rights), names, level, source, lines if whole else ())
+            yield Group(kind, tuple(rights), names, level, source, lines if is_one_file else ())
 
     def _read_protection(self, element: etree._Element, place: IncludedFile) -> Level | None:
         """Return the protection level that the policy states for a name, or None."""

@@ -126,9 +126,9 @@ class _Planner:
                                 entry.protect = entry.protect or group.protect
                                 entry.rights[right, qualifier] = None
         entries = {
-            place: tuple(sorted(_entries(found), key=_entry_order))
-            for place, found in sorted(names.items(), key=lambda item: _place_order(item[0]))
-            if found
+            place: tuple(sorted(_entries(place_names), key=_entry_order))
+            for place, place_names in sorted(names.items(), key=lambda item: _place_order(item[0]))
+            if place_names
         }
         added = [right for right, wanted in self._wanted.items() if wanted]
         return MergePlan(entries, tuple(sorted(added, key=order)), tuple(self._contradictions))
@@ -162,8 +162,8 @@ class _Name:
     protect: Level | None = None
 
 
-def _entries(found: dict[tuple[str, str], _Name]) -> Iterable[AddedName]:
-    for (kind, _), name in found.items():
+def _entries(names: dict[tuple[str, str], _Name]) -> Iterable[AddedName]:
+    for (kind, _), name in names.items():
         for qualifiers in group_rights(name.rights):
             yield AddedName(kind, name.written, qualifiers, name.protect)
 
@@ -414,13 +414,13 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
             before = _checked_policy(path, document, before, plan.added)
             added += plan.added
         _check_protection(path, before, additions)
-    already = nodes_in_several_namespaces(first.enclaves)
+    first_nodes = nodes_in_several_namespaces(first.enclaves)
     several = (
         f"{enclave} has the node {node} in {first_few([profile.ns for profile in profiles], 3)}: "
         "each process in this enclave has the rights of all of them. Put the namespace into path=, "
         "too, to give each instance an enclave of its own."
         for (enclave, node), profiles in nodes_in_several_namespaces(before.enclaves).items()
-        if already.get((enclave, node), ()) != profiles
+        if first_nodes.get((enclave, node), ()) != profiles
     )
     shared = tuple(_shared_enclaves(first, policies, before))
     rights = frozenset(policy_rights(before))
@@ -520,8 +520,10 @@ def _group(kind: str, rights: GroupRights, entries: Iterable[AddedName]) -> _New
 def _groups(entries: Sequence[AddedName]) -> list[_New]:
     """Group names that are sorted by kind and rights."""
     return [
-        _group(kind, rights, same)
-        for (kind, rights), same in groupby(entries, key=lambda entry: (entry.kind, entry.rights))
+        _group(kind, rights, entries_of_group)
+        for (kind, rights), entries_of_group in groupby(
+            entries, key=lambda entry: (entry.kind, entry.rights)
+        )
     ]
 
 
@@ -544,8 +546,8 @@ class _Editor:
         own = {
             element.get("path"): element for block in blocks for element in block.named("enclave")
         }
-        for path, found in groupby(entries.items(), key=lambda item: item[0].enclave):
-            places = dict(found)
+        for path, enclave_entries in groupby(entries.items(), key=lambda item: item[0].enclave):
+            places = dict(enclave_entries)
             if path in own:
                 self._add_to_enclave(own[path], places)
                 continue
@@ -573,8 +575,8 @@ class _Editor:
                 own.setdefault(key, []).append(profile)
         new = []
         for place, entries in places.items():
-            if found := own.get((place.ns, place.node)):
-                self._add_to_profiles(found, entries)
+            if profiles := own.get((place.ns, place.node)):
+                self._add_to_profiles(profiles, entries)
             else:
                 new.append(_profile(place, entries))
         if new and blocks:
@@ -593,9 +595,11 @@ class _Editor:
             [entry for entry in entries if (entry.kind, entry.rights) not in groups]
         ):
             self._append(profiles[0], new)
-        for (kind, rights), same in groupby(entries, key=lambda entry: (entry.kind, entry.rights)):
+        for (kind, rights), entries_of_group in groupby(
+            entries, key=lambda entry: (entry.kind, entry.rights)
+        ):
             if group := groups.get((kind, rights)):
-                self._add_names(group, kind, list(same))
+                self._add_names(group, kind, list(entries_of_group))
 
     def _add_names(self, group: PlacedElement, kind: str, entries: Sequence[AddedName]) -> None:
         """Insert names into a group: sorted if the group is sorted, otherwise at its end."""

@@ -164,7 +164,7 @@ def _protected_as_before(before: Policy, after: Policy) -> Policy:
     left: dict[str, set[str]] = defaultdict(set)
     for right in policy_rights(after):
         left[right.kind].add(right.name)
-    names = {kind: Names(sorted(found)) for kind, found in left.items()}
+    names = {kind: Names(sorted(names_of_kind)) for kind, names_of_kind in left.items()}
     levels: dict[tuple[str, str], Level] = {}
     for kind, name, level in sorted(gone):
         met = list(names[kind].overlapping(name)) if kind in names else []
@@ -175,13 +175,13 @@ def _protected_as_before(before: Policy, after: Policy) -> Policy:
             )
 
     def groups(group: Group, profile: Profile) -> Iterator[Group]:
-        found: dict[Level | None, list[str]] = {}
+        names_of_kind: dict[Level | None, list[str]] = {}
         for name in group.names:
             fqn = expand(name, profile.ns, profile.node)
             level = group.protect or levels.get((group.kind, fqn))
-            found.setdefault(level, []).append(name)
-        for level, same in found.items():
-            yield replace(group, names=tuple(same), protect=level, lines=())
+            names_of_kind.setdefault(level, []).append(name)
+        for level, names in names_of_kind.items():
+            yield replace(group, names=tuple(names), protect=level, lines=())
 
     return with_groups(after, groups)
 
@@ -190,12 +190,12 @@ class _KnownNames:
     """All exact names in policies and observations: by kind, sorted."""
 
     def __init__(self, all_rights: Iterable[Iterable[Right]]) -> None:
-        found: dict[str, set[str]] = defaultdict(set)
+        names_by_place: dict[str, set[str]] = defaultdict(set)
         for rights in all_rights:
             for right in folded(rights):
                 if not is_expression(right.name):
-                    found[right.kind].add(right.name)
-        self._names = {kind: sorted(names) for kind, names in found.items()}
+                    names_by_place[right.kind].add(right.name)
+        self._names = {kind: sorted(names) for kind, names in names_by_place.items()}
 
     def of(self, kind: str) -> Sequence[str]:
         """Return the known names of a kind (topics, services or actions)."""
@@ -331,12 +331,12 @@ class _Narrowing:
     def _prove(self, remaining_rights: Sequence[Right]) -> None:
         """Raise unless the narrowed enclave adds no right and keeps every observed right."""
         after = Rules(remaining_rights)
-        more = [right for right in remaining_rights if not self._rules.cover(right)]
+        widened = [right for right in remaining_rights if not self._rules.cover(right)]
         lost = [p for p in self._in_use if self._is_allowed(p) and not after.cover(p)]
-        if more or lost:
+        if widened or lost:
             raise PolicyError(
                 f"the enclave {self._enclave.path} cannot be narrowed",
-                f"{(more or lost)[0]} would be {'added' if more else 'lost'}.",
+                f"{(widened or lost)[0]} would be {'added' if widened else 'lost'}.",
                 "This is a defect of sros: please report it with the policy.",
             )
 
@@ -345,35 +345,35 @@ class _Narrowing:
     def _pairs(self, rights: Iterable[Right]) -> set[_Pair]:
         """Return the pairs (right, known name) that ``rights`` allow and no rule denies."""
         rights = folded(rights)
-        found: set[_Pair] = set()
+        pairs: set[_Pair] = set()
         wild = False
         for right in rights:
             if is_expression(right.name):
                 wild = True
                 matched = self._names.matching_names(right.kind, right.name)
-                found.update((right.right, name) for name in matched)
+                pairs.update((right.right, name) for name in matched)
             else:
-                found.add((right.right, right.name))
+                pairs.add((right.right, right.name))
         if (
             wild
         ):  # wildcards of services and topics can match all parts of an action, or the missing ones
-            found = self._with_actions(found, Rules(rights))
+            pairs = self._with_actions(pairs, Rules(rights))
         if not self._denied:
-            return found
+            return pairs
         return {
             pair
-            for pair in found
+            for pair in pairs
             if not self._rules.overlaps(Right(self._enclave.path, DENY, *pair))
         }
 
-    def _with_actions(self, found: set[_Pair], rules: Rules) -> set[_Pair]:
+    def _with_actions(self, found_pairs: set[_Pair], rules: Rules) -> set[_Pair]:
         """Return the pairs; an action that ``rules`` allow completely counts as one pair."""
-        pairs = set(found)
+        pairs = set(found_pairs)
         for action in ("call", "execute"):
             for name in self._names.of(KIND_OF[action]):
-                whole = Right(self._enclave.path, ALLOW, action, name)
-                if rules.cover(whole):
-                    pairs.difference_update((part.right, part.name) for part in parts(whole))
+                whole_action = Right(self._enclave.path, ALLOW, action, name)
+                if rules.cover(whole_action):
+                    pairs.difference_update((part.right, part.name) for part in parts(whole_action))
                     pairs.add((action, name))
         return pairs
 
@@ -412,7 +412,7 @@ def _profile(
 
     ``pending`` maps rights to their replacements.  Those of this profile are removed from it.
     """
-    said: dict[tuple[str, str, Level | None], dict[tuple[str, Qualifier], None]] = {}
+    statements: dict[tuple[str, str, Level | None], dict[tuple[str, Qualifier], None]] = {}
     for group in profile.groups:
         level = group.protect
         for name in group.names:
@@ -420,14 +420,14 @@ def _profile(
             for right, qualifier in group.rights:
                 whole = Right(path, qualifier, right, fqn)
                 if qualifier is DENY or whole in kept_rights:
-                    said.setdefault((group.kind, name, level), {})[right, qualifier] = None
+                    statements.setdefault((group.kind, name, level), {})[right, qualifier] = None
                 for replacement in pending.pop(whole, ()):
                     written = _name_written_like(replacement.name, name, profile)
-                    said.setdefault((replacement.kind, written, level), {})[
+                    statements.setdefault((replacement.kind, written, level), {})[
                         replacement.right, ALLOW
                     ] = None
     groups: dict[tuple[str, GroupRights, Level | None], list[str]] = {}
-    for (kind, name, level), rights in said.items():
+    for (kind, name, level), rights in statements.items():
         for together in group_rights(rights):
             groups.setdefault((kind, together, level), []).append(name)
     return replace(
@@ -490,14 +490,14 @@ def propose_wildcards(
     # A large document does not list the names that its wildcards match, so these save nothing.
     listed = (right for right in own if not present.cover(right))
     candidates: dict[frozenset[Right], WildcardProposal] = {}
-    for rule, found in _candidates(listed).items():
-        other = candidates.get(frozenset(found))
+    for rule, listed_rights in _candidates(listed).items():
+        other = candidates.get(frozenset(listed_rights))
         # Of wildcards for the same names, the longest one allows least.
         if other is None or len(rule.name) > len(other.rule.name):
             adds = tuple(sorted(_rights_matching(rule, foreign), key=order))
-            saves = sum(map(size, found)) - size(rule)
-            names = tuple(sorted(found, key=order))
-            candidates[frozenset(found)] = WildcardProposal(rule, names, adds, saves)
+            saves = sum(map(size, listed_rights)) - size(rule)
+            names = tuple(sorted(listed_rights, key=order))
+            candidates[frozenset(listed_rights)] = WildcardProposal(rule, names, adds, saves)
     best = sorted(
         candidates.values(),
         key=lambda proposal: (len(proposal.adds), -proposal.saves, order(proposal.rule)),
@@ -519,12 +519,12 @@ def propose_wildcards(
 
 def _candidates(rights: Iterable[Right]) -> dict[Right, list[Right]]:
     """Map candidate wildcards to the rights that they can replace, at least `_FEWEST` each."""
-    found: dict[Right, list[Right]] = defaultdict(list)
+    rights_by_wildcard: dict[Right, list[Right]] = defaultdict(list)
     for right in rights:
         if right.name.startswith("/") and not is_expression(right.name):
             for expression in set(_wider_names(right.name)):
-                found[right._replace(name=expression)].append(right)
-    return {rule: names for rule, names in found.items() if len(names) >= _FEWEST}
+                rights_by_wildcard[right._replace(name=expression)].append(right)
+    return {rule: names for rule, names in rights_by_wildcard.items() if len(names) >= _FEWEST}
 
 
 def _wider_names(name: str) -> Iterator[str]:

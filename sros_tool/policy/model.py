@@ -182,12 +182,12 @@ def nodes_in_several_namespaces(
 
     Nodes whose names have wildcards are left out.  An enclave may occur several times.
     """
-    found: dict[tuple[str, str], dict[str, Profile]] = {}
+    profiles_by_node: dict[tuple[str, str], dict[str, Profile]] = {}
     for enclave in enclaves:
         for profile in enclave.all_profiles():
             if profile.node and not is_expression(profile.node):
-                found.setdefault((enclave.path, profile.node), {})[profile.ns] = profile
-    return {key: tuple(by_ns.values()) for key, by_ns in found.items() if len(by_ns) > 1}
+                profiles_by_node.setdefault((enclave.path, profile.node), {})[profile.ns] = profile
+    return {key: tuple(by_ns.values()) for key, by_ns in profiles_by_node.items() if len(by_ns) > 1}
 
 
 @dataclass(frozen=True, slots=True)
@@ -336,7 +336,7 @@ def stated_protections(enclaves: Iterable[Enclave]) -> tuple[StatedProtection, .
 
     What an enclave says several times is returned once, with the first place.
     """
-    found: dict[StatedProtection, None] = {}
+    protections: dict[StatedProtection, None] = {}
     for enclave in enclaves:
         for profile in enclave.all_profiles():
             for group in profile.groups:
@@ -347,5 +347,5 @@ def stated_protections(enclaves: Iterable[Enclave]) -> tuple[StatedProtection, .
                     statement = StatedProtection(
                         enclave.path, group.kind, name, group.protect, source
                     )
-                    found.setdefault(statement)
-    return tuple(found)
+                    protections.setdefault(statement)
+    return tuple(protections)

@@ -152,10 +152,10 @@ class _Form:
     def _covers_at(self, piece: frozenset[str]) -> int:
         """Return the positions whose pieces match all letters of ``piece``."""
         if piece not in self._covering:
-            every = ~0
+            all_covered = ~0
             for letter in piece:
-                every &= self._bit_of_letter(letter)
-            self._covering[piece] = every & (1 << len(self.pieces)) - 1 & ~self.stars
+                all_covered &= self._bit_of_letter(letter)
+            self._covering[piece] = all_covered & (1 << len(self.pieces)) - 1 & ~self.stars
         return self._covering[piece]
 
     def _meets_at(self, piece: frozenset[str]) -> int:
@@ -187,17 +187,17 @@ def _pattern_form(expression: str) -> _Form:
 
 def _pieces(expression: str) -> _Pieces:
     """Split an expression into pieces: `_ANY` for ``*``, else the set of matching characters."""
-    found: list[frozenset[str]] = []
+    letter_sets: list[frozenset[str]] = []
     for piece in _PIECE.finditer(expression):
         negated, members, literal = piece.groups()
         if literal is not None:
-            found.append(_single_letter(literal))
+            letter_sets.append(_single_letter(literal))
         elif members is not None:
             chosen = _members(members)
-            found.append(_ALPHABET - chosen if negated else chosen)
+            letter_sets.append(_ALPHABET - chosen if negated else chosen)
         else:
-            found.append(_ALPHABET if piece[0] == "?" else _ANY)
-    return tuple(found)
+            letter_sets.append(_ALPHABET if piece[0] == "?" else _ANY)
+    return tuple(letter_sets)
 
 
 @lru_cache(maxsize=_MANY)
@@ -302,10 +302,10 @@ class Names:
         keys = {
             text[i : i + size] for size in range(_GRAM + 1) for i in range(len(text) - size + 1)
         }
-        found = [
+        candidates = [
             number for key in keys & self._by_letters.keys() for number in self._by_letters[key]
         ]
-        return [self._wild[number] for number in sorted(found)]
+        return [self._wild[number] for number in sorted(candidates)]
 
     @cached_property
     def _by_letters(self) -> dict[str, list[int]]:
@@ -322,11 +322,11 @@ class Names:
         def rarity(gram: str) -> tuple[int, int, str]:
             return -len(gram), count[gram], gram
 
-        found: dict[str, list[int]] = {}
+        numbers_by_letters: dict[str, list[int]] = {}
         for number, each in enumerate(grams):
             key = min(each, key=rarity) if each else ""
-            found.setdefault(key, []).append(number)
-        return found
+            numbers_by_letters.setdefault(key, []).append(number)
+        return numbers_by_letters
 
     def _overlap_candidates(self, expression: str) -> Sequence[int]:
         """Return the numbers of expressions that could overlap with ``expression``."""
@@ -484,8 +484,8 @@ def listed_expressions(expression: str, maximum: int) -> list[str]:
         raise TooManyNames
     names = ("".join(choice) for choice in product(*pieces))
     # "/" next to another one or at the end is in no name.
-    found = (_STARS.sub("*", name) for name in names if "//" not in name and name[-1:] != "/")
-    return list(dict.fromkeys(found))
+    expressions = (_STARS.sub("*", name) for name in names if "//" not in name and name[-1:] != "/")
+    return list(dict.fromkeys(expressions))
 
 
 def _letters_or_text(negated: str, listed: str, any_letter: str, text: str) -> Sequence[str]:

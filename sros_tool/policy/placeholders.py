@@ -104,11 +104,11 @@ def check_path(path: Parts) -> None:
     Raises:
         ValueError: the path does not; the message is a sentence.
     """
-    found = placeholders_of(path)
-    if plural := next((part for part in found if part.plural), None):
+    path_placeholders = placeholders_of(path)
+    if plural := next((part for part in path_placeholders if part.plural), None):
         singular = plural._replace(plural=False)
         raise ValueError(f"{plural} names all robots, a path names one enclave: write {singular}.")
-    if len({part.group for part in found}) > 1:
+    if len({part.group for part in path_placeholders}) > 1:
         raise ValueError("Its placeholders are of different groups.")
 
 
@@ -131,10 +131,10 @@ def check_name(name: Parts, path: Parts, *, several: bool) -> None:
                     f"{placeholder} stands for several names, but only one can be here."
                 )
         elif not of_path:
-            instead = f" For a name for each robot write {placeholder._replace(plural=True)}."
+            suggestion = f" For a name for each robot write {placeholder._replace(plural=True)}."
             raise ValueError(
                 f"{placeholder} stands for one robot, but the enclave's path does not say which "
-                f"one.{instead if several else ''}"
+                f"one.{suggestion if several else ''}"
             )
         elif placeholder.group not in ("", of_path[0].group):
             only = str(placeholder._replace(value="robot"))

@@ -157,11 +157,11 @@ def profile_rights(enclave: str, profile: Profile) -> Iterator[Right]:
 
 def parts(right: Right) -> tuple[Right, ...]:
     """Split an action's right into its five topics and services; keep other rights."""
-    found = ACTION_PARTS.get(right.right)
-    if found is None:
+    part_rights = ACTION_PARTS.get(right.right)
+    if part_rights is None:
         return (right,)
     return tuple(
-        Right(right.enclave, right.qualifier, part, right.name + end) for part, end in found
+        Right(right.enclave, right.qualifier, part, right.name + end) for part, end in part_rights
     )
 
 
@@ -178,10 +178,12 @@ def folded(rights: Iterable[Right]) -> frozenset[Right]:
         for right in remaining
         if right.right in WHOLE and right.name.endswith(GOAL) and right.name.startswith("/")
     ]
-    whole = [right for right in actions if right.name and remaining.issuperset(parts(right))]
-    for right in whole:
+    whole_actions = [
+        right for right in actions if right.name and remaining.issuperset(parts(right))
+    ]
+    for right in whole_actions:
         remaining.difference_update(parts(right))
-    return frozenset(remaining.union(whole))
+    return frozenset(remaining.union(whole_actions))
 
 
 # ── queries ────────────────────────────────────────────────────────────────────────────────
@@ -196,7 +198,7 @@ class Rules:
         for enclave, qualifier, right, name in sorted(self._stated):
             names[enclave, qualifier, right].append(name)
         limit = ComparisonLimit()
-        self._names = {place: Names(found, limit) for place, found in names.items()}
+        self._names = {place: Names(place_names, limit) for place, place_names in names.items()}
 
     def cover(self, right: Right) -> bool:
         """Return whether the set covers all of ``right``, an ALLOW or a DENY."""
@@ -204,9 +206,11 @@ class Rules:
 
     def covering_rights(self, right: Right) -> tuple[Right, ...]:
         """Return the rights that together cover ``right``, or () if it is not covered."""
-        found = [self._covering_right(part) for part in parts(right)]
+        covering_parts = [self._covering_right(part) for part in parts(right)]
         return (
-            tuple(dict.fromkeys(covering for covering in found if covering)) if all(found) else ()
+            tuple(dict.fromkeys(covering for covering in covering_parts if covering))
+            if all(covering_parts)
+            else ()
         )
 
     def overlaps(self, right: Right) -> bool:
@@ -263,8 +267,10 @@ class RightsDifference:
 
     def lines(self) -> list[tuple[str, Right]]:
         """Return the different rights with "-" (only first side) or "+" (only second side)."""
-        found = [("-", right) for right in self.only_first] + [("+", e) for e in self.only_second]
-        return sorted(found, key=lambda line: (*order(line[1]), line[0] == "+"))
+        marked_rights = [("-", right) for right in self.only_first] + [
+            ("+", e) for e in self.only_second
+        ]
+        return sorted(marked_rights, key=lambda line: (*order(line[1]), line[0] == "+"))
 
     def without(self, enclaves: Collection[str]) -> RightsDifference:
         """Return the difference in the rights of all other enclaves."""
@@ -318,9 +324,9 @@ def compare(
         folded(right for right in side if scope is None or right.enclave in scope)
         for side in (first_rights, second_rights)
     )
-    both = Rules(unfolded(one) & unfolded(other) if one != other else ())
+    common = Rules(unfolded(one) & unfolded(other) if one != other else ())
     only_first, only_second = (
-        tuple(sorted((right for right in side if not both.cover(right)), key=order))
+        tuple(sorted((right for right in side if not common.cover(right)), key=order))
         for side in (one - other, other - one)
     )
     covered: dict[Right, tuple[Right, ...]] = {}

@@ -294,10 +294,10 @@ class CommitFiles:
         paths = []
         with Folder(work_tree) as folder:
             for path in self.files:
-                there = None
+                working_entry = None
                 with suppress(SrosError, OSError):
-                    there = folder.read(path)
-                if there != self.written(path):
+                    working_entry = folder.read(path)
+                if working_entry != self.written(path):
                     paths.append(path)
         return paths
 

@@ -140,10 +140,10 @@ class Worlds:
         self._first_alike: dict[World, World] = {}
         for world in worlds:
             others = self._first_alike.values()
-            alike = (
+            same_access = (
                 world_of_group for world_of_group in others if world.has_same_access(world_of_group)
             )
-            self._first_alike[world] = next(alike, world)
+            self._first_alike[world] = next(same_access, world)
 
     def decide(
         self, requirement: Requirement, limit: SearchLimit
@@ -354,9 +354,9 @@ def _witness_against_must(requirement: Must, world: World, limit: SearchLimit) -
 def _is_on_other_domain(world: World, enclave: str, limit: SearchLimit) -> bool:
     """Return whether an enclave has rights in other ROS domains, and none in that of ``world``."""
 
-    def has_rights(some: World) -> bool:
-        sides = (_own_topics(some, enclave, writes) for writes in (True, False))
-        return any(names.example(limit, longest=some.longest) for names in sides)
+    def has_rights(world: World) -> bool:
+        sides = (_own_topics(world, enclave, writes) for writes in (True, False))
+        return any(names.example(limit, longest=world.longest) for names in sides)
 
     return bool(world.elsewhere) and not has_rights(world) and any(map(has_rights, world.elsewhere))
 
@@ -469,11 +469,11 @@ def _shared_by(
     valid = shortest(name for name in known if name in valid_topics("", ""))
     if valid or len(wild) < count:  # nobody but holders with wildcards has a name not stated
         return valid or shortest(known)
-    shared, every = NameSet.at_least(count, wild), Topics("", expression, "")
+    shared, any_topic = NameSet.at_least(count, wild), Topics("", expression, "")
     return (
-        (shared & every.valid()).example(limit, longest=longest)
+        (shared & any_topic.valid()).example(limit, longest=longest)
         or shortest(known)
-        or (shared & every.every()).example(limit, longest=longest)
+        or (shared & any_topic.every()).example(limit, longest=longest)
     )
 
 
@@ -485,7 +485,7 @@ def _witness_against_widest(
     uses: defaultdict[str, list[Use]] = defaultdict(list)
     for right, names in requirement.rights:
         for part in _sufficient_parts(right):
-            side, every = world.side(part.writes), part.topics("*")
+            side, all_topics = world.side(part.writes), part.topics("*")
             within = NameSet.union(part.topics(name).every() for name in names)
             for enclave in enclaves:
                 own = side.of[enclave]
@@ -494,8 +494,8 @@ def _witness_against_widest(
                     continue
                 access = world.stated[enclave]
                 exact = access.writes if part.writes else access.reads
-                if topic := world.example(own - exact - within, every, limit):
-                    uses[enclave].append(_use(enclave, right, part, every, topic))
+                if topic := world.example(own - exact - within, all_topics, limit):
+                    uses[enclave].append(_use(enclave, right, part, all_topics, topic))
     return _first_of(uses)
 
 
@@ -518,8 +518,8 @@ def _witness_against_nothing_but(
             for name in names
         )
         for enclave in enclaves:
-            more = world.side(writes).of[enclave] - allowed - ordinary
-            if topic := world.any_example(more, limit):
+            unexpected = world.side(writes).of[enclave] - allowed - ordinary
+            if topic := world.any_example(unexpected, limit):
                 right, name = right_to_use(topic, writes=writes)
                 uses[enclave].append(Use(enclave, right, name, topic, writes))
     return _first_of(uses)
@@ -757,14 +757,19 @@ def _shortest_chain(
     queue: deque[tuple[str, str, _Chain]] = deque((start, start, ()) for start in starts)
     flows = [_Flow(domain_world, limit) for domain_world in (world, *world.elsewhere)]
     while queue:
-        here, origin, chain = queue.popleft()
+        enclave_here, origin, chain = queue.popleft()
 
         def is_new(enclave: str, origin: str = origin) -> bool:
-            there = origins.get(enclave, ())
-            return enclave not in excluded and origin not in there and len(there) < most
+            origins_here = origins.get(enclave, ())
+            return (
+                enclave not in excluded and origin not in origins_here and len(origins_here) < most
+            )
 
         def is_unused(
-            number: int, topic: str, origin: str = origin, router: str = world.router_of(here)
+            number: int,
+            topic: str,
+            origin: str = origin,
+            router: str = world.router_of(enclave_here),
         ) -> bool:
             by = used.setdefault((number, topic, router), set())
             fresh = origin not in by and len(by) < most
@@ -772,8 +777,8 @@ def _shortest_chain(
             return fresh
 
         for number, flow in enumerate(flows):
-            for topic, target in flow.hops(here, partial(is_unused, number), is_new):
-                longer = (*chain, TopicHop(here, target, topic))
+            for topic, target in flow.hops(enclave_here, partial(is_unused, number), is_new):
+                longer = (*chain, TopicHop(enclave_here, target, topic))
                 if target in targets:
                     return longer
                 origins.setdefault(target, set()).add(origin)

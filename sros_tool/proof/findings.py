@@ -112,8 +112,8 @@ class Violation:
     @property
     def differing(self) -> list[tuple[Step, ...]]:
         """The steps of ``others`` that break the requirement by other uses."""
-        alike = {*self.alike}
-        return [steps for steps in self.others if steps[0].use.enclave not in alike]
+        similar_enclaves = {*self.alike}
+        return [steps for steps in self.others if steps[0].use.enclave not in similar_enclaves]
 
 
 def _are_alike(uses: Sequence[Use], witness: Witness) -> bool:
@@ -158,11 +158,11 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
                 (enclave for enclave in witness.enclaves if enclave and enclave not in known), ""
             )
             idle = isinstance(requirement, Must) and requirement.enclave in world.idle
-            alike = [uses for uses in witness.others if _are_alike(uses, witness)]
+            similar_uses = [uses for uses in witness.others if _are_alike(uses, witness)]
             differing = [uses for uses in witness.others if not _are_alike(uses, witness)]
             others = tuple(
                 tuple(_step(use, world, system) for use in uses)
-                for uses in (*alike[:_SHOWN], *differing[:_SHOWN])
+                for uses in (*similar_uses[:_SHOWN], *differing[:_SHOWN])
             )
             violations.append(Violation(requirement, witness, steps, titles, missing, idle, others))
         if reasons := tuple(_never_fails([verdict for _, verdict in verdicts])):
@@ -315,11 +315,11 @@ def _joined_steps(steps: Sequence[Step]) -> str:
 
 def _other_violators(violation: Violation) -> str:
     """Return clauses on the further enclaves that break a requirement; "" for none."""
-    alike, differing = violation.alike, violation.differing
-    text = f", and so may {_listed_names(alike)}" if alike else ""
+    similar, differing = violation.alike, violation.differing
+    text = f", and so may {_listed_names(similar)}" if similar else ""
     for steps in differing:
         text += f"; {steps[0].use.enclave} may {' and '.join(step.action_text() for step in steps)}"
-    more = len(violation.witness.others) - len(alike) - len(differing)
+    more = len(violation.witness.others) - len(similar) - len(differing)
     return text + (f"; {more} more break it in their own ways" if more else "")
 
 

@@ -315,14 +315,14 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     unknown = "only some enclaves are compared" if partial else ""
     if None in sides:
         unknown = f"there are more than {_MOST_HOPS:,} hops between enclaves"
-    more = dict.fromkeys(_lost_protection(head, base, limit, rules=False))
+    lost_protection = dict.fromkeys(_lost_protection(head, base, limit, rules=False))
     return Growth(
         added,
         tuple(_gains(after, before, worlds, scope, limit)),
         tuple(islice(_new_reach(*sides), _MOST_REACH)),
         unknown,
         lost,
-        tuple(replace(change, effect=Effect.TIGHTER) for change in more),
+        tuple(replace(change, effect=Effect.TIGHTER) for change in lost_protection),
         tuple(world.title for world in worlds),
         tuple(sorted({domain for world in worlds for domain in world.domains})),
         tuple(_assumptions(base, head)),
@@ -346,8 +346,8 @@ def _lost_protection(
 
 def _not_compared_clauses(base: AccessSource, head: AccessSource) -> Iterator[str]:
     """Yield clauses on parts of HEAD that could not be compared."""
-    if found := contradiction(head):
-        yield f"the protection of HEAD: {found}"
+    if fault := contradiction(head):
+        yield f"the protection of HEAD: {fault}"
     yield from unknown_settings(base.zenoh_files, head.zenoh_files)
     if "zenoh" in (base.kind, head.kind):
         return
@@ -522,13 +522,15 @@ def _access_on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
             return stated[id(side)](enclave, domain)
         if enclave in side.routers:
             return _NO_ACCESS
-        found = enforced_access(side.enforcers, enclave, domain)
+        access_granted = enforced_access(side.enforcers, enclave, domain)
 
         def decide(verb: AccessVerb, topic: str) -> bool:
             writes = verb is AccessVerb.PUBLISH
             return is_enforced(side.enforcers, enclave, domain, topic, writes=writes)
 
-        writes, reads = (name_set & ROS_TOPICS for name_set in (found.writes, found.reads))
+        writes, reads = (
+            name_set & ROS_TOPICS for name_set in (access_granted.writes, access_granted.reads)
+        )
         topics = {AccessVerb.PUBLISH: writes, AccessVerb.SUBSCRIBE: reads}
         joins = any(enclave in enforcer.names() for enforcer in side.enforcers)
         return _Access(topics, decide, joins=joins)
@@ -572,14 +574,14 @@ def _access_by_rights(
         )
 
         def decide(verb: AccessVerb, topic: str) -> bool:
-            def union_of_names(some: Iterable[str]) -> bool:
-                return any(matches(Style.FNMATCH, pattern, topic) for pattern in some)
+            def union_of_names(patterns: Iterable[str]) -> bool:
+                return any(matches(Style.FNMATCH, pattern, topic) for pattern in patterns)
 
             return union_of_names(allowed[verb]) and not union_of_names(denied[verb])
 
         def topics(verb: AccessVerb) -> NameSet:
-            given = names_of(Style.FNMATCH, allowed[verb]) - names_of(Style.FNMATCH, denied[verb])
-            return given & ROS_TOPICS
+            granted = names_of(Style.FNMATCH, allowed[verb]) - names_of(Style.FNMATCH, denied[verb])
+            return granted & ROS_TOPICS
 
         return _Access({verb: topics(verb) for verb in _VERBS}, decide, joins=bool(own))
 
@@ -624,8 +626,8 @@ def _gains(
             domains=tuple(sorted(domains)),
         )
         # What the governance gives, it gives to many.
-        alike = one if one.right else replace(one, enclaves=())
-        together.setdefault(alike, []).extend(gain.enclaves)
+        gain_without_enclaves = one if one.right else replace(one, enclaves=())
+        together.setdefault(gain_without_enclaves, []).extend(gain.enclaves)
     for gain, enclaves in together.items():
         yield replace(gain, enclaves=tuple(dict.fromkeys(enclaves)))
 
@@ -646,10 +648,10 @@ def _each_gain(
                 continue
             for domain in world.domains:
                 before, after = (world.access(side, enclave, domain) for side in (old, new))
-                more = {verb: after.topics[verb] - before.topics[verb] for verb in _VERBS}
+                gained_topics = {verb: after.topics[verb] - before.topics[verb] for verb in _VERBS}
                 gained = False
                 for gain in _added_gains(
-                    stated, enclave, more, (before, after), world, domain, limit
+                    stated, enclave, gained_topics, (before, after), world, domain, limit
                 ):
                     gained = True
                     yield gain
@@ -671,10 +673,10 @@ def _added_gains(
     """Yield a gain for ``topics``, which an enclave may use only after a change."""
     before, after = sides
     for verb in _VERBS:
-        more = topics[verb]
+        gained_topics = topics[verb]
         if not before.joins:
-            more -= NameSet((ROS_DISCOVERY_TOPIC,))  # every participant has it
-        for gain in stated_rights.gains(enclave, verb, more, world, domain, limit):
+            gained_topics -= NameSet((ROS_DISCOVERY_TOPIC,))  # every participant has it
+        for gain in stated_rights.gains(enclave, verb, gained_topics, world, domain, limit):
             if not after.decide(verb, gain.topic) or before.decide(verb, gain.topic):
                 raise AssertionError(f"{gain} is not what {world.title} decides")
             yield gain
@@ -726,8 +728,8 @@ class AccessByVendors:
                 for name in (*names, ROS_DISCOVERY_TOPIC)
                 if sides[1].decide(verb, name) and not sides[0].decide(verb, name)
             )
-            every = NameSet() if old == new else (new - old) & ROS_TOPICS
-            topics[verb] = every | NameSet(exact)
+            gained = NameSet() if old == new else (new - old) & ROS_TOPICS
+            topics[verb] = gained | NameSet(exact)
         yield from _added_gains(self._stated, enclave, topics, sides, world, domain, SearchLimit())
 
 
@@ -1018,22 +1020,22 @@ def _edges(side: AccessSource, fitting_pairs: Iterable[tuple[str, str]]) -> _Edg
         names_by_holder[holder].append(name)
     usable = {}
     left = _MOST_HOPS
-    for domains, some in rights_grouped_by_domains(
+    for domains, group in rights_grouped_by_domains(
         rights, side.permissions, side.key_domains
     ).items():
         left -= sum(
             len(names_by_holder[right.enclave])
-            for right in some
+            for right in group
             if right.enclave in names_by_holder
         )
         if left < 0:
             return None
-        more = (
+        more_rights = (
             right._replace(enclave=name)
-            for right in some
+            for right in group
             for name in names_by_holder.get(right.enclave, ())
         )
-        usable[domains] = some.union(more)
+        usable[domains] = group.union(more_rights)
     network = Network(
         usable,
         excluded=OF_EVERY_NODE,
@@ -1059,11 +1061,11 @@ def _reached_with_hops(edges: _Edges, start: str) -> dict[str, Hop]:
     """Return the enclaves that can be reached from ``start``, each with the last hop to it."""
     reached: dict[str, Hop] = {}
     row = [start]
-    for here in row:
-        for there, hop in edges.get(here, {}).items():
-            if there not in reached and there != start:
-                reached[there] = hop
-                row.append(there)
+    for enclave_here in row:
+        for neighbour, hop in edges.get(enclave_here, {}).items():
+            if neighbour not in reached and neighbour != start:
+                reached[neighbour] = hop
+                row.append(neighbour)
     return reached
 
 
@@ -1107,7 +1109,7 @@ def _certified_as(side: AccessSource, other: AccessSource) -> Mapping[str, Permi
     if side.kind != "policy" or other.kind == "policy":
         return side.permissions
     unique = other.later is not None and other.later.unique_subject
-    found = {}
+    certified = {}
     for name, permissions in side.permissions.items():
         subject = other.subject_of(name)
         if not subject and unique:
@@ -1115,8 +1117,8 @@ def _certified_as(side: AccessSource, other: AccessSource) -> Mapping[str, Permi
         grants = permissions.grants
         if subject:
             grants = tuple(grant._replace(subject=subject) for grant in grants)
-        found[name] = Permissions(grants)
-    return found
+        certified[name] = Permissions(grants)
+    return certified
 
 
 def _domains_of_robots(side: AccessSource, other: AccessSource) -> dict[str, int]:

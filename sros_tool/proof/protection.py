@@ -57,11 +57,11 @@ def _demanded_governance(
     If it states both levels for a name, the stronger level counts.
     """
     (rule,) = governance_for(strict_protection(), domains).domain_access_rules
-    (every,) = rule.topic_access_rules
+    (rule_for_all,) = rule.topic_access_rules
     kinds = {Level.SIGN: ProtectionKind.NONE, Level.ENCRYPT: ProtectionKind.ENCRYPT}
     topics = {
         (right.level, topic): replace(
-            every,
+            rule_for_all,
             topic_expression=topic,
             metadata_protection_kind=ProtectionKind.NONE,
             data_protection_kind=kinds[right.level],
@@ -71,7 +71,7 @@ def _demanded_governance(
         if right.level is level
         for topic in protected_topics(right.kind, right.name)
     }
-    return Governance((replace(rule, topic_access_rules=(*topics.values(), every)),))
+    return Governance((replace(rule, topic_access_rules=(*topics.values(), rule_for_all)),))
 
 
 def _payload_governance(governance: Governance) -> Governance:
@@ -84,8 +84,8 @@ def _payload_governance(governance: Governance) -> Governance:
             domain.rtps_protection_kind,
         )
         names = [kind.value.partition("_")[0] for kind in kinds]
-        found = max(names, key=("NONE", "SIGN", "ENCRYPT").index)
-        return replace(topic, data_protection_kind=ProtectionKind(found))
+        strongest = max(names, key=("NONE", "SIGN", "ENCRYPT").index)
+        return replace(topic, data_protection_kind=ProtectionKind(strongest))
 
     return Governance(
         tuple(
@@ -189,11 +189,11 @@ def _certified_otherwise(old: AccessSource, new: AccessSource) -> Iterator[Setti
         before = names.get(new_one.key, enclave)
         old_one = old.certified.get(enclave)
         if new_one.name not in (before, old_one.name if old_one else enclave):
-            what, text = (
+            document, text = (
                 f"certificate of {enclave}",
                 "anyone who has its key can act as that enclave",
             )
-            yield SettingChange(Effect.LOOSER, what, before, new_one.name, text)
+            yield SettingChange(Effect.LOOSER, document, before, new_one.name, text)
 
 
 def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
@@ -201,7 +201,7 @@ def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChan
     if old.trusts is None or new.trusts is None:
         return
     all_revoked = frozenset(entry for trust in old.trusts.values() for entry in trust.revoked)
-    again: dict[int, list[str]] = defaultdict(list)
+    trusted_serials: dict[int, list[str]] = defaultdict(list)
 
     @lru_cache(maxsize=8)  # most enclaves have the same lists
     def lost_revocations(before: frozenset[tuple[str, int]], after: Trust) -> list[int]:
@@ -212,9 +212,9 @@ def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChan
         if old.scope is None or new.scope is not None or name in old.scope:
             before = old.trusts[name].revoked if name in old.trusts else all_revoked
             for serial in lost_revocations(before, new.trusts[name]):
-                again[serial].append(name)
-    for serial in sorted(again)[:_MOST_SERIALS]:
-        names = [enclave for enclave in again[serial] if enclave != KEYSTORE_ITSELF] or [
+                trusted_serials[serial].append(name)
+    for serial in sorted(trusted_serials)[:_MOST_SERIALS]:
+        names = [enclave for enclave in trusted_serials[serial] if enclave != KEYSTORE_ITSELF] or [
             KEYSTORE_ITSELF
         ]
         who = (
@@ -222,7 +222,7 @@ def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChan
         )
         text = f"{who} anyone who has its key"
         yield SettingChange(Effect.LOOSER, f"certificate {serial:x}", "revoked", "trusted", text)
-    if (more := len(again) - _MOST_SERIALS) > 0:
+    if (more := len(trusted_serials) - _MOST_SERIALS) > 0:
         text = "enclaves again trust anyone who has their keys"
         yield SettingChange(Effect.LOOSER, f"{more} certificates more", "revoked", "trusted", text)
 
@@ -257,14 +257,14 @@ def _looser_topics(
                 for change in attribute_changes(before, after, "protection", "{}")
                 if change.effect is Effect.LOOSER
             ]
-            both = had & has
+            unchanged = had & has
             if not changes:
                 continue
-            topic = both.example(limit)
+            topic = unchanged.example(limit)
             if topic is None:
                 continue
             if topic not in ROS_TOPICS:
-                topic = (both & ROS_TOPICS).example(limit) or topic
+                topic = (unchanged & ROS_TOPICS).example(limit) or topic
             for change in changes:
                 yield replace(change, meaning=change.meaning.replace("{}", f"DDS topic {topic}"))
 
@@ -376,18 +376,18 @@ def _moved_enclaves(
     for (one, other), enclave in places.items():
         if one == other:
             continue
-        for there, later in places:
-            if there == one:
+        for old_place, later in places:
+            if old_place == one:
                 continue
             has = () if later == other else _crossing_of_both(after, other, later)
-            if name := _newly_passing_name(_crossing_of_both(before, one, there), has, limit):
-                crossing = _text(_crossing_of_both(before, one, there))
+            if name := _newly_passing_name(_crossing_of_both(before, one, old_place), has, limit):
+                crossing = _text(_crossing_of_both(before, one, old_place))
                 yield SettingChange(
                     Effect.LOOSER,
                     f"router of {enclave}",
                     f"{one}, which passes on {crossing}",
                     other,
-                    f"{name} may pass between this enclave and enclaves that were at {there}",
+                    f"{name} may pass between this enclave and enclaves that were at {old_place}",
                 )
                 break
 

@@ -103,10 +103,10 @@ class Repository:
         """
         if not _HASH.match(name) and not name.startswith("refs/"):
             candidates = self._references(name)
-            there = f" There is {_candidates_text(candidates)}." if candidates else ""
+            suggestion = f" There is {_candidates_text(candidates)}." if candidates else ""
             raise UsageError(
                 f"'{name}' is neither the full id of a commit nor a full reference",
-                f"A tag or branch of that name could stand for another commit.{there}",
+                f"A tag or branch of that name could stand for another commit.{suggestion}",
                 "Write the 40 digits of the commit, or a name such as refs/remotes/origin/main.",
             )
         digits = name if _HASH.match(name) else self._target(name)
@@ -129,9 +129,9 @@ class Repository:
             raise _unknown_revision_error(name)
         base, rest = expression["name"], expression["rest"]
         if _HASH.match(base):
-            found = base
+            commit_hash = base
         elif base in ("HEAD", "@"):
-            base, found = "HEAD", self._ask("rev-parse", "--verify", "--quiet", "HEAD")
+            base, commit_hash = "HEAD", self._ask("rev-parse", "--verify", "--quiet", "HEAD")
         else:
             candidates = self._candidates(base)
             if len(candidates) > 1:
@@ -140,14 +140,14 @@ class Repository:
                     f"It is {_candidates_text(candidates)}.",
                     "Write the full name, such as refs/remotes/origin/main.",
                 )
-            base, found = next(iter(candidates.items()), (base, ""))
-        if found and rest:
-            start = base if rest.startswith("@") else found
+            base, commit_hash = next(iter(candidates.items()), (base, ""))
+        if commit_hash and rest:
+            start = base if rest.startswith("@") else commit_hash
             words = ("--verify", "--quiet", "--end-of-options", f"{start}{rest}^{{commit}}")
-            found = self._ask("rev-parse", *words)
-        if not found:
+            commit_hash = self._ask("rev-parse", *words)
+        if not commit_hash:
             raise _unknown_revision_error(name)
-        return self._commit_id(found, name)
+        return self._commit_id(commit_hash, name)
 
     def _candidates(self, name: str) -> dict[str, str]:
         """Return the ids of all references that a short name can stand for, by reference.
@@ -156,8 +156,8 @@ class Repository:
             DocumentError: the name looks like a branch of a remote, but is a local tag or branch.
         """
         if name.startswith("refs/"):
-            found = self._target(name)
-            return {name: found} if found else {}
+            target = self._target(name)
+            return {name: target} if target else {}
         candidates = self._references(name)
         remote, slash, _ = name.partition("/")
         if slash and remote in self._ask("remote").split():
@@ -573,8 +573,8 @@ def walk(
         ids = [object_id for _, *pair in level for object_id in pair if object_id]
         folders = repository.folders(ids)
         below = []
-        for path, here, there in level:
-            before = folders[there] if there else {}
+        for path, here, other_tree in level:
+            before = folders[other_tree] if other_tree else {}
             for name, entry in folders[here].items():
                 count += 1
                 if count > maximum:
@@ -622,10 +622,10 @@ def _split_at_blank(line: str) -> tuple[str, str, str]:
 
 
 def _digest(kind: str, content: bytes, digits: int) -> str:
-    whole = b"%s %d\0%s" % (kind.encode(), len(content), content)
+    git_object = b"%s %d\0%s" % (kind.encode(), len(content), content)
     if digits == 40:
-        return hashlib.sha1(whole, usedforsecurity=False).hexdigest()
-    return hashlib.sha256(whole).hexdigest()
+        return hashlib.sha1(git_object, usedforsecurity=False).hexdigest()
+    return hashlib.sha256(git_object).hexdigest()
 
 
 def _header(content: bytes, key: bytes) -> str:
@@ -635,10 +635,10 @@ def _header(content: bytes, key: bytes) -> str:
         DocumentError: the object is malformed.
     """
     first, _, digits = content.partition(b"\n")[0].partition(b" ")
-    found = digits.decode(errors="replace")
-    if first != key or not _HASH.match(found):
+    object_hash = digits.decode(errors="replace")
+    if first != key or not _HASH.match(object_hash):
         raise DocumentError("an object of the repository is malformed")
-    return found
+    return object_hash
 
 
 def _entries(data: bytes, id_length: int) -> dict[str, TreeEntry]:

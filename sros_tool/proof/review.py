@@ -318,13 +318,13 @@ class _Review:
     def all(self) -> Iterator[ReviewStep]:
         asked = self.request
         if asked.base == asked.head:
-            same = DocumentError(
+            same_commits = DocumentError(
                 "both commits are the same, so that nothing would be compared",
                 "",
                 "Check out the commit of the change (GitHub's pull_request_target does not), or "
                 "ask for no comparison: --base none.",
             )
-            yield ReviewStep("files", "", _UNDECIDED, same)
+            yield ReviewStep("files", "", _UNDECIDED, same_commits)
         head_fleet = yield from self._fleet(self.head)
         base_fleet = yield from self._fleet(self.base)
         of_head = yield from self._policies(self.head, head_fleet)
@@ -497,8 +497,10 @@ class _Review:
             before, after = (read_connections(e.folder / file) for e in (self.base, self.head))
             for where in sorted({*before, *after}, key=_decisive_first):
                 if before.get(where) != (value := after.get(where)):
-                    said = "is gone, which" if value is None else f"is {value}, which"
-                    lines.append((f"{said} can change which keys Ansible delivers, and how", where))
+                    change = "is gone, which" if value is None else f"is {value}, which"
+                    lines.append(
+                        (f"{change} can change which keys Ansible delivers, and how", where)
+                    )
         return (_FOUND, Facts(tuple(lines))) if lines else None
 
     def _unreviewed_step(
@@ -528,8 +530,8 @@ class _Review:
         for path, entry in changed:
             if sizes.get(entry.id, 0) > _MOST_OUTSIDE and entry.mode in FILES:
                 lines.append(("changes and is too large to be reviewed", path))
-            if said := self._hidden_entry_clause(path, entry):
-                lines.append((f"changes and is not reviewed: it is {said}", path))
+            if clause := self._hidden_entry_clause(path, entry):
+                lines.append((f"changes and is not reviewed: it is {clause}", path))
                 status = _FOUND
         gone = [
             (path, entry)
@@ -612,19 +614,19 @@ class _Review:
         contents: dict[str, bytes] = {}
         for part in repository.contents_in_parts(ids.values(), _MOST_BYTES):
             contents |= {digits: data for digits, data in part.items() if includes_files(data)}
-        there = {
+        contents_by_path = {
             path: contents[object_id] for path, object_id in ids.items() if object_id in contents
         }
-        users = users_of(parts, there)
-        return sorted(e for e in users if e not in files and is_whole_policy(there[e]))
+        users = users_of(parts, contents_by_path)
+        return sorted(e for e in users if e not in files and is_whole_policy(contents_by_path[e]))
 
     def _hidden_entry_clause(self, path: str, entry: TreeEntry) -> str:
         """Return a clause on a link or submodule at a path that may hide policies, or "".
 
         ``path`` is a path in HEAD.
         """
-        apart = (*self.request.left_out, *self.request.keystores)
-        if entry.mode not in (LINK, SUBMODULE) or _is_below(path, apart):
+        reviewed_apart = (*self.request.left_out, *self.request.keystores)
+        if entry.mode not in (LINK, SUBMODULE) or _is_below(path, reviewed_apart):
             return ""
         if entry.mode == SUBMODULE:
             return entry.kind
@@ -632,8 +634,14 @@ class _Review:
         target = os.fsdecode(repository.content(entry.id))
         with suppress(SrosError):
             place = os.path.normpath(Path(path).parent / target)
-            there = None if _is_below(place, self.request.left_out) else self.head.entry(place)
-            if there and there.mode in FILES and not may_be_policy(repository.content(there.id)):
+            entry_at_place = (
+                None if _is_below(place, self.request.left_out) else self.head.entry(place)
+            )
+            if (
+                entry_at_place
+                and entry_at_place.mode in FILES
+                and not may_be_policy(repository.content(entry_at_place.id))
+            ):
                 return ""
         return f"a symbolic link to '{target[:_LONGEST]}'"
 
@@ -846,7 +854,7 @@ class _Review:
             except SrosError as error:
                 yield ReviewStep("new-access", path, _UNDECIDED, error)
         settings = f"{path}/{SETTINGS}"
-        same = before is not None and _is_same_file(self.base, self.head, settings)
+        is_same = before is not None and _is_same_file(self.base, self.head, settings)
 
         def findings() -> tuple[int, Content]:
             findings = (
@@ -855,7 +863,7 @@ class _Review:
                 if (finding.id != _FILE_MISSING or Path(finding.file).name != KEY_FILE)
                 and (not finding.file or _is_below(os.path.normpath(finding.file), (str(folder),)))
             )
-            chosen = FindingFilter(strict=bool(self.base) and not same).choose(findings)
+            chosen = FindingFilter(strict=bool(self.base) and not is_same).choose(findings)
             return _status(chosen), chosen
 
         def access() -> tuple[int, Content]:
@@ -871,8 +879,10 @@ class _Review:
 
     def _expiry(self, settings_folder: Path, folder: Path) -> tuple[int, Content]:
         settings = Keystore(settings_folder).template
-        found = due_enclaves(Keystore(folder), self.request.renew_within, self.request.at, settings)
-        return _UNDECIDED if found.unreadable else _FOUND if found.due else _OK, found
+        expiring = due_enclaves(
+            Keystore(folder), self.request.renew_within, self.request.at, settings
+        )
+        return _UNDECIDED if expiring.unreadable else _FOUND if expiring.due else _OK, expiring
 
 
 def _decisive_first(where: str) -> tuple[bool, str]:
@@ -936,8 +946,8 @@ def _moved_rights(enclave: Enclave) -> Iterator[tuple[PlacedRight, Right]]:
         return replace(profile, ns=f"{_SOMEWHERE}{profile.ns}".rstrip("/"))
 
     moved = placed_rights(enclave.with_profiles(elsewhere))
-    for placed, there in zip(placed_rights(enclave), moved, strict=True):
-        yield placed, there.right
+    for placed, moved_right in zip(placed_rights(enclave), moved, strict=True):
+        yield placed, moved_right.right
 
 
 def _status(chosen_findings: ChosenFindings) -> int:

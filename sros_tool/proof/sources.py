@@ -440,42 +440,42 @@ def _trusts(
         revoked = set()
         lists: dict[str, bytes] = {}
         for data in dict.fromkeys(([] if own is None else [own]) + embedded_lists(pem)):
-            found = load_crl(data, CRL_FILE)
-            key = next((key for certificate, key in keys if signed_by(found.list, certificate)), "")
-            if refusal := refusal_of(found.list) or ("" if key else "another CA signed it"):
+            crl = load_crl(data, CRL_FILE)
+            key = next((key for certificate, key in keys if signed_by(crl.list, certificate)), "")
+            if refusal := refusal_of(crl.list) or ("" if key else "another CA signed it"):
                 raise DocumentError(
                     f"its revocation list makes DDS refuse every enclave: {refusal}"
                 )
-            if len(found.revoked) < len(found.list) or names_issuers(found.list):
+            if len(crl.revoked) < len(crl.list) or names_issuers(crl.list):
                 raise DocumentError(
                     "its revocation list has entries that perhaps revoke no certificate"
                 )
-            if lists.setdefault(key, found.list.signature) != found.list.signature:
+            if lists.setdefault(key, crl.list.signature) != crl.list.signature:
                 raise DocumentError(
                     "it has several revocation lists of one CA, and DDS uses only one"
                 )
-            signed = iso(found.this_update)
+            signed = iso(crl.this_update)
             revoked |= {
                 (key, entry.serial)
-                for entry in found.revoked
+                for entry in crl.revoked
                 if expiries.get(entry.serial, signed) >= signed
             }
         return Trust(frozenset(key for _, key in keys), frozenset(revoked))
 
-    found = {}
+    trusts = {}
     for name, (authority, own) in files.items():
         if authority.exists():
             pem = read_bytes(authority, "certificate")
             try:
                 listed = read_bytes(own, "revocation list") if os.path.lexists(own) else None
-                found[name] = trust(pem, listed)
+                trusts[name] = trust(pem, listed)
             except SrosError as error:
                 raise DocumentError(
                     f"'{authority.parent}' cannot be compared: {error.what}",
                     "It is not certain which certificates it refuses.",
                     error.remedy,
                 ) from error
-    return found
+    return trusts
 
 
 def _governance(file: Path) -> Governance:

@@ -66,12 +66,12 @@ def _joined_requirement(requirement: Requirement, other: Requirement) -> Require
     """Return a requirement that demands the same as two, or None if they cannot be joined."""
     match requirement, other:
         case (
-            Nobody(rights=(("request", some),)),
+            Nobody(rights=(("request", holders),)),
             Nobody(rights=(("request", more),)),
-        ) if len(some) < _WIDE_LIST:
-            return replace(requirement, rights=(("request", (*some, *more)),))
-        case Protected(names=some, level=level), Protected(names=more) if other.level is level:
-            return replace(requirement, names=(*some, *more))
+        ) if len(holders) < _WIDE_LIST:
+            return replace(requirement, rights=(("request", (*holders, *more)),))
+        case Protected(names=holders, level=level), Protected(names=more) if other.level is level:
+            return replace(requirement, names=(*holders, *more))
     return None
 
 
@@ -116,8 +116,8 @@ def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
         received = name not in _OF_EVERY_NODE and (other, name) in stated_rights.users
         if len(users) <= _FEW and received:
             names[users].append(name)
-    for enclaves, found in sorted(names.items(), key=lambda item: (len(item[0]), item[0])):
-        yield Only(source=_NOWHERE, rights=((right, tuple(found)),), enclaves=enclaves)
+    for enclaves, names_held in sorted(names.items(), key=lambda item: (len(item[0]), item[0])):
+        yield Only(source=_NOWHERE, rights=((right, tuple(names_held)),), enclaves=enclaves)
 
 
 def _unused_services(stated_rights: _Stated) -> Iterator[Nobody]:
@@ -144,12 +144,12 @@ def _with_placeholders_for_robots(
 ) -> Iterator[Requirement]:
     """Yield requirements that demand the same, with placeholders for the robots of a fleet."""
     stated = tuple(requirements)
-    alike: dict[Requirement, dict[str, Requirement]] = {}
+    by_pattern: dict[Requirement, dict[str, Requirement]] = {}
     for requirement in stated:
         robot = _robot_of(requirement, fleet)
         kind = _with_robot_placeholders(requirement, robot) if robot else requirement
-        alike.setdefault(kind, {})[robot.name if robot else ""] = requirement
-    for kind, of_robots in alike.items():
+        by_pattern.setdefault(kind, {})[robot.name if robot else ""] = requirement
+    for kind, of_robots in by_pattern.items():
         if "" in of_robots:
             yield _with_lists(kind, lambda names, value: _joined_names(names, value, fleet))
         elif (group := _group_of(of_robots, fleet)) is not None:
@@ -205,15 +205,15 @@ def _with_placeholder(name: str, robot: Robot, placeholder: Placeholder) -> str:
 
 def _joined_names(names: Names, value: str, fleet: Fleet) -> Names:
     """Return names; names that exist for each robot of a group become one with a placeholder."""
-    alike: dict[str, dict[str, str]] = {}
+    names_by_pattern: dict[str, dict[str, str]] = {}
     for name in names:
         robots = _robots_in(name, fleet)
         robot = fleet.robots[robots.pop()] if len(robots) == 1 else None
         placeholder = Placeholder(value, plural=True)
         kind = _with_placeholder(name, robot, placeholder) if robot else name
-        alike.setdefault(kind, {})[robot.name if robot else ""] = name
+        names_by_pattern.setdefault(kind, {})[robot.name if robot else ""] = name
     joined: list[str] = []
-    for of_robots in alike.values():
+    for of_robots in names_by_pattern.values():
         group = None if "" in of_robots else _group_of(of_robots, fleet)
         if group is None:
             joined += of_robots.values()
@@ -301,8 +301,8 @@ def _values(requirement: Requirement) -> Iterator[tuple[str, object]]:
             yield from requirement.rights
         case Protected():
             for kind in RIGHTS:
-                if found := [name for of, name in requirement.names if of == kind]:
-                    yield kind, found
+                if names := [name for of, name in requirement.names if of == kind]:
+                    yield kind, names
             yield "level", requirement.level.value.lower()
         case Apart():
             yield "from", requirement.sources

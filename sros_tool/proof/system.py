@@ -267,18 +267,18 @@ def _dds_world(
             for possible_access in access.get(enclave, ())
         )
 
-    def topics(some: Sequence[Access]) -> TopicAccess:
-        every = [dds_access(possible_access) for possible_access in some]
-        if len(every) == 1:
-            return every[0]
-        writes, reads = ([getattr(e, side) for e in every] for side in ("writes", "reads"))
+    def topics(accesses: Sequence[Access]) -> TopicAccess:
+        topic_accesses = [dds_access(possible_access) for possible_access in accesses]
+        if len(topic_accesses) == 1:
+            return topic_accesses[0]
+        writes, reads = ([getattr(e, side) for e in topic_accesses] for side in ("writes", "reads"))
         return TopicAccess(NameSet.union(writes), NameSet.union(reads))
 
-    every = [possible_access for accesses in access.values() for possible_access in accesses]
-    weak = _weaker_topics(every)
+    all_accesses = [possible_access for accesses in access.values() for possible_access in accesses]
+    weak = _weaker_topics(all_accesses)
     opened = [
         names
-        for possible_access in every
+        for possible_access in all_accesses
         if (names := possible_access.topics_of_unauthenticated()) is not None
     ]
     if demanded is not None:
@@ -571,12 +571,12 @@ def _zenoh_world(
     def confirm(enclave: str, writes: bool, topic: str) -> bool:
         return is_enforced(enforcers, enclave, domain, topic, writes=writes)
 
-    nothing = TopicAccess(NameSet(), NameSet())
+    no_topics = TopicAccess(NameSet(), NameSet())
     return World(
         title,
         {name: enforced_access(enforcers, name, domain) for name in names},
         confirm=confirm,
-        stated_access={name: stated_access.get(name, nothing) for name in names},
+        stated_access={name: stated_access.get(name, no_topics) for name in names},
         crossing=crossing,
     )
 

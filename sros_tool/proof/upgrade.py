@@ -235,8 +235,8 @@ def check_upgrade(
         if not files.keystore:
             findings += _rights_needed_after(path, circumstances, before, later)
     compared = {name for enclaves in by_distribution.values() for name in enclaves}
-    found = with_joined_findings(list(dict.fromkeys(findings)))
-    return UpgradeFindings(found, len(compared), len(files.enclaves))
+    joined_findings = with_joined_findings(list(dict.fromkeys(findings)))
+    return UpgradeFindings(joined_findings, len(compared), len(files.enclaves))
 
 
 def _present_distributions(
@@ -256,9 +256,9 @@ def _present_distributions(
             if distribution and distribution != later:
                 by_distribution.setdefault(distribution, []).append(name)
     if unknown or (files.enclaves and not by_distribution):
-        what = first_few(unknown, _SHOWN) if by_distribution else f"'{files.file}'"
+        source = first_few(unknown, _SHOWN) if by_distribution else f"'{files.file}'"
         raise UsageError(
-            f"it is not known from which distribution {what} is updated to {later.title}",
+            f"it is not known from which distribution {source} is updated to {later.title}",
             "Neither --distro, nor $ROS_DISTRO, nor the keystore names another distribution.",
             "Name the current distribution, for example with --distro jazzy.",
         )
@@ -312,12 +312,12 @@ def _vulnerabilities(
         )
         unclear = {advisory.id for advisory in known[1].unclear} if known[1] else set()
         parts = [f"{len(old & new)} stay"] if old & new else []
-        for ids, what in (
+        for ids, verb in (
             (old - new - unclear, "fixed"),
             (old & unclear, f"not known for {releases[1].latest}"),
             (new - old, "new"),
         ):
-            parts += [f"{what}: {', '.join(sorted(ids))}"] if ids else []
+            parts += [f"{verb}: {', '.join(sorted(ids))}"] if ids else []
         if old != new:
             title = f"{releases[0].product} {releases[0].latest} to {releases[1].latest}"
             yield VULNERABILITIES.found(title, "; ".join(parts))
@@ -517,8 +517,8 @@ def _refusal(
 def _untested_notes(before: Shipped, after: Shipped) -> Iterator[Finding]:
     for shipped in dict.fromkeys((before, after)):
         if not shipped.tested:
-            same = before.vendor is after.vendor
-            blind = ", so sros sees no difference between the two releases" if same else ""
+            same_vendor = before.vendor is after.vendor
+            blind = ", so sros sees no difference between the two releases" if same_vendor else ""
             text = f"{shipped}{blind}"
             yield NOT_MEASURED.found(f"ROS 2 {shipped.distribution.title}", text)
 

@@ -161,11 +161,13 @@ class Side:
                     stated.setdefault(enclave, []).append(topic)
         own = _wild(topics.expression)
         if own is None:
-            alike = [automaton for automaton in self._wild if automaton.matches(topics.expression)]
+            matching = [
+                automaton for automaton in self._wild if automaton.matches(topics.expression)
+            ]
         else:
             limit.spend(len(self._wild) // _OF_A_STEP)
-            alike = [automaton for automaton in self._wild if automaton.may_meet(own)]
-        wild = {enclave for automaton in alike for enclave in self._wild[automaton]}.union(
+            matching = [automaton for automaton in self._wild if automaton.may_meet(own)]
+        wild = {enclave for automaton in matching for enclave in self._wild[automaton]}.union(
             self._any
         )
         return [
@@ -341,14 +343,14 @@ class World:
         self._written: dict[str, Written] = {}
 
     def _with_fitting(self, name: str, access: Mapping[str, TopicAccess]) -> TopicAccess:
-        every = [
+        accesses = [
             access[holder]
             for holder in (name, *self.fitting_others.get(name, ()))
             if holder in access
         ]
-        if len(every) == 1:
-            return every[0]
-        writes, reads = ([e.writes for e in every], [e.reads for e in every])
+        if len(accesses) == 1:
+            return accesses[0]
+        writes, reads = ([e.writes for e in accesses], [e.reads for e in accesses])
         return TopicAccess(NameSet.union(writes), NameSet.union(reads))
 
     def confirm(self, enclave: str, writes: bool, topic: str) -> bool:
@@ -467,15 +469,15 @@ class World:
         ``written`` has to depend on the writer only.
         """
         if (writer, reader) not in self._shared:
-            both = written & self._readers.of.get(reader, NameSet())
+            shared = written & self._readers.of.get(reader, NameSet())
             crossing = self.topics_between(writer, reader)
-            both = both if crossing is None else both & crossing
-            valid = (both & names for names in _VALID)
+            shared = shared if crossing is None else shared & crossing
+            valid = (shared & names for names in _VALID)
             example = next(
                 filter(None, (name_set.example(limit, longest=self.longest) for name_set in valid)),
                 None,
             )
-            self._shared[writer, reader] = example or both.example(limit, longest=self.longest)
+            self._shared[writer, reader] = example or shared.example(limit, longest=self.longest)
         return self._shared[writer, reader]
 
     def weakly_protected(self, level: Level) -> NameSet | None:
@@ -555,11 +557,13 @@ def enforced_access(enforcers: Iterable[Enforcement], enclave: str, domain: int)
             first &= names
         return first & names_of_expression(f"{begin}/*{_ENDS[begin]}")
 
-    every = tuple(enforcers)
+    all_enforcers = tuple(enforcers)
     return TopicAccess(
         *(
             NameSet.union(
-                topics(enforcement, writes, begin) for enforcement in every for begin in _ENDS
+                topics(enforcement, writes, begin)
+                for enforcement in all_enforcers
+                for begin in _ENDS
             )
             for writes in (True, False)
         )
@@ -594,12 +598,12 @@ def domains_of(
             for rule_id in policy.rules:
                 subjects[rule_id] += policy.subjects
         for rule in enforcer.rules:
-            what = number, frozenset(subjects[rule.id]), rule.allows, rule.flows, rule.messages
+            rule_key = number, frozenset(subjects[rule.id]), rule.allows, rule.flows, rule.messages
             for key in rule.key_expressions:
                 begin, _, rest = key.partition("/")
                 wild |= "*" in begin
                 if _DOMAIN.match(begin):
-                    rules.setdefault(int(begin), set()).add((*what, rest))
+                    rules.setdefault(int(begin), set()).add((*rule_key, rest))
     unnamed = next(domain for domain in count() if domain not in rules)
     known = {*rules, *(range(MAX_DOMAIN + 1) if others else ()), *([unnamed] if wild else ())}
     kinds: dict[object, int] = {}

@@ -94,8 +94,10 @@ def focused_picture(
         left_out = f"; what passes between the {routers} Zenoh routers is not considered"
         focuses = tuple(replace(focus, sentence=f"{focus.sentence}{left_out}") for focus in focuses)
     if system.is_partial:
-        here = f"of the enclaves in {picture.title}, "
-        focuses = tuple(replace(focus, sentence=f"{here}{focus.sentence}") for focus in focuses)
+        title_clause = f"of the enclaves in {picture.title}, "
+        focuses = tuple(
+            replace(focus, sentence=f"{title_clause}{focus.sentence}") for focus in focuses
+        )
     picture = system.with_shortest_paths(replace(picture, focus=focuses))
     flow = FocusFlow.of(picture)
     edges = tuple(edge for edge in picture.edges if flow.has(edge))
@@ -231,8 +233,10 @@ class _System:
         enclaves = {enclave.path for enclave in picture.enclaves}
         in_domains: dict[DomainSet | None, list[Right]] = defaultdict(list)
         for source in sources:
-            for domains, some in (source.in_domains or {None: source.rights}).items():
-                in_domains[domains] += (right for right in some if right.enclave in enclaves)
+            for domains, rights_there in (source.in_domains or {None: source.rights}).items():
+                in_domains[domains] += (
+                    right for right in rights_there if right.enclave in enclaves
+                )
         self._rights = [right for rights in in_domains.values() for right in rights]
         self._domains = {enclave.path: enclave.domains for enclave in picture.enclaves}
         self._governance: Governance | None = next(
@@ -364,10 +368,10 @@ class _System:
         for right in self._rights:
             if right.kind == kind and matches(right.name, name):
                 by_right[right.enclave, right.right].append(right)
-        for (enclave, what), rights in by_right.items():
+        for (enclave, place), rights in by_right.items():
             qualifier = DENY if any(right.qualifier is DENY for right in rights) else ALLOW
             by = sorted({right.name for right in rights if right.qualifier is qualifier})
-            yield Edge(enclave, kind, name, what, qualifier, tuple(by))
+            yield Edge(enclave, kind, name, place, qualifier, tuple(by))
 
     def _name(self, kind: str, name: str) -> Name:
         protection = protection_of(self._governance, kind, name)
@@ -413,13 +417,13 @@ def _sentence(
     text += f"; {_enclaves_text(receivers, partial=partial)} may {receives} it"
     if open_to_all or not senders:
         return text
-    them = f"the {sender}" if len(senders) == 1 else f"these {sender}s"
+    sender_text = f"the {sender}" if len(senders) == 1 else f"these {sender}s"
     near = sum(influence.hops == 2 for influence in influencing)
     if not influencing:
-        return f"{text}; no other enclave influences {them}"
+        return f"{text}; no other enclave influences {sender_text}"
     s = "s" if len(influencing) == 1 else ""
     far = " directly" if near == len(influencing) else f", {near} of them directly"
-    return f"{text}; {counted(len(influencing), 'other enclave')} influence{s} {them}{far}"
+    return f"{text}; {counted(len(influencing), 'other enclave')} influence{s} {sender_text}{far}"
 
 
 def _counted_influences(influences: Sequence[Influence], direct: int) -> str:
@@ -529,8 +533,8 @@ class _Draft:
                 for path in paths:
                     node = path
                     if len(paths) > _MOST_ENCLAVES:
-                        whole = len(groups) > _MOST_ENCLAVES
-                        node = f":{hop}" if whole else f":{hop} {self._groups[path]}"
+                        is_folded = len(groups) > _MOST_ENCLAVES
+                        node = f":{hop}" if is_folded else f":{hop} {self._groups[path]}"
                     nodes[before, path] = node
         return nodes
 
@@ -546,8 +550,8 @@ class _Draft:
             for n, drawn in enumerate(edges)
         ]
         used = [{(edge.kind, edge.name) for edge in side} for side in sides]
-        both = used[0] | used[1] if stage == 0 else used[0] & used[1]
-        kept = [edge for side in sides for edge in side if (edge.kind, edge.name) in both]
+        on_stage = used[0] | used[1] if stage == 0 else used[0] & used[1]
+        kept = [edge for side in sides for edge in side if (edge.kind, edge.name) in on_stage]
         bundles: Iterable[Bundle] = fold(self._picture.names, kept)
         bundles = joined_by_senders(bundles) if len(tuple(bundles)) > _MOST_BUNDLES else bundles
         middle = self._first + 2 * self._left - 1

@@ -377,9 +377,9 @@ class _Draft:
                 before[unit] = number
         classes = _classes(self._parts_by_unit(), before)
         return {
-            number: sorted(found, key=self._unit_name_order)
-            for number, found in classes.items()
-            if len(found) > 1
+            number: sorted(class_units, key=self._unit_name_order)
+            for number, class_units in classes.items()
+            if len(class_units) > 1
         }
 
     def _unit_name_order(self, unit: int) -> tuple[object, ...]:
@@ -408,8 +408,8 @@ class _Draft:
         """Return how many other units of its family have rights to names of each unit."""
         pairs = {
             (unit, owner)
-            for _kind, units, what in self._seen
-            if isinstance(what, Edge) and (owner := self._of.get(what.enclave)) is not None
+            for _kind, units, symbol in self._seen
+            if isinstance(symbol, Edge) and (owner := self._of.get(symbol.enclave)) is not None
             for unit in units
             if unit != owner
             and self._units[unit].family == self._units[owner].family
@@ -567,8 +567,8 @@ class _Draft:
     def _folded_names(self, edges: Sequence[Edge]) -> Iterator[Name]:
         for kind, shown in sorted({(edge.kind, edge.name) for edge in edges}):
             real = self._names.get((kind, shown), (shown,))[0]
-            if found := self._names_of.get((kind, real)):
-                yield replace(found, name=shown, namespace=namespace_of(shown))
+            if use := self._names_of.get((kind, real)):
+                yield replace(use, name=shown, namespace=namespace_of(shown))
 
     def _folded_enclaves(self, differing_parts: Set[Edge | str]) -> Iterator[PicturedEnclave]:
         differing = {part if isinstance(part, str) else part.enclave for part in differing_parts}
@@ -619,16 +619,16 @@ class _Draft:
             and self._inside.get(n) != self._inside[usual]
         }
         seen: dict[int, dict[object, Edge | str]] = {n: {} for n in (*near.keys(), *near.values())}
-        for kind, units, what in self._seen:
+        for kind, units, symbol in self._seen:
             for unit in seen.keys() & set(units):
-                seen[unit].setdefault((kind, self._symbols_around(units, unit)), what)
+                seen[unit].setdefault((kind, self._symbols_around(units, unit)), symbol)
         different: list[DifferentUnit] = []
         differing_parts: set[Edge | str] = set()
         for n in sorted(near, key=self._unit_name_order):
             own, other = seen[n], seen[near[n]]
             if _are_alike(own, other):
-                more = [what for key, what in own.items() if key not in other]
-                fewer = [what for key, what in other.items() if key not in own]
+                more = [symbol for key, symbol in own.items() if key not in other]
+                fewer = [symbol for key, symbol in other.items() if key not in own]
                 differing_parts.update(more)
                 only = dict.fromkeys(self._in_words(more, n))
                 missing = dict.fromkeys(self._in_words(fewer, n, near[n]))
@@ -647,12 +647,12 @@ class _Draft:
         return {unit for name in names for unit in self._text(name).units}
 
     def _in_words(
-        self, drawn: Sequence[Edge | str], unit: int, instead: int | None = None
+        self, drawn: Sequence[Edge | str], unit: int, replaced: int | None = None
     ) -> Iterator[str]:
-        """Yield enclaves and rights in words; the name of ``unit`` replaces that of ``instead``."""
+        """Yield enclaves and rights in words, with ``unit`` named instead of ``replaced``."""
 
         def word(named: int, position: int) -> str:
-            return self._label(unit if named == instead else named, position)
+            return self._label(unit if named == replaced else named, position)
 
         enclaves = {drawn_part for drawn_part in drawn if isinstance(drawn_part, str)}
         for drawn_part in drawn:
@@ -730,8 +730,8 @@ def _guessed_units(paths: Iterable[str]) -> Iterator[DrawnUnit]:
             family += 1
             for name, below in sorted(children.items()):
                 if 2 * len(usual & below.keys()) >= max(len(usual), len(below)):
-                    what = _ENCLAVE if below.keys() == {""} else "namespace"
-                    yield DrawnUnit(name, what, family, tuple(sorted(below.values())), (name,))
+                    kind = _ENCLAVE if below.keys() == {""} else "namespace"
+                    yield DrawnUnit(name, kind, family, tuple(sorted(below.values())), (name,))
                     del children[name]
         waiting += [
             _group_by_first_part((rest, path) for rest, path in below.items() if rest)

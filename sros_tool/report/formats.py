@@ -314,16 +314,16 @@ _MOST_LABELS = 8
 
 def _row(rows: Iterable[tuple[str, str]]) -> str:
     """Return one row of the legend as SVG, from pairs of symbol (SVG) and text."""
-    x, found = 0, []
+    x, cells = 0, []
     for drawn, text in rows:
         room = 68 if "M20 -4h40" in drawn else (48 if "h40" in drawn else (20 if drawn else 0))
         room = 42 if "<rect" in drawn else room
-        found.append(
+        cells.append(
             f'<g transform="translate({x} 0)">{drawn}'
             f'<text class="small" x="{room}" y="0">{escape(text)}</text></g>'
         )
         x += room + round(6.2 * len(text)) + 26
-    return "".join(found)
+    return "".join(cells)
 
 
 _DOT_STYLES = {"encrypt": "solid", "sign": "dashed", "none": "dotted", "unknown": "solid"}

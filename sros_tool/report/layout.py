@@ -543,12 +543,12 @@ def height_of(lines: Sequence[str], notes: Sequence[str]) -> int:
 
 def _common_namespace(names: Sequence[str]) -> str:
     """Return the innermost namespace that contains all names; "" for the root."""
-    found = []
+    common_parts = []
     for parts in zip(*(name.split("/")[:-1] for name in names), strict=False):
         if len(set(parts)) > 1:
             break
-        found.append(parts[0])
-    return "/".join(found)
+        common_parts.append(parts[0])
+    return "/".join(common_parts)
 
 
 def wrapped_name(text: str, letters: int) -> tuple[str, ...]:
@@ -598,11 +598,13 @@ def linked_cards(cards: Mapping[str, Card], links: Sequence[Link]) -> tuple[Link
     """Return the links with their ends spread along the edges of the cards."""
     ports: dict[tuple[str, bool], list[tuple[float, int]]] = defaultdict(list)
     for number, link in enumerate(links):
-        for here, there, out in (
+        for source_card, target_card, out in (
             (link.source, link.target, True),
             (link.target, link.source, False),
         ):
-            ports[here, out].append((cards[there].y + cards[there].height / 2, number))
+            ports[source_card, out].append(
+                (cards[target_card].y + cards[target_card].height / 2, number)
+            )
     where: dict[tuple[int, bool], int] = {}
     for (card, out), ends in ports.items():
         box = cards[card]
@@ -710,7 +712,7 @@ def _sort_by_barycentre(
     groups: dict[str, list[float]] = {}
     for item in column:
         groups.setdefault(item.group, []).append(centre[item.id])
-    middle = {group: sum(found) / len(found) for group, found in groups.items()}
+    middle = {group: sum(positions) / len(positions) for group, positions in groups.items()}
     return sorted(
         column, key=lambda item: (middle[item.group], item.group, centre[item.id], item.id)
     )

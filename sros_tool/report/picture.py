@@ -650,13 +650,15 @@ def joined_by_senders(bundles: Iterable[Bundle]) -> tuple[Bundle, ...]:
 
     Denials and differences stay separate, because users look for them.
     """
-    alike: dict[tuple[object, ...], list[Bundle]] = defaultdict(list)
+    similar_bundles: dict[tuple[object, ...], list[Bundle]] = defaultdict(list)
     for bundle in bundles:
         plain = all(map(is_plain, bundle.ties))
         senders = frozenset((tie.node, tie.right) for tie in bundle.ties if tie.sends)
-        apart = None if plain and senders else bundle.ties
-        alike[bundle.kind, bundle.protection, senders, apart, bundle.lacks].append(bundle)
-    return tuple(_joined_bundles(bundles) for bundles in alike.values())
+        ties_if_separate = None if plain and senders else bundle.ties
+        similar_bundles[
+            bundle.kind, bundle.protection, senders, ties_if_separate, bundle.lacks
+        ].append(bundle)
+    return tuple(_joined_bundles(bundles) for bundles in similar_bundles.values())
 
 
 def _joined_bundles(bundles: Sequence[Bundle]) -> Bundle:

@@ -64,47 +64,47 @@ def sample_of(
     be told apart, or where too much is not alike.
     """
     paths = keystore.names
-    everything = SampledKeystore(keystore, paths)
+    whole_keystore = SampledKeystore(keystore, paths)
     if len(paths) <= _LARGE:
-        return everything
+        return whole_keystore
     units = units_of(paths, robots)
     names = UnitNames(units, paths)
     if any(_is_ambiguous(word, names.words) for word in names.words):
-        return everything
+        return whole_keystore
     enclaves: dict[int, list[str]] = defaultdict(list)
     for path, number in names.of.items():
         enclaves[number].append(path)
-    alike: dict[object, list[int]] = defaultdict(list)
+    equal_units: dict[object, list[int]] = defaultdict(list)
     for n in sorted(enclaves, key=lambda n: name_order(units[n].name)):
         digest = _digest_of(keystore, enclaves[n], units[n], names)
-        alike[units[n].family, digest or n].append(n)
+        equal_units[units[n].family, digest or n].append(n)
     # Equal units name the same other ones, so it is enough to look at the first.
     few = {
         n: number
-        for number, (first, *more) in enumerate(alike.values())
-        if len(more) > 1 and _named_units(keystore, enclaves[first], names) <= {first}
-        for n in (first, *more)
+        for number, (first, *further) in enumerate(equal_units.values())
+        if len(further) > 1 and _named_units(keystore, enclaves[first], names) <= {first}
+        for n in (first, *further)
     }
     others = [path for path in paths if names.of.get(path) not in few]
     if len(others) > _LARGE:
-        return everything
+        return whole_keystore
     named: dict[int, set[Right]] = defaultdict(set)
     for right in load_rights(keystore, only_enclaves=others).rights:
         of_right = {*names.text(right.name).units}
         for n in of_right & few.keys():
             if len(of_right) > 1:
-                return everything
+                return whole_keystore
             named[n].add(right._replace(name=_without_unit_names(right.name, units[n], names)))
     equal: dict[object, list[int]] = defaultdict(list)
     for n, number in few.items():
         equal[number, frozenset(named[n])].append(n)
     unread, left_out = [], set()
-    for first, *more in equal.values():
-        if rest := [n for n in more[:-1] if units[n].name not in wanted_names]:
-            members = tuple(units[n].name for n in rest)
-            number = sum(len(enclaves[n]) for n in rest)
+    for first, *further in equal.values():
+        if further_named := [n for n in further[:-1] if units[n].name not in wanted_names]:
+            members = tuple(units[n].name for n in further_named)
+            number = sum(len(enclaves[n]) for n in further_named)
             unread.append(UnreadUnits(units[first].what, members, number, units[first].name))
-            left_out |= {*rest}
+            left_out |= {*further_named}
     chosen = tuple(path for path in paths if names.of.get(path) not in left_out)
     return SampledKeystore(keystore, chosen, tuple(unread), names, frozenset(left_out))
 

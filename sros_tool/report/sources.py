@@ -257,8 +257,8 @@ def _sample(path: Path, drawing: Drawing) -> SampledKeystore | None:
                 "",
                 f"It has {first_few(sorted(known, key=name_order), 5)}." if known else "",
             )
-    whole = not drawing.sampled or drawing.focus or drawing.requirements or drawing.observed
-    if whole or len(drawing.sources) > 1:
+    draw_whole = not drawing.sampled or drawing.focus or drawing.requirements or drawing.observed
+    if draw_whole or len(drawing.sources) > 1:
         return SampledKeystore(keystore, keystore.names)
     return sample_of(keystore, robots, drawing.robots)
 
@@ -485,10 +485,10 @@ def _with_findings(
         right.enclave for right in source.rights
     }
     places = _file_names(path)
-    found = tuple(
+    attached = tuple(
         _without_paths(_attach_to_known_enclave(finding, known), places) for finding in findings
     )
-    return replace(source, findings=tuple(dict.fromkeys((*source.findings, *found))))
+    return replace(source, findings=tuple(dict.fromkeys((*source.findings, *attached))))
 
 
 def _base_name(path: Path) -> str:
@@ -637,8 +637,8 @@ def _authorities(keystore: Keystore) -> Iterator[Validity]:
         role = path.name.removesuffix("_ca.cert.pem")
         for certificate in load_certificates(keystore.read(path, "CA certificate"), "of the CA"):
             roles[certificate].append(role)
-    for certificate, found in roles.items():
-        named = [role for role in found if role != "ca"] or found
+    for certificate, certificate_roles in roles.items():
+        named = [role for role in certificate_roles if role != "ca"] or certificate_roles
         title = f"{' and '.join(dict.fromkeys(named))} CA, {authority_text(certificate)}"
         yield _certificate(certificate, "authority", title, "")
     for crl in keystore.revocation_lists:

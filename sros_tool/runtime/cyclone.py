@@ -183,8 +183,8 @@ class Participant:
             values = []
             for name in (b"__Hostname", b"__Pid"):
                 value = ctypes.c_char_p()
-                there = sample.qos and qget(sample.qos, name, ctypes.byref(value))
-                values.append(_text(value.value) if there else "")
+                is_present = sample.qos and qget(sample.qos, name, ctypes.byref(value))
+                values.append(_text(value.value) if is_present else "")
             is_here = values[0] == socket.gethostname() and values[1].isdecimal()
             return bytes(sample.key[:12]).hex(), int(values[1]) if is_here else 0
 
@@ -259,7 +259,7 @@ class Participant:
             raise self._dds_error(handle, f"cannot create a {kind} on {topic}")
         return handle
 
-    def _dds_error(self, code: int, what: str, *, secured: bool = False) -> DdsError:
+    def _dds_error(self, code: int, action: str, *, secured: bool = False) -> DdsError:
         from sros_tool.runtime.vendor_log import participant_refusal
 
         messages = self._library.log.messages()
@@ -268,8 +268,8 @@ class Participant:
             secured and bool(participant_refusal("\n".join(messages)))
         )
         if refused:
-            return SecurityRefusedError(what, reason)
-        return DdsError(what, reason, _MORE_PARTICIPANTS if "participant index" in reason else "")
+            return SecurityRefusedError(action, reason)
+        return DdsError(action, reason, _MORE_PARTICIPANTS if "participant index" in reason else "")
 
 
 _MORE_PARTICIPANTS = (

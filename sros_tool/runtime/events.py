@@ -116,9 +116,9 @@ class EventReader:
                 data = file.read()
         except FileNotFoundError:
             return []
-        whole = data[: data.rfind(b"\n") + 1]
-        self._position += len(whole)
-        return [parse_event(line, self._path) for line in whole.splitlines()]
+        whole_lines = data[: data.rfind(b"\n") + 1]
+        self._position += len(whole_lines)
+        return [parse_event(line, self._path) for line in whole_lines.splitlines()]
 
 
 def read_events(path: Path) -> list[Event]:

@@ -499,14 +499,14 @@ def installed_dds(top: Path = Path("/")) -> tuple[MappedLibrary, ...]:
 
     Environment variables are not used: in a login by ssh they do not name the folder of ROS.
     """
-    found = (
+    products = (
         (folder / name, _PRODUCTS[match[1].encode()])
         for pattern in _LIBRARY_FOLDERS
         for folder in top.glob(pattern)
         for name in _names_in(folder)
         if (match := _LIBRARY_FILE.match(name))
     )
-    files = {(file.resolve(), product) for file, product in found if file.is_file()}
+    files = {(file.resolve(), product) for file, product in products if file.is_file()}
     return tuple(
         MappedLibrary(product, _version(str(file)), str(file)) for file, product in sorted(files)
     )
@@ -637,8 +637,8 @@ def _stat(folder: int) -> _Stat:
 
 def _user(folder: int) -> int:
     """Return the effective user id of a process."""
-    found = re.search(rb"^Uid:\s+\d+\s+(\d+)", _read(folder, "status", _MOST_BYTES), re.MULTILINE)
-    return int(found[1]) if found else 0
+    match = re.search(rb"^Uid:\s+\d+\s+(\d+)", _read(folder, "status", _MOST_BYTES), re.MULTILINE)
+    return int(match[1]) if match else 0
 
 
 def _words(folder: int, name: str) -> list[str]:
@@ -744,9 +744,9 @@ class ProcessEnclave:
     @property
     def lacking(self) -> tuple[str, ...]:
         """The names of the required files that are missing."""
-        there = {file.name for file in self.files if file.changed or file.problem}
-        there |= {_KEY} if _KEY_ON_TOKEN in there else set()
-        return tuple(file for file in ENCLAVE_FILES if file not in there)
+        present_files = {file.name for file in self.files if file.changed or file.problem}
+        present_files |= {_KEY} if _KEY_ON_TOKEN in present_files else set()
+        return tuple(file for file in ENCLAVE_FILES if file not in present_files)
 
 
 class FileReader:
@@ -854,13 +854,13 @@ class ProcessRoot:
         file or folder itself.  Each part is opened in the folder before it, and the system follows
         no link, so nothing outside of the root directory is reached.
         """
-        rest = [part for part in path.split("/")[::-1] if part]
+        parts_left = [part for part in path.split("/")[::-1] if part]
         way = [("/", os.fstat(self._handle))]
         folders: list[tuple[str, int]] = []
         links = 0
         try:
-            while rest:
-                part = rest.pop()
+            while parts_left:
+                part = parts_left.pop()
                 if part == "..":
                     if folders:
                         os.close(folders.pop()[1])
@@ -884,7 +884,7 @@ class ProcessRoot:
                 if target.startswith("/"):
                     while folders:
                         os.close(folders.pop()[1])
-                rest += [part for part in target.split("/")[::-1] if part]
+                parts_left += [part for part in target.split("/")[::-1] if part]
             last = folders[-1] if folders else ("/", self._handle)
             way.append((last[0], os.fstat(last[1])))
             yield last[1], way

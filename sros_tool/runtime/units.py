@@ -110,7 +110,7 @@ def unit_instance(enclave: str) -> str:
     return enclave.strip("/").replace("/", "-") or "-"
 
 
-def _check_path(path: str, what: str, option: str = "") -> str:
+def _check_path(path: str, kind: str, option: str = "") -> str:
     """Return ``path`` if all directives of a unit read it in the same way.
 
     ``option`` is the option that names another path.
@@ -120,7 +120,7 @@ def _check_path(path: str, what: str, option: str = "") -> str:
     """
     if not _PLAIN_PATH.match(path):
         raise UsageError(
-            f"{what} {path!r} cannot be written in a unit",
+            f"{kind} {path!r} cannot be written in a unit",
             "systemd reads spaces, '%', '$', ':' and quotes in paths in several ways.",
             f"{f'With {option}, name' if option else 'Name'} an absolute path of letters, digits "
             "and /._+- only, without parts that begin with '.'.",
@@ -272,7 +272,7 @@ def job_units(
         _check_path(keystore, "the keystore"),
         _check_program(sros),
     )
-    what, words, own = {
+    description, words, own = {
         Job.RENEW: (
             f"Renew the enclaves of {root} that expire within {_RENEWED_WITHIN}",
             ("renew", root, "--all-expiring", _RENEWED_WITHIN),
@@ -317,7 +317,7 @@ def job_units(
     service = f"""\
 {_MADE}
 [Unit]
-Description={what}
+Description={description}
 Wants=time-sync.target
 After=time-sync.target
 
@@ -333,7 +333,7 @@ RestrictAddressFamilies=AF_UNIX
     timer = f"""\
 {_MADE}
 [Unit]
-Description={what}
+Description={description}
 
 [Timer]
 OnCalendar={_WHEN[job]}
@@ -381,13 +381,13 @@ def _agent(folder: str, *, user: str, sros: str, writable: Sequence[str] = ()) -
         _check_program(sros),
     )
     places = " ".join((root, *(f"-{_check_path(place, 'the inbox')}" for place in writable)))
-    what = f"Keep the enclaves in {root} up to date"
+    description = f"Keep the enclaves in {root} up to date"
     # It asks the kernel whether the clock is set; without capabilities it cannot set it anyway.
     closed = _CLOSED.replace("ProtectClock=yes\n", "")
     service = f"""\
 {_MADE}
 [Unit]
-Description={what}
+Description={description}
 Wants=network-online.target time-sync.target
 After=network-online.target time-sync.target
 
@@ -408,7 +408,7 @@ RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6
     timer = f"""\
 {_MADE}
 [Unit]
-Description={what}
+Description={description}
 
 [Timer]
 # Not by the calendar: the clock of a robot may be wrong, or jump.

@@ -113,14 +113,14 @@ def graph_rules(
             if any(map(denial.meets, left)) or not any(map(denial.meets, nodes))
         ]
     )
-    everything = f"{GRAPH}/{domain}/{ANY_CHUNKS}"
+    whole_domain = f"{GRAPH}/{domain}/{ANY_CHUNKS}"
     if allowed:
         yield AccessRule(Flow.INGRESS, _ANNOUNCING, allowed)
     if denied:
         yield AccessRule(Flow.INGRESS, _ANNOUNCING, denied, allows=False)
-    yield AccessRule(Flow.EGRESS, _ANNOUNCING, (everything,))
-    yield AccessRule(Flow.INGRESS, _ASKING, (everything,))
-    yield AccessRule(Flow.EGRESS, _ASKING, (everything,))
+    yield AccessRule(Flow.EGRESS, _ANNOUNCING, (whole_domain,))
+    yield AccessRule(Flow.INGRESS, _ASKING, (whole_domain,))
+    yield AccessRule(Flow.EGRESS, _ASKING, (whole_domain,))
 
 
 class _Tokens:

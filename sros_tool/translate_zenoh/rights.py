@@ -343,9 +343,9 @@ def _with_keys_below(names: frozenset[Chunks] | set[Chunks]) -> set[Chunks] | fr
     below = ("*", ANY_CHUNKS)
     if not any(name[-1] == ANY_CHUNKS for name in names):
         return names
-    both = {name for name in names if (*name, *below) in names}
-    return names - both - {(*name, *below) for name in both} | {
-        (*name, ANY_CHUNKS) for name in both
+    complete_names = {name for name in names if (*name, *below) in names}
+    return names - complete_names - {(*name, *below) for name in complete_names} | {
+        (*name, ANY_CHUNKS) for name in complete_names
     }
 
 
@@ -772,11 +772,11 @@ class _Names:
 
     def keys_without_name(self) -> list[str]:
         """Return the key expressions that no name expresses completely."""
-        said = _ByPrefix(dict.fromkeys(self._said), self._limit)
+        stated_names = _ByPrefix(dict.fromkeys(self._said), self._limit)
         return [
             key
             for key in self._allowed
-            if not all(said.any(piece, includes) for piece in _pieces(key))
+            if not all(stated_names.any(piece, includes) for piece in _pieces(key))
         ]
 
 
@@ -805,8 +805,8 @@ def _texts(chunks: Sequence[str]) -> list[str]:
         return []
     text = "/".join(chunks)
     joined = text.replace("$*/**/$*", "*").replace("**/$*", "*").replace("*/**", "*")
-    apart = text.replace("**/", "")
-    names = (name.replace("$*", "*").replace("**", "*") for name in (joined, text, apart))
+    separate = text.replace("**/", "")
+    names = (name.replace("$*", "*").replace("**", "*") for name in (joined, text, separate))
     return list(dict.fromkeys(f"/{name}" for name in names))
 
 

@@ -336,9 +336,11 @@ class RightsBetween:
                 for messages, others in meeting[place]:
                     if are_apart and keys.is_plain and others.is_plain:
                         continue
-                    if both := keys.common(others):
-                        same = (place[0], messages, True)
-                        shared[same] = _added_keys(shared.get(same, ()), both)
+                    if common_keys := keys.common(others):
+                        place_and_messages = (place[0], messages, True)
+                        shared[place_and_messages] = _added_keys(
+                            shared.get(place_and_messages, ()), common_keys
+                        )
             for place, rule, _ in (
                 *(rule_of_peer for rule_of_peer in theirs if not rule_of_peer.rule.allows),
                 *denied,
@@ -391,9 +393,9 @@ def narrowed_rights(rights: RemoteRights, most: Iterable[AccessRule], kept: str)
     graph = [rule for rule in rights.rules if rule.key_expressions[0].startswith(kept)]
     others = tuple(rule for rule in rights.rules if rule not in graph)
     limit = RemoteRights("", tuple(rule.mirrored() for rule in most))
-    some = RemoteRights(rights.common_name, others, rights.made_of)
-    both, _ = RightsBetween((some, limit)).rights_for_others("")
-    return RemoteRights(rights.common_name, sorted_rules((*graph, *both.rules)))
+    other_rights = RemoteRights(rights.common_name, others, rights.made_of)
+    common_rights, _ = RightsBetween((other_rights, limit)).rights_for_others("")
+    return RemoteRights(rights.common_name, sorted_rules((*graph, *common_rights.rules)))
 
 
 def is_within(remote: RemoteRights, own_rights: RemoteRights) -> bool:
@@ -573,8 +575,10 @@ class Enforcement:
         for subject in self.subjects:
             stated = {name for name in PROPERTIES if getattr(subject, name) is not None}
             if subject.cert_common_names is not None and len(stated) > 1:
-                more = ", ".join(sorted(stated - {"cert_common_names"}))
-                return f"its subject {subject.id[:80]!r} has conditions besides the name: {more}"
+                conditions = ", ".join(sorted(stated - {"cert_common_names"}))
+                return (
+                    f"its subject {subject.id[:80]!r} has conditions besides the name: {conditions}"
+                )
         if any(
             not rule.allows and set(rule.messages) != {Message.LIVELINESS_TOKEN}
             for rule in self.rules
@@ -677,18 +681,18 @@ class Enforcement:
         ``of`` returns the set of names that key expressions include.  These names are the keys, or
         other names that stand for keys.
         """
-        everything = ~NameSet()
+        all_names = ~NameSet()
         if not self.enabled:
-            return everything
+            return all_names
         combinations = self._matching_subjects(remote)
         if not self._rules_of or not combinations:
-            return everything if self.allows_by_default else NameSet()
+            return all_names if self.allows_by_default else NameSet()
         passing = []
         for combination in combinations:
             rules = self._in_force[combination].get((flow, message), ())
             denied = of(key for rule in rules if not rule.allows for key in rule.key_expressions)
             allowed = of(key for rule in rules if rule.allows for key in rule.key_expressions)
-            passing.append((everything if self.allows_by_default else allowed) - denied)
+            passing.append((all_names if self.allows_by_default else allowed) - denied)
         return NameSet.union(passing)
 
     def _default_decision(self, subjects: tuple[str, ...], why: str) -> AccessDecision:
@@ -751,8 +755,8 @@ class Enforcement:
             combination
             for combination in (*named, *by_name.get(None, ()))
             if all(
-                wanted is None or wanted in there
-                for wanted, there in zip(combination, values, strict=True)
+                wanted is None or wanted in value
+                for wanted, value in zip(combination, values, strict=True)
             )
         ]
 

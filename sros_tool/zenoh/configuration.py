@@ -206,8 +206,8 @@ def render_configuration(
 ) -> bytes:
     """Return what `Configuration.render` does, from the rendered rights of all remote enclaves."""
     control = _control([*rights], once=settings is SettingsEdition.RULES_ONCE)
-    rest = _text_without_control(mode, listen, connect, revoked, settings)
-    return f"{rest}{_CONTROL}{control}".encode()
+    without_control = _text_without_control(mode, listen, connect, revoked, settings)
+    return f"{without_control}{_CONTROL}{control}".encode()
 
 
 _CONTROL = ',\n "access_control": {\n'
@@ -386,8 +386,11 @@ class RenderedReader:
             sections = _SECTIONS.fullmatch(control)
             if not mark or not sections:
                 return None
-            found, rights = self._parse_without_rules(beginning), self._rendered_rights(sections)
-            settings = found.settings
+            configuration, rights = (
+                self._parse_without_rules(beginning),
+                self._rendered_rights(sections),
+            )
+            settings = configuration.settings
             if settings is not SettingsEdition.FEW and _control(rights, once=True) == control:
                 settings = SettingsEdition.RULES_ONCE
             elif _control(rights, once=False) != control:
@@ -395,7 +398,7 @@ class RenderedReader:
             remotes = tuple(
                 RemoteRights(right.name, tuple(map(self._rule, right.rules))) for right in rights
             )
-            return replace(found, access_control=AccessControl(remotes), settings=settings)
+            return replace(configuration, access_control=AccessControl(remotes), settings=settings)
         except (ValueError, KeyError, IndexError, TypeError, RecursionError):
             return None
 

@@ -106,11 +106,11 @@ def parse_json(text: str) -> Any:
 
 
 def _without_lines(members: list[tuple[str, Any]]) -> Json5Object:
-    found = Json5Object(1)
-    found.update(members)
-    if len(found) != len(members):
+    plain_object = Json5Object(1)
+    plain_object.update(members)
+    if len(plain_object) != len(members):
         raise ValueError("a member is named twice")
-    return found
+    return plain_object
 
 
 def _is_deep(value: Any) -> bool:
@@ -130,15 +130,15 @@ def _tokens(text: str, maximum: int) -> Iterator[_Token]:
         count += 1
         if count > 2 * maximum:  # every other one may be space
             raise Json5Error(f"more than {maximum} tokens", line)
-        found = _TOKEN.match(text, at)
-        if found is None:
+        match = _TOKEN.match(text, at)
+        if match is None:
             raise Json5Error(f"unexpected {text[at : at + 10]!r}", line)
-        kind, token = found.lastgroup or "", found.group()
+        kind, token = match.lastgroup or "", match.group()
         if kind != "space":
             yield _Token(kind, token, line)
         if kind in ("space", "text"):
             line += sum(1 for _ in _LINE.finditer(token))
-        at = found.end()
+        at = match.end()
     while True:
         yield _Token("end", "", line)
 
@@ -212,8 +212,8 @@ class _Reader:
 
 
 def _unexpected_error(token: _Token) -> Json5Error:
-    found = f"unexpected {token.text[:40]!r}" if token.kind != "end" else "it ends too early"
-    return Json5Error(found, token.line)
+    problem = f"unexpected {token.text[:40]!r}" if token.kind != "end" else "it ends too early"
+    return Json5Error(problem, token.line)
 
 
 def _name_of(token: _Token) -> str:

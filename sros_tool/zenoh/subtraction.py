@@ -254,16 +254,16 @@ def _split_by_first_chunk(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[C
             if common_chunks(first, chunk) and _keys_meet(tail, rest):
                 tails.setdefault(chunk, set()).add(tail)
     always = {chunk for chunk in tails if _matches(chunk, first)}
-    some = tuple(sorted(tails.keys() - always))
+    first_chunks = tuple(sorted(tails.keys() - always))
     # The remainders behind the first chunk, with the kinds of first chunks that allow them.
     kinds: dict[Chunks, set[frozenset[str]]] = {}
-    for kind in _kinds(first, some):
+    for kind in _kinds(first, first_chunks):
         behind = frozenset(tail for chunk in kind | always for tail in tails[chunk])
         for remainder in _remaining_keys(rest, behind):
             kinds.setdefault(remainder, set()).add(kind)
     left = set()
     for remainder, matched in kinds.items():
-        left |= {(chunk, *remainder) for chunk in _chunks(first, some, frozenset(matched))}
+        left |= {(chunk, *remainder) for chunk in _chunks(first, first_chunks, frozenset(matched))}
         _check_number(len(left))
     return frozenset(left)
 
@@ -278,27 +278,27 @@ def _first_chunks(expression: Chunks) -> Iterator[tuple[str, Chunks]]:
 
 
 @lru_cache(maxsize=_MANY)
-def _kinds(first: str, some: tuple[str, ...]) -> Mapping[frozenset[str], Chunks]:
+def _kinds(first: str, first_chunks: tuple[str, ...]) -> Mapping[frozenset[str], Chunks]:
     """Return the kinds of chunks that ``first`` matches, as a map to expressions for them.
 
-    A kind is the set of chunks of ``some`` that match, too.
+    A kind is the set of chunks of ``first_chunks`` that match, too.
     """
-    wild = [chunk for chunk in some if "*" in chunk]
+    wild = [chunk for chunk in first_chunks if "*" in chunk]
     _check_number(len(wild), _MOST_WILD)
     shared_by_kind: dict[frozenset[str], Chunks] = {frozenset(): (first,)}
     for chunk in wild:
-        for kind, both in list(shared_by_kind.items()):
+        for kind, shared_chunks in list(shared_by_kind.items()):
             if shared := tuple(
-                c for common_chunk in both for c in common_chunks(common_chunk, chunk)
+                c for common_chunk in shared_chunks for c in common_chunks(common_chunk, chunk)
             ):
                 shared_by_kind[kind | {chunk}] = shared
         _check_number(len(shared_by_kind), _MOST_KINDS)
     kinds = {
-        kind: both
-        for kind, both in shared_by_kind.items()
-        if not all(_matches_any(chunk, wild, kind) for chunk in both)
+        kind: shared_chunks
+        for kind, shared_chunks in shared_by_kind.items()
+        if not all(_matches_any(chunk, wild, kind) for chunk in shared_chunks)
     }
-    for chunk in some:
+    for chunk in first_chunks:
         if "*" not in chunk:
             matching = (wide for wide in wild if _matches(wide, chunk))
             kinds[frozenset((chunk, *matching))] = (chunk,)
@@ -316,35 +316,37 @@ def _matches(wide: str, narrow: str) -> bool:
 
 
 @lru_cache(maxsize=_MANY)
-def _chunks(first: str, some: tuple[str, ...], kinds: frozenset[frozenset[str]]) -> Chunks:
+def _chunks(first: str, first_chunks: tuple[str, ...], kinds: frozenset[frozenset[str]]) -> Chunks:
     """Return few chunks that match exactly the names of ``first`` whose kind is in ``kinds``.
 
-    The kind of a chunk is the set of the chunks in ``some`` that match it.  If a kind is allowed,
-    so is each kind that is a part of it.
+    The kind of a chunk is the set of the chunks in ``first_chunks`` that match it.  If a kind is
+    allowed, so is each kind that is a part of it.
     """
-    every = _kinds(first, some)
+    kinds_of_first = _kinds(first, first_chunks)
 
     def are_allowed(others: Iterable[frozenset[str]]) -> bool:
         return all(any(other_kind <= kind for kind in kinds) for other_kind in others)
 
-    if are_allowed(every):
+    if are_allowed(kinds_of_first):
         return (first,)
     choices = []
-    outside = frozenset(some).difference(*kinds)
-    if are_allowed(kind for kind in every if not kind & outside):
+    outside = frozenset(first_chunks).difference(*kinds)
+    if are_allowed(kind for kind in kinds_of_first if not kind & outside):
         choices.append(_chunks_less(first, outside))
     chosen: dict[str, None] = {}
     for kind in sorted(kinds, key=sorted):
-        others = frozenset(some) - kind
-        if are_allowed(kind_of_chunk for kind_of_chunk in every if kind <= kind_of_chunk):
+        others = frozenset(first_chunks) - kind
+        if are_allowed(kind_of_chunk for kind_of_chunk in kinds_of_first if kind <= kind_of_chunk):
             others = frozenset()
-        chosen |= dict.fromkeys(c for chunk in every[kind] for c in _chunks_less(chunk, others))
+        chosen |= dict.fromkeys(
+            c for chunk in kinds_of_first[kind] for c in _chunks_less(chunk, others)
+        )
     choices.append(tuple(chosen))
-    wanted = [chunk for kind in kinds for chunk in every[kind]]
+    wanted = [chunk for kind in kinds for chunk in kinds_of_first[kind]]
     for letter in sorted({*wanted[0]}.intersection(*wanted[1:]).difference(ANY_PART)):
-        both = common_chunks(first, f"{ANY_PART}{letter}{ANY_PART}")
-        if len(both) == 1 and are_allowed(_kinds(both[0], some)):
-            choices.append(both)
+        common = common_chunks(first, f"{ANY_PART}{letter}{ANY_PART}")
+        if len(common) == 1 and are_allowed(_kinds(common[0], first_chunks)):
+            choices.append(common)
     return min(choices, key=len)
 
 
@@ -608,13 +610,15 @@ def _search_index(expressions: frozenset[Chunks]) -> KeyExpressions:
 
 
 @lru_cache(maxsize=_FEW)
-def _common_expressions(some: frozenset[Chunks], others: frozenset[Chunks]) -> frozenset[Chunks]:
+def _common_expressions(
+    expressions: frozenset[Chunks], others: frozenset[Chunks]
+) -> frozenset[Chunks]:
     """Return expressions for what some expressions and others match."""
-    if some == others:
-        return some
+    if expressions == others:
+        return expressions
     return frozenset(
         tuple(expression.split("/"))
-        for first in some
+        for first in expressions
         for second in others
         for expression in common("/".join(first), "/".join(second))
     )
@@ -725,10 +729,10 @@ def _plain_in(plain: frozenset[str], wide: RuleKeys) -> frozenset[str]:
 
 @lru_cache(maxsize=_MANY)
 def _common_of_differences(
-    some: tuple[Difference, ...], others: tuple[Difference, ...]
+    differences: tuple[Difference, ...], others: tuple[Difference, ...]
 ) -> frozenset[str]:
     try:
-        shared = [key for first in some for second in others for key in first.common(second)]
+        shared = [key for first in differences for second in others for key in first.common(second)]
     except CannotSubtract:
         raise TooManyExpressions from None
     return frozenset(shared)

@@ -134,14 +134,14 @@ def _authority_findings(
     elif role == PERMISSIONS and (fault := next(purpose_faults(chain[:1]), "")):
         yield CA_PURPOSE.found(subject, fault, file)
     signs_documents = role == PERMISSIONS  # no vendor asks for small keys then (tested)
-    for finding in key_findings(certificate, subject, file, what=f"{name} has"):
+    for finding in key_findings(certificate, subject, file, owner_clause=f"{name} has"):
         if finding.kind is not KEY_ALGORITHM or not signs_documents:
             yield finding
     yield from _extension_findings(certificate, subject, name, file)
 
 
 def key_findings(
-    certificate: x509.Certificate, subject: str, file: str, *, what: str = "it has"
+    certificate: x509.Certificate, subject: str, file: str, *, owner_clause: str = "it has"
 ) -> Iterator[Finding]:
     """Yield findings about a certificate's key or signature that a vendor refuses."""
     key = certificate.public_key()
@@ -149,11 +149,11 @@ def key_findings(
         isinstance(key, rsa.RSAPublicKey) and key.key_size == 2048
     )
     if not fits:
-        yield KEY_ALGORITHM.found(subject, f"{what} a key of {algorithm(key)}", file)
+        yield KEY_ALGORITHM.found(subject, f"{owner_clause} a key of {algorithm(key)}", file)
     digest = certificate.signature_hash_algorithm
     if not isinstance(digest, hashes.SHA256):
         name = digest.name.upper() if digest else "no digest"
-        yield SIGNATURE_HASH.found(subject, f"{what} a signature with {name}", file)
+        yield SIGNATURE_HASH.found(subject, f"{owner_clause} a signature with {name}", file)
 
 
 def _extension_findings(

@@ -327,11 +327,11 @@ def _validity_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iter
     if begin is None or end is None:
         return  # TIME_FORMAT reports it
     if not begin <= int(now.timestamp()) <= end:
-        here = (
+        utc_dates = (
             f"in {enclave.keystore.zone} Fast DDS reads these dates as {_utc(begin)} to {_utc(end)}"
         )
         accepted = enclave.accepts_expiry if now.timestamp() > end else ""
-        yield LOCAL_TIME.found(enclave.name, f"{text}, and {here}", file, accepted=accepted)
+        yield LOCAL_TIME.found(enclave.name, f"{text}, and {utc_dates}", file, accepted=accepted)
     elif now - _WEST < window.not_before or now + _EAST > window.not_after:
         accepted = enclave.accepts_expiry if now - _WEST >= window.not_before else ""
         text = f"{text}, and now it is {iso(now)}"
@@ -384,10 +384,10 @@ def _unreachable_rule_findings(
         yield UNREACHABLE.found(name, text, file)
         return
     for by, topics in hidden.items():
-        what = " and ".join(
+        described_topics = " and ".join(
             f"{direction} {names_text(topic)}" for direction, topic in topics.items()
         )
-        text = f"rule {index + 1} allows to {what} after a rule that denies {by}"
+        text = f"rule {index + 1} allows to {described_topics} after a rule that denies {by}"
         yield UNREACHABLE.found(name, text, file)
 
 
@@ -405,8 +405,8 @@ class _Topics:
 
     def earlier_covering(self, topic: str, index: int) -> str:
         """Return a topic expression in a rule before ``index`` that covers ``topic``, or ""."""
-        found = (topic,) if topic in self._places else ()
-        return self._first_earlier(chain(found, self._names.covering(topic)), index)
+        same_topic = (topic,) if topic in self._places else ()
+        return self._first_earlier(chain(same_topic, self._names.covering(topic)), index)
 
     def earlier_overlapping(self, topic: str, index: int) -> str:
         """Return a topic expression in a rule before ``index`` that overlaps ``topic``, or ""."""

@@ -99,8 +99,8 @@ def fault_remedy(enclave: CheckedEnclave, fault: Fault, name: str) -> str:
             remedy = f"Restore {missing} from a backup; every exported enclave has a copy of it."
     else:
         remedy, root = fault.remedy_in_export(name), "KEYSTORE"
-        there = f"KEYSTORE/enclaves{quote(enclave.name)}/{name}"
-        path = there if "`" in remedy else quote(file)
+        quoted_path = f"KEYSTORE/enclaves{quote(enclave.name)}/{name}"
+        path = quoted_path if "`" in remedy else quote(file)
     return remedy.format(root=root, enclave="ENCLAVE", path=path)
 
 
@@ -291,8 +291,8 @@ def _token_findings(enclave: CheckedEnclave, place: TokenUri) -> Iterator[Findin
     yield ON_TOKEN.found(name, f"its key is {place.object!r} on the token {place.token!r}", file)
     if any((enclave.folder / zenoh_file).exists() for zenoh_file in ZENOH_FILES):
         yield TOKEN_ON_ZENOH.found(name, "it has no key.pem", file)
-    here = not enclave.keystore.is_original or Path(place.pin_source).exists()
-    for problem in (pin_file_problem(place), pin_line_break(place)) if here else ():
+    is_local = not enclave.keystore.is_original or Path(place.pin_source).exists()
+    for problem in (pin_file_problem(place), pin_line_break(place)) if is_local else ():
         if problem:
             yield PIN_FILE.found(name, problem, file)
 
@@ -348,10 +348,10 @@ def _expiry_findings(
             text = f"they expire at {grant.not_after}, the certificate at {iso(validity.not_after)}"
             file = enclave.file("permissions.p7s")
             yield PERMISSIONS_OUTLIVE.found(enclave.name, text, file)
-    for file, what, window in windows:
+    for file, subject, window in windows:
         if window.expires_soon_from() < now <= window.not_after:
-            verb = "expires" if what == "the certificate" else "expire"
-            text = f"{what} {verb} at {iso(window.not_after)}"
+            verb = "expires" if subject == "the certificate" else "expire"
+            text = f"{subject} {verb} at {iso(window.not_after)}"
             accepted = enclave.accepts_expiry
             yield EXPIRES_SOON.found(enclave.name, text, enclave.file(file), accepted=accepted)
 

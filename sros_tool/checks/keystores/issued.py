@@ -304,10 +304,10 @@ def _lower_protection_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
 
 
 def _shared_values(pairs: Iterable[tuple[_Key, str]]) -> Iterator[tuple[_Key, list[str]]]:
-    found: dict[_Key, list[str]] = defaultdict(list)
+    names_by_key: dict[_Key, list[str]] = defaultdict(list)
     for key, name in pairs:
-        found[key].append(name)
-    return ((key, names) for key, names in found.items() if len(names) > 1)
+        names_by_key[key].append(name)
+    return ((key, names) for key, names in names_by_key.items() if len(names) > 1)
 
 
 def _trust_findings(
@@ -457,11 +457,11 @@ def _is_plain_router(enclave: CheckedEnclave, grant: Grant | None) -> bool:
 
 def wanted_rights(keystore: CheckedKeystore) -> dict[str, frozenset[Right]]:
     """Map each enclave of the given policies to its rights."""
-    found: dict[str, frozenset[Right]] = {}
+    rights_by_enclave: dict[str, frozenset[Right]] = {}
     for policy in keystore.policies:
         rights = defaultdict(set)
         for right in policy_rights(policy):
             rights[right.enclave].add(right)
         for enclave in policy.enclaves:
-            found[enclave.path] = frozenset(rights[enclave.path])
-    return found
+            rights_by_enclave[enclave.path] = frozenset(rights[enclave.path])
+    return rights_by_enclave

@@ -131,10 +131,10 @@ class CheckedKeystore:
     @cached_property
     def governance(self) -> bytes:
         """The signed governance that the enclaves share, or b""."""
-        there = (self.root / GOVERNANCE_P7S).is_file()
+        exists = (self.root / GOVERNANCE_P7S).is_file()
 
         def read() -> bytes:
-            return self.opened.read(GOVERNANCE_P7S, "governance document") if there else b""
+            return self.opened.read(GOVERNANCE_P7S, "governance document") if exists else b""
 
         return self._part(GOVERNANCE_P7S, read, b"")
 

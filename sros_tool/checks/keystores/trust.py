@@ -144,11 +144,12 @@ def _strangers(
     """
     read = {shown: dict(_parties(*target)) for shown, target in targets.items()}
     # Most exports trust and present the same CAs as others: only one of each kind is compared.
-    alike: dict[frozenset[_Kind], list[str]] = defaultdict(list)
+    names_by_kinds: dict[frozenset[_Kind], list[str]] = defaultdict(list)
     for shown, of_target in read.items():
-        alike[frozenset(of_target)].append(shown)
+        names_by_kinds[frozenset(of_target)].append(shown)
     parties = {
-        targets_alike[0]: list(read[targets_alike[0]].values()) for targets_alike in alike.values()
+        targets_alike[0]: list(read[targets_alike[0]].values())
+        for targets_alike in names_by_kinds.values()
     }
     roles = range(1 if on_zenoh else len(ROLES))
     # Which targets each one is refused by, in which roles; targets with the same are one group.
@@ -157,21 +158,21 @@ def _strangers(
         if refused := _refused_roles(parties[first_target], parties[other], roles):
             refused_by[first_target][other] = refused_by[other][first_target] = refused
     groups: dict[tuple[tuple[str, tuple[int, ...]], ...], list[str]] = defaultdict(list)
-    for targets_alike in alike.values():
+    for targets_alike in names_by_kinds.values():
         groups[tuple(refused_by[targets_alike[0]].items())] += targets_alike
-    for some, others in combinations(groups.values(), 2):
-        if refused := refused_by[some[0]].get(others[0], ()):
+    for group, others in combinations(groups.values(), 2):
+        if refused := refused_by[group[0]].get(others[0], ()):
             authorities = " and ".join(f"{ROLES[role]} CA" for role in refused)
             text = (
-                f"nodes of {names_text(some)} do not communicate with nodes of "
+                f"nodes of {names_text(group)} do not communicate with nodes of "
                 f"{names_text(others)}: not both of them trust the other's {authorities}"
             )
             yield STRANGERS.found(others[0], text, others[0])
-            refused_pairs.update(map(frozenset, product(some, others)))
+            refused_pairs.update(map(frozenset, product(group, others)))
 
 
 def _refused_roles(
-    some: Sequence[_Party], others: Sequence[_Party], roles: range
+    parties: Sequence[_Party], others: Sequence[_Party], roles: range
 ) -> tuple[int, ...]:
     """Return the roles in which all pairs of enclaves refuse each other.
 
@@ -183,7 +184,7 @@ def _refused_roles(
             for role in roles
             if not (first_target.accepts(other, role) and other.accepts(first_target, role))
         )
-        for first_target, other in product(some, others)
+        for first_target, other in product(parties, others)
     )
     return min(pairs, key=len, default=())
 
@@ -223,12 +224,12 @@ def _revoked(targets: Targets) -> Iterator[Finding]:
             with suppress(SrosError):
                 data = keystore.read(keystore.folder(name) / CRL_FILE, "revocation list")
                 holders[data][shown] = None
-    found: dict[tuple[str, tuple[str, ...]], dict[str, None]] = defaultdict(dict)
+    revocations: dict[tuple[str, tuple[str, ...]], dict[str, None]] = defaultdict(dict)
     for data, of_list in holders.items():
         for shown, target in targets.items():
             if shown not in of_list and (names := tuple(_names_revoked(data, *target))):
-                found[shown, names].update(of_list)
-    for (shown, names), of_lists in found.items():
+                revocations[shown, names].update(of_list)
+    for (shown, names), of_lists in revocations.items():
         text = (
             f"nodes of {names_text(list(of_lists))} refuse nodes of {shown} in "
             f"{names_text(names)}: their revocation list revokes "
@@ -269,11 +270,11 @@ class _Governed:
             with suppress(SrosError):
                 file = self._keystore.folder(name) / GOVERNANCE_FILE
                 signed[self._keystore.read(file, "governance document")] = None
-        found = []
+        documents = []
         for message in signed:
             with suppress(SrosError):
-                found.append(parse_governance(self._keystore.files.signed(message).document))
-        return tuple(found)
+                documents.append(parse_governance(self._keystore.files.signed(message).document))
+        return tuple(documents)
 
     @cached_property
     def first(self) -> tuple[DomainSet, ...]:
@@ -286,15 +287,15 @@ class _Governed:
         return self._domains(self._enclaves)
 
     def _domains(self, enclaves: Sequence[str]) -> tuple[DomainSet, ...]:
-        found: dict[DomainSet, None] = {}
+        domain_sets: dict[DomainSet, None] = {}
         for name in enclaves:
             domains = None
             with suppress(SrosError):
                 domains = self._keystore.enclave(name, now=self._now).joined_domains()
             if domains is None:
                 return ()
-            found[domains] = None
-        return tuple(found)
+            domain_sets[domains] = None
+        return tuple(domain_sets)
 
     def joined(self) -> Iterator[int]:
         """Yield the domains that an enclave may join."""
@@ -305,8 +306,8 @@ class _Governed:
         return _domains_meet(self.first, other.first) or _domains_meet(self.domains, other.domains)
 
 
-def _domains_meet(some: Sequence[DomainSet], others: Sequence[DomainSet]) -> bool:
-    pairs = list(product(some, others))
+def _domains_meet(domain_sets: Sequence[DomainSet], others: Sequence[DomainSet]) -> bool:
+    pairs = list(product(domain_sets, others))
     return not pairs or any((first_target & other).ranges for first_target, other in pairs)
 
 
@@ -328,20 +329,20 @@ def _incompatible_governance_findings(
     groups: dict[tuple[_Incompatibility, tuple[str, ...]], list[str]] = defaultdict(list)
     shown_before: list[str] = []
     for shown, own in governed.items():
-        found: dict[_Incompatibility, list[str]] = defaultdict(list)
+        names_by_incompatibility: dict[_Incompatibility, list[str]] = defaultdict(list)
         for other_shown in shown_before:
             if frozenset((shown, other_shown)) not in refused_pairs and (
                 incompatibility := _incompatibility_of(own, governed[other_shown])
             ):
-                found[incompatibility].append(other_shown)
-        for incompatibility, others in found.items():
+                names_by_incompatibility[incompatibility].append(other_shown)
+        for incompatibility, others in names_by_incompatibility.items():
             groups[incompatibility, tuple(others)].append(shown)
         shown_before.append(shown)
-    for (incompatibility, those), alike in groups.items():
+    for (incompatibility, incompatible_names), alike_names in groups.items():
         on = f" on {first_few(incompatibility.names, _MOST_SHOWN)}" if incompatibility.names else ""
         why = first_few(
             [
-                f"{key}: {own_value} in {alike[0]}, {value} in {those[0]}"
+                f"{key}: {own_value} in {alike_names[0]}, {value} in {incompatible_names[0]}"
                 for key, own_value, value in incompatibility.differences
             ],
             _MOST_SHOWN,
@@ -349,14 +350,14 @@ def _incompatible_governance_findings(
         if incompatibility.kind is PEERS_DOMAINS:
             own_domains, domains = (
                 DomainSet.of(*((d, d) for name in names for d in governed[name].joined()))
-                for names in (alike, those)
+                for names in (alike_names, incompatible_names)
             )
             why = f"the former are for domain {own_domains}, the latter for domain {domains}"
         text = (
-            f"nodes of {names_text(alike)} do not communicate with nodes of {names_text(those)}"
-            f"{on}: {why}"
+            f"nodes of {names_text(alike_names)} do not communicate with "
+            f"nodes of {names_text(incompatible_names)}{on}: {why}"
         )
-        yield incompatibility.kind.found(alike[0], text, alike[0])
+        yield incompatibility.kind.found(alike_names[0], text, alike_names[0])
 
 
 def _incompatibility_of(own: _Governed, other: _Governed) -> _Incompatibility | None:

@@ -168,12 +168,12 @@ def evaluate(
         distributions: the ROS 2 distributions that it is for, which findings name.
     """
     keystore = enclave.keystore
-    there = loaded_enclave(enclave.name, enclave.folder, enclave.state, moment=keystore.now)
+    loaded = loaded_enclave(enclave.name, enclave.folder, enclave.state, moment=keystore.now)
     numbers = (domain,) if domain is not None else example_domains(enclave.state)
     by_domain = {
         number: {
             vendor: VendorParticipant(
-                vendor, there, JoinContext(number, keystore.now, keystore.zone)
+                vendor, loaded, JoinContext(number, keystore.now, keystore.zone)
             )
             for vendor in vendors
         }
@@ -184,7 +184,7 @@ def evaluate(
     ]
     state = accepted_state(enclave.state, participants) if participants else enclave.state
     checked = CheckedEnclave(keystore, enclave.name, state)
-    return EnclaveEvaluation(checked, by_domain, there.portable is not None, distributions)
+    return EnclaveEvaluation(checked, by_domain, loaded.portable is not None, distributions)
 
 
 def check_vendors(

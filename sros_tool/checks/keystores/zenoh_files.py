@@ -197,8 +197,8 @@ def _drift_findings(keystore: CheckedKeystore, drifted: Drifted) -> Iterator[Fin
         return
     state = keystore.enclave(drifted.enclave)
     enclave = CheckedEnclave(keystore, drifted.enclave, state)
-    found = list(
+    findings = list(
         _configuration_findings(enclave, open_zenoh(enclave.folder, drifted.enclave, state))
     )
     text = "the settings and the permissions of the keystore give another configuration"
-    yield from found or [OUT_OF_DATE.found(drifted.enclave, text, file)]
+    yield from findings or [OUT_OF_DATE.found(drifted.enclave, text, file)]

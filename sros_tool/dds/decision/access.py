@@ -406,10 +406,10 @@ class _GrantRules:
 
         Entries in a row with the same verdict are joined.
         """
-        for allowed, some in groupby(
+        for allowed, group in groupby(
             entries, key=lambda entry: entry.allow and bool(entry.expression)
         ):
-            yield self._names_of(some), allowed
+            yield self._names_of(group), allowed
 
     def _names_of(self, entries: Iterable[_Entry]) -> NameSet:
         texts = tuple([_usable_expression(self._traits, entry.expression) for entry in entries])

@@ -75,9 +75,9 @@ class _Reader:
             raise self._error("a comment is not closed")
 
     def _take(self, mark: str) -> bool:
-        there = self._text.startswith(mark, self._index)
-        self._index += len(mark) if there else 0
-        return there
+        is_next = self._text.startswith(mark, self._index)
+        self._index += len(mark) if is_next else 0
+        return is_next
 
     def _name(self) -> str:
         match = _NAME.match(self._text, self._index)

@@ -155,10 +155,10 @@ def _token(text: str, index: int) -> tuple[Letters | None, bool, int]:
     Also returns whether the token is a range, and the index after it.  The characters are None for
     something that glibc does not know.
     """
-    if found := _CLASS.match(text, index):
-        return _CLASSES.get(found[1]), False, found.end()
-    if found := _EQUIVALENT.match(text, index):
-        return Letters.of(found[1]), False, found.end()
+    if match := _CLASS.match(text, index):
+        return _CLASSES.get(match[1]), False, match.end()
+    if match := _EQUIVALENT.match(text, index):
+        return Letters.of(match[1]), False, match.end()
     low, index = _member(text, index)
     if text[index : index + 1] != "-" or text[index + 1 : index + 2] == "]":
         return (None if low is None else Letters.of(low)), False, index

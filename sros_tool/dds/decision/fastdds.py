@@ -72,13 +72,13 @@ class _Reader:
     def _read_into(self, document: XmlElement) -> None:
         text = self._read_text
         stack = [document]
-        while found := _TEXT.match(text, self._index):
+        while match := _TEXT.match(text, self._index):
             children = stack[-1].children
-            if found[1]:
-                self._need_more(found.end())
-                children.append(_plain(found[0][:-1]))
-            self._index = found.end() - 1
-            if text[found.end() : found.end() + 1] in ("?", "!"):
+            if match[1]:
+                self._need_more(match.end())
+                children.append(_plain(match[0][:-1]))
+            self._index = match.end() - 1
+            if text[match.end() : match.end() + 1] in ("?", "!"):
                 self._take_special(stack)
                 continue
             tag = _TAG.match(text, self._index)
@@ -126,12 +126,12 @@ class _Reader:
             children.append(NodeMark.COMMENT if begin == "<!--" else NodeMark.OTHER)
 
     def _attributes(self, text: str) -> dict[str, str]:
-        found = {}
+        attributes = {}
         for name, value in _ATTRIBUTES.findall(text):
-            if name in found:
+            if name in attributes:
                 raise self._error(f"the attribute {name} is given twice")
-            found[name] = _plain(value[1:-1])
-        return {_decoded(name): value for name, value in found.items()}
+            attributes[name] = _plain(value[1:-1])
+        return {_decoded(name): value for name, value in attributes.items()}
 
 
 def _decoded(text: str) -> str:
@@ -251,8 +251,8 @@ class _Sequence:
     def next(self, name: str) -> XmlElement:
         """Return the next child and go on; raise `UnreadableError` if it has another name."""
         if not self.is_next(name):
-            there = f", where it has <{self.rest()[0].name}>" if self.rest() else ""
-            raise UnreadableError(f"<{self._name}> lacks <{name}> at its position{there}")
+            actual = f", where it has <{self.rest()[0].name}>" if self.rest() else ""
+            raise UnreadableError(f"<{self._name}> lacks <{name}> at its position{actual}")
         self._index += 1
         return self._children[self._index - 1]
 
@@ -324,8 +324,8 @@ def _integer(match: re.Match[str]) -> int:
 
 def _read_flag(element: XmlElement) -> bool:
     text = _read_first_text(element)
-    if found := _INTEGER.match(text):
-        return _integer(found) != 0
+    if match := _INTEGER.match(text):
+        return _integer(match) != 0
     if text not in _TRUE + _FALSE:
         raise UnreadableError(f"<{element.name}> holds {text!r} instead of true or false")
     return text in _TRUE

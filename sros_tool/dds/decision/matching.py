@@ -99,8 +99,8 @@ class ExpressionIndex:
 
     def first(self, name: str) -> int | None:
         """Return the position of the first expression that matches ``name``."""
-        found = self.matching(name)
-        return found[0] if found else None
+        matching_numbers = self.matching(name)
+        return matching_numbers[0] if matching_numbers else None
 
     def _either_way(self, name: str) -> Sequence[int]:
         return [

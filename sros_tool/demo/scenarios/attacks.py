@@ -277,7 +277,7 @@ def _forged_packets_row(
     name: str, relation: Relation, expected: RowStatus, mechanism: str, keystore: KeystoreChoice
 ) -> Row:
     """Return a row in which a talker's packets are sent again, unchanged or changed."""
-    again = relation is Relation.HEARS_AGAIN
+    is_repeated = relation is Relation.HEARS_AGAIN
     return Row(
         name,
         expected,
@@ -285,8 +285,8 @@ def _forged_packets_row(
         talker_and_listener(keystore),
         (Claim(relation, "listener", "talker").expecting(expected),),
         (hears("listener", "talker"),),
-        replay="talker" if again else "",
-        impersonate="" if again else "talker",
+        replay="talker" if is_repeated else "",
+        impersonate="" if is_repeated else "talker",
         brief=True,
     )
 
@@ -499,11 +499,11 @@ def _trespass_rows(
     ``forge`` gives the enclave of the ``part`` wide permissions, and ``opened`` says what they
     allow.
     """
-    given = " that it was not given" if attack.startswith("an enclave ") else ""
+    unless_granted = " that it was not given" if attack.startswith("an enclave ") else ""
     done = RowStatus.ANSWERED if kind in (_call_row, _false_server_row) else RowStatus.HEARD
     return tries(
         attack,
-        kind(f"{attack}{given}", Identity(OWN, part), RowStatus.REFUSED, mechanism),
+        kind(f"{attack}{unless_granted}", Identity(OWN, part), RowStatus.REFUSED, mechanism),
         kind(
             f"{attack}, wildcard permissions",
             Identity(Undefended(forge), part),

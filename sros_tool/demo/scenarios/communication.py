@@ -205,15 +205,17 @@ class _Interface(NamedTuple):
         )
 
 
-def _rows_of(kind: _Interface, both: str) -> tuple[Row, ...]:
-    """Return the rows of a service or action; ``both`` explains the secured pair."""
+def _rows_of(kind: _Interface, pair_meaning: str) -> tuple[Row, ...]:
+    """Return the rows of a service or action; ``pair_meaning`` explains the secured pair."""
     client, server = kind.pair(secured=True)
     open_client, open_server = kind.pair(secured=False)
     posing = kind.party("client as a server", kind.server_role, Identity(OWN, "client"))
     calling = kind.party("server as a client", kind.client_role, Identity(OWN, "server"))
     may_not = "its permissions allow it to {}, not to {}"
     return (
-        _answered_call_row(f"secured client of a secured {kind.server}", both, client, server),
+        _answered_call_row(
+            f"secured client of a secured {kind.server}", pair_meaning, client, server
+        ),
         _answered_call_row(
             f"unsecured client of an unsecured {kind.server}",
             "no security on either side: the control of the rows below",
@@ -395,7 +397,7 @@ _KINDS = {
 
 
 def _payload_row(name: str, kind: str, expected: RowStatus, mechanism: str) -> Row:
-    """Return a row that looks for payload in packets with a protection kind."""
+    """Return a row that looks for readable payload in packets, with one protection kind."""
     return Row(
         f"{name} under {kind}",
         expected,

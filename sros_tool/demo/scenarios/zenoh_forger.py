@@ -322,9 +322,9 @@ def both_cas_trusted(copy: KeystoreCopy) -> None:
     other = (enclave_path(copy.foreign, copy.enclave("talker")) / IDENTITY_CA_FILE).read_bytes()
     for name in enclave_names(copy.root):
         file = enclave_path(copy.root, name) / IDENTITY_CA_FILE
-        both = file.read_bytes() + other
+        certificates = file.read_bytes() + other
         file.unlink()
-        file.write_bytes(both)
+        file.write_bytes(certificates)
 
 
 def without_certificate(copy: KeystoreCopy) -> None:

@@ -761,10 +761,10 @@ def _revoke_again(
     """
     if not (forgotten_lists.lists or forgotten_lists.unknown_certificates(Keystore(root))):
         return "", [], []
-    again = {entry.serial for crl in forgotten_lists.lists for entry in crl.revoked}
+    forgotten_serials = {entry.serial for crl in forgotten_lists.lists for entry in crl.revoked}
     requests = [request for message in messages for request in message.requests if request.request]
     for request in requests:
-        if again & {*request.vouching}:
+        if forgotten_serials & {*request.vouching}:
             request.set_outcome("refused", "its certificate was revoked")
     have = (
         f"{first_few(robots_with_lists, _SHOWN)} {'has' if len(robots_with_lists) == 1 else 'have'}"

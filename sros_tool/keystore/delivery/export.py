@@ -437,15 +437,15 @@ def _check_robot(root: Path, target: Path, files: Mapping[str, bytes]) -> None:
     settings = target / AGENT / "agent.toml"
     if not settings.is_file() or not (fleet := load_fleet(Keystore(root))):
         return
-    here = None
+    owner = None
     with suppress(SrosError, ValueError):  # the agent refuses these settings itself
-        here = tomllib.loads(read_bytes(settings, "settings").decode()).get("robot")
+        owner = tomllib.loads(read_bytes(settings, "settings").decode()).get("robot")
     for name in sorted({enclave_of(path) for path in files}):
         robot = robot_of(fleet, name)
-        if robot and here and robot.name != here:
+        if robot and owner and robot.name != owner:
             raise KeystoreError(
-                f"'{target}' is the folder of robot {here}, and {name} belongs to {robot.name}",
-                f"'{settings}' names {here}. Nothing was changed.",
+                f"'{target}' is the folder of robot {owner}, and {name} belongs to {robot.name}",
+                f"'{settings}' names {owner}. Nothing was changed.",
                 f"Choose the folder of {robot.name}.",
             )
 

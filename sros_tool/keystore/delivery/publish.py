@@ -273,7 +273,7 @@ def is_all_published(root: Path, published: PublishedRobot, enclaves: Sequence[s
 
 
 def _check_apart(root: Path, folder: Path) -> None:
-    """Raise `KeystoreError` if keystore and publishing folder are in one another."""
+    """Raise `KeystoreError` if the keystore or the publishing folder contains the other."""
     inner, outer = (Path(os.path.realpath(path)) for path in (folder, root))
     if inner.is_relative_to(outer) or outer.is_relative_to(inner):
         raise KeystoreError(
@@ -333,9 +333,10 @@ class _Keys:
             KeystoreError: a key is missing, or is not the one that the root metadata names.
         """
         first = not self.roots.versions
-        if first and (there := [role for role in _ROLES if self._path(role).exists()]):
+        if first and (existing_keys := [role for role in _ROLES if self._path(role).exists()]):
             raise KeystoreError(
-                f"'{self._root}' has the {there[0]} key for publishing, but no {FLEET_ROOT}",
+                f"'{self._root}' has the {existing_keys[0]} key for publishing, "
+                f"but no {FLEET_ROOT}",
                 "This file says which keys robots trust.",
                 f"Restore {FLEET_ROOT} from a backup.",
             )
@@ -612,8 +613,8 @@ class _Run:
 
     def _shows_restore(self) -> bool:
         """Return whether PUB, the ledger or a robot shows that the keystore was restored."""
-        known, there = self.list.versions, self._present.versions()
-        if self._has_later_root or any(there.get(name, 0) > known[name] for name in known):
+        known, present = self.list.versions, self._present.versions()
+        if self._has_later_root or any(present.get(name, 0) > known[name] for name in known):
             return True
         entries = self.keystore.ledger_with("what", "release").entries
         last = max((entry.number for entry in entries if entry.what == "release"), default=0)
@@ -624,9 +625,11 @@ class _Run:
         for robot in recorded_fleet(self.keystore).robots:
             with suppress(SrosError):
                 if received := last_confirmation(self.keystore.root, robot):
-                    said = received.confirmation
-                    problems = said.problems or ()
-                    if (said.release or 0) > last or any(OF_SAME_NUMBER in e for e in problems):
+                    confirmation = received.confirmation
+                    problems = confirmation.problems or ()
+                    if (confirmation.release or 0) > last or any(
+                        OF_SAME_NUMBER in e for e in problems
+                    ):
                         return True
         return False
 
@@ -667,8 +670,8 @@ class _Run:
             known = self.list.robots
             robots = [
                 robot
-                for robot, there in self._there.items()
-                if robot not in known or there.number > known[robot].release.number
+                for robot, release in self._there.items()
+                if robot not in known or release.number > known[robot].release.number
             ]
             raise self._restored_error(
                 f"has later releases: {first_few(robots, 3)}, up to the number {latest}",
@@ -685,8 +688,8 @@ class _Run:
         """
         from sros_tool.keystore.delivery.repository import RENEWED_ALONE
 
-        known, there = self.list.versions, self._present.versions()
-        if any(there.get(name, 0) > known[name] for name in known.keys() - RENEWED_ALONE):
+        known, present = self.list.versions, self._present.versions()
+        if any(present.get(name, 0) > known[name] for name in known.keys() - RENEWED_ALONE):
             fleet = recorded_fleet(self.keystore)
             gone = sorted(self.list.robots.keys() - self._there.keys())
             if removed := [robot for robot in gone if self._enclaves(fleet, robot)]:
@@ -697,9 +700,9 @@ class _Run:
                     "the fleet file, and publish again",
                 )
 
-    def _restored_error(self, what: str, remedy: str) -> KeystoreError:
+    def _restored_error(self, evidence: str, remedy: str) -> KeystoreError:
         return KeystoreError(
-            f"'{self._folder}' {what}, which the keystore '{self.keystore.root}' does not know",
+            f"'{self._folder}' {evidence}, which the keystore '{self.keystore.root}' does not know",
             "The keystore was restored from a backup, or is a copy. Publishing would undo later "
             "changes, such as a revocation.",
             f"Restore a later backup. If there is none, {remedy}.",
@@ -716,14 +719,14 @@ class _Run:
         problem = ""
         # Only these have the last list: others may have been refused since, and still have earlier.
         last = (robot for robot in self._there.items() if robot[1].number == self._number)
-        for robot, there in last:
+        for robot, present_release in last:
             try:
-                if not (data := self._read(robot, there)):
+                if not (data := self._read(robot, present_release)):
                     raise DocumentError(
-                        f"'{self._folder / there.path(robot)}' is missing or incomplete"
+                        f"'{self._folder / present_release.path(robot)}' is missing or incomplete"
                     )
                 release = read_release(data)
-                if release.number != there.number:
+                if release.number != present_release.number:
                     raise DocumentError(f"the release of {robot} does not have the recorded number")
             except SrosError as error:
                 problem = problem or f"{error.what[:1].upper()}{error.what[1:]}."
@@ -794,7 +797,7 @@ class _Run:
         Only the robots ``among`` are looked at; None looks at all.
         """
         root, fleet = self.keystore.root, recorded_fleet(self.keystore)
-        found, wanted = [], set()
+        changed_robots, wanted = [], set()
         looked_at = fleet.robots.keys() if among is None else {robot.robot for robot in among}
         for robot in looked_at:
             names = self._enclaves(fleet, robot)
@@ -804,16 +807,16 @@ class _Run:
             state = _state(root, names)
             before = self.list.robots.get(robot)
             if not before or before.files != state:
-                found.append(_Changed(robot, names, state))
+                changed_robots.append(_Changed(robot, names, state))
             elif not self._has_files_of(robot, before.release):
-                found.append(_Changed(robot, names, state))
+                changed_robots.append(_Changed(robot, names, state))
                 self._damaged |= {robot} if robot in self._there else set()
         known = self.list.robots.keys() | self._there.keys()
         gone = (known if among is None else looked_at) - wanted
         for name in gone:
             self.list.robots.pop(name, None)
         self._removed = sorted({*self._removed, *(gone & self._there.keys())})
-        return found
+        return changed_robots
 
     def _enclaves(self, fleet: Fleet, robot: str) -> list[str]:
         """Return the enclaves of a robot with certificates; none if it is not in the fleet."""
@@ -842,12 +845,12 @@ class _Run:
 
     # ── their releases ─────────────────────────────────────────────────────────────────────
 
-    def release(self, found: Sequence[_Changed], change: KeystoreChange) -> None:
+    def release(self, changed_robots: Sequence[_Changed], change: KeystoreChange) -> None:
         """Make and write the archives of new releases, which nothing names yet.
 
-        ``found`` are the robots that seemed changed before the keystore was locked.
+        ``changed_robots`` are the robots that seemed changed before the keystore was locked.
         """
-        changed = self.changed_robots(found)
+        changed = self.changed_robots(changed_robots)
         unused = change.keystore.ledger_file.next_number()
         number = max(unused, self._number + 1, self._least)
         if number > MOST_NUMBER:
@@ -1004,8 +1007,8 @@ class _Run:
             for path, data in late:
                 _put_file(folder, path, data)
             folder.flush_file_system()
-            for path, since in self.list.superseded.items():
-                if self._now - since >= _KEPT:
+            for path, superseded_at in self.list.superseded.items():
+                if self._now - superseded_at >= _KEPT:
                     folder.unlink(path, missing_ok=True)
         keys.finish()
 
@@ -1047,11 +1050,11 @@ def _state(root: Path, names: Sequence[str]) -> str:
         folder = os.fspath(enclave_path(root, name))
         for file in sorted(RELEASE_FILES):
             try:
-                there = os.stat(f"{folder}/{file}")  # noqa: PTH116 - faster, of very many files
+                state = os.stat(f"{folder}/{file}")  # noqa: PTH116 - faster, of very many files
             except OSError:
                 continue
-            times = there.st_mtime_ns, there.st_ctime_ns
-            digest.update(f"{name}\0{file}\0{there.st_ino} {there.st_size} {times}\n".encode())
+            times = state.st_mtime_ns, state.st_ctime_ns
+            digest.update(f"{name}\0{file}\0{state.st_ino} {state.st_size} {times}\n".encode())
     return digest.hexdigest()
 
 

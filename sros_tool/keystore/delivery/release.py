@@ -60,11 +60,11 @@ class Release:
 
     def enclaves(self) -> dict[str, dict[str, bytes]]:
         """Map the names of the enclaves to their files, by file name."""
-        found: dict[str, dict[str, bytes]] = {}
+        enclaves: dict[str, dict[str, bytes]] = {}
         for path, data in self.files.items():
             name, file = _enclave_and_file(path)
-            found.setdefault(name, {})[file] = data
-        return found
+            enclaves.setdefault(name, {})[file] = data
+        return enclaves
 
 
 def check_tuf() -> None:

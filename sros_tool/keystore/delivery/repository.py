@@ -353,9 +353,9 @@ class Composer:
         self._signers = signers
         self._now = now.replace(microsecond=0)
         self._expiry = expiry
-        there = present.versions()
-        names = {*there, *known}
-        self.versions = {name: max(there.get(name, 0), known.get(name, 0)) for name in names}
+        versions = present.versions()
+        names = {*versions, *known}
+        self.versions = {name: max(versions.get(name, 0), known.get(name, 0)) for name in names}
         self._files: list[tuple[str, bytes]] = []
         self._expires: dict[str, datetime] = {}
 
@@ -365,10 +365,10 @@ class Composer:
         targets: dict[str, dict[str, TargetFile]] = {name: {} for name in roles.get_roles()}
         for robot, release in sorted(releases.items()):
             path = release_target(robot)
-            more = {"custom": {"number": release.number}}
+            custom = {"custom": {"number": release.number}}
             hashes = {"sha256": release.sha256}
             targets[roles.get_role_for_target(path)][path] = TargetFile(
-                release.length, hashes, path, more
+                release.length, hashes, path, custom
             )
         before = self._present.targets
         key = self._signers[_TARGETS][0].public_key

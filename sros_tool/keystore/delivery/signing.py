@@ -530,13 +530,15 @@ def _check_key(
     An enclave that already shares its key with another enclave is renewed, with a note.
     """
     remedy = "Create a new key on the robot, with `sros create_request` in another folder."
-    same = (
+    is_same_key = (
         present_certificate
         if present_certificate and present_certificate.public_key() == request.public_key
         else None
     )
-    known_keys.refuse_revoked(request.public_key, f"the request for {request.name}", remedy, same)
-    if not same:
+    known_keys.refuse_revoked(
+        request.public_key, f"the request for {request.name}", remedy, is_same_key
+    )
+    if not is_same_key:
         known_keys.refuse_shared_key(request.public_key, request.name, remedy)
 
 
@@ -596,8 +598,8 @@ def _lost_rights_notes(
     if not text:
         return []
     lost = f"{replaced.enclave} loses: {replaced.lost_text()}."
-    again = "Then answer its request again with `sros sign_request --renew`."
-    return [Note("request.rights-lost", f"{lost} {text} {again}")]
+    remedy = "Then answer its request again with `sros sign_request --renew`."
+    return [Note("request.rights-lost", f"{lost} {text} {remedy}")]
 
 
 def _earlier_rights(

@@ -443,8 +443,8 @@ class _FilesOfChange:
         added = [f"{serial:x}" for serial in _listed_serials(after) - _listed_serials(before)]
         entries = ledger.with_values("serial", added).entries
         listed = {entry.enclave for entry in entries if entry.enclave}
-        there = (name for name in recorded if has_enclave(self.transaction.root, name))
-        kept = next((name for name in there if enclave_folder(name) not in self.changed), None)
+        existing = (name for name in recorded if has_enclave(self.transaction.root, name))
+        kept = next((name for name in existing if enclave_folder(name) not in self.changed), None)
         return listed | ({kept} if kept else set())
 
     def was_revoked(self, name: str) -> bool:

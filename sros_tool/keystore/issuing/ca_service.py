@@ -150,14 +150,14 @@ class CaService:
                 why = f"`{self.program}` cannot be started: {error.strerror}"
                 raise self._error(asked, why) from error
             answer, errors = _bounded_output(process)
-        said = " ".join(errors.decode(errors="replace").split())
+        error_text = " ".join(errors.decode(errors="replace").split())
         if answer is None:
             raise self._error(asked, f"`{self.program}` did not end within {_SECONDS} seconds")
         if len(answer) > _MOST_BYTES:
             raise self._error(asked, f"`{self.program}` wrote more than {_MOST_BYTES} bytes")
         if process.returncode:
             why = f"`{self.program}` ended with status {process.returncode}"
-            raise self._error(asked, f"{why}: {said}" if said else why)
+            raise self._error(asked, f"{why}: {error_text}" if error_text else why)
         return answer
 
     def _error(self, request: CertificateRequest, why: str) -> CaServiceError:

@@ -188,12 +188,12 @@ class EnclaveWriter:
         self._permissions_validity = window(now, template.permissions_validity)
         self.notes = tuple(
             note
-            for what, validity, authority in (
+            for kind, validity, authority in (
                 ("certificates", self._certificate_validity, identity),
                 ("permissions", self._permissions_validity, permissions),
             )
             if authority
-            and (note := _early_expiry(what, validity, authority.certificate, transaction.root))
+            and (note := _early_expiry(kind, validity, authority.certificate, transaction.root))
         )
         if permissions:
             self._permissions_validity = self._permissions_validity.intersection(
@@ -350,10 +350,10 @@ class EnclaveWriter:
     def _sign(self, name: str, permissions: Permissions) -> bytes:
         if self._signer is None:
             raise KeystoreError("there is no permissions CA to sign the permissions")
-        folder, what = enclave_folder(name), f"the permissions of {name}"
+        folder, document_name = enclave_folder(name), f"the permissions of {name}"
         document = render_permissions(permissions)
-        check_meaning(parse_permissions(document), permissions, what)
-        message = self._signer.sign(document, what)
+        check_meaning(parse_permissions(document), permissions, document_name)
+        message = self._signer.sign(document, document_name)
         self._transaction.write(f"{folder}/permissions.xml", document)
         self._transaction.write(f"{folder}/{PERMISSIONS_FILE}", message)
         return message

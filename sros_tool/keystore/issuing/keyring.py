@@ -209,12 +209,12 @@ class Keyring:
             KeystoreError: the key file cannot be read, or belongs to another user than the
                 keystore.
         """
-        what, root = f"{role} CA key", keystore.root
+        name, root = f"{role} CA key", keystore.root
         owner = root.stat().st_uid if root.exists() else os.geteuid()
         if self._is_from_user(role) or owner in (0, os.geteuid()):
-            return keystore.read(path, what)
+            return keystore.read(path, name)
         try:
-            return read_bytes(path, what, owner=owner)
+            return read_bytes(path, name, owner=owner)
         except DocumentError as error:
             raise KeystoreError(
                 error.what,

@@ -273,16 +273,16 @@ def example_topics(expressions: Iterable[str]) -> tuple[str, ...]:
     """
     known = sorted(set(expressions))
     wild = [expression for expression in known if is_expression(expression)]
-    found: set[str | None] = {name for name in known if not is_expression(name)}
+    topics: set[str | None] = {name for name in known if not is_expression(name)}
     for index, wildcard in enumerate(wild):
-        found.add(_uniquely_matched_name(wildcard, known))
-        found.add(_matching_name(wildcard))
+        topics.add(_uniquely_matched_name(wildcard, known))
+        topics.add(_matching_name(wildcard))
         for other_expression in wild[index + 1 :]:
             if overlap(wildcard, other_expression):
-                found.add(common_name([wildcard, other_expression], absolute=False))
+                topics.add(common_name([wildcard, other_expression], absolute=False))
     for prefix in ("rt/*", "rq/*Request", "rr/*Reply", "*"):
-        found.add(_uniquely_matched_name(prefix, known))
-    return tuple(sorted(topic for topic in found if topic))
+        topics.add(_uniquely_matched_name(prefix, known))
+    return tuple(sorted(topic for topic in topics if topic))
 
 
 def _matching_name(expression: str) -> str | None:

@@ -509,11 +509,11 @@ class KeystoreChange:
         serials = [entry.serial for entry in issued]
         known = self.keystore.ledger_file.with_values("serial", serials).entries
         counts = Counter([*serials, *(entry.serial for entry in known)])
-        if again := [entry for entry in issued if counts[entry.serial] > 1]:
+        if equal := [entry for entry in issued if counts[entry.serial] > 1]:
             raise KeystoreError(
-                f"the CA service issued a certificate for {again[0].enclave} with a serial number "
+                f"the CA service issued a certificate for {equal[0].enclave} with a serial number "
                 "that another certificate has",
-                f"It is {again[0].serial}; no revocation list could tell them apart. Nothing was "
+                f"It is {equal[0].serial}; no revocation list could tell them apart. Nothing was "
                 "changed.",
             )
         asked = window(self.now, self.template.certificate_validity)
@@ -745,7 +745,7 @@ def _revoked_names(
     """Yield a note on enclave names that revoked certificates also have, until these expire."""
     entries = ledger.entries
     revoked = {entry.serial for entry in entries if entry.what == "revocation"}
-    again = sorted(
+    revoked_again = sorted(
         {
             entry.enclave
             for entry in entries
@@ -756,10 +756,10 @@ def _revoked_names(
         }
         | {*replaced}
     )
-    if again:
+    if revoked_again:
         yield Note(
             "zenoh.revoked-name",
-            f"a revoked certificate of {', '.join(again)} has not expired: Zenoh has no revocation "
-            "list, so anyone who has the certificate gets the rights of that enclave. Give the "
-            "enclave another name, or replace the identity CA with `sros rotate_ca`.",
+            f"a revoked certificate of {', '.join(revoked_again)} has not expired: "
+            "Zenoh has no revocation list, so anyone who has the certificate gets the rights of that "
+            "enclave. Give the enclave another name, or replace the identity CA with `sros rotate_ca`.",
         )

@@ -317,9 +317,9 @@ def generate_artifacts(
     if create is None or not new_keystore:
         with change:
             _prepare_change(change, domain, fleet, patterns, wanted, protections)
-            again = _revoked_before(change, wanted, enclaves, fleet)
+            created_again = _revoked_before(change, wanted, enclaves, fleet)
             ended = dict(_expired_enclaves(change, wanted.keys() - {*enclaves}))
-            again = [*again, *ended.values()]
+            created_again = [*created_again, *ended.values()]
             if ended:
                 wanted = {name: wanted[name] for name in wanted if name not in ended}
             rights = write_enclaves(
@@ -330,7 +330,7 @@ def generate_artifacts(
                 places=places,
                 progress=progress,
             )
-        change.notes = [*again, *change.notes]
+        change.notes = [*created_again, *change.notes]
         return creation(change, rights)
     domains = domains or _domains_of(fleet, domain)
     check_domain(domains, domain, root)
@@ -399,8 +399,8 @@ def _revoked_before(
     existing, known, root = frozenset(change.names), change.known, change.root
     missing = [name for name in wanted_names if name not in existing]
     revoked = known.revoked_before(missing) if missing else ()
-    again = [name for name in missing if name in revoked]
-    if unasked := [name for name in again if name not in named]:
+    revoked_before = [name for name in missing if name in revoked]
+    if unasked := [name for name in revoked_before if name not in named]:
         raise KeystoreError(
             f"a policy names {', '.join(unasked)}, revoked in keystore '{root}'",
             "The policy would create it again, and `distribute_key --all` would export it.",
@@ -409,7 +409,7 @@ def _revoked_before(
             f"`sros generate_artifacts -k {quote(str(root))} -e {' '.join(unasked)} -p POLICY_FILE"
             f"{' --fleet FLEET_FILE' if fleet else ''}`.",
         )
-    return list(known.revoked_before_notes(again))
+    return list(known.revoked_before_notes(revoked_before))
 
 
 def refuse_other_template(root: Path, template: Template) -> None:
@@ -720,13 +720,13 @@ def _restart_text(mismatch: Mismatch, *, revoked: bool) -> str:
             "certificates of other processes. Until then, running processes communicate as before."
         )
     if mismatch:
-        which, what = "all processes", "do not communicate"
+        which, effect = "all processes", "do not communicate"
         if not mismatch.everything:
             which = "the processes that use these names"
-            what += f" on {', '.join(mismatch.names)}, but do on everything else"
+            effect += f" on {', '.join(mismatch.names)}, but do on everything else"
         return (
             f"Cyclone DDS and Fast DDS: restart {which} together; processes before and after the "
-            f"restart {what}. Until then, running processes communicate as before."
+            f"restart {effect}. Until then, running processes communicate as before."
         )
     return (
         "All vendors: restart the processes one by one, at any time; processes before and after "
@@ -1060,25 +1060,25 @@ class _EnclaveMaker:
 
     def _not_valid_error(self) -> KeystoreError:
         """Return the error that names all enclaves whose certificates are not valid now."""
-        found: dict[str, Window] = {}
+        windows: dict[str, Window] = {}
         for name in self._names:
             with suppress(SrosError):
                 path = enclave_path(self._root, name) / CERTIFICATE_FILE
                 validity = validity_of(self._change.keystore.certificate(path))
                 if not validity.contains(self._change.now):
-                    found[name] = validity
-        name, validity = next(iter(found.items()))
+                    windows[name] = validity
+        name, validity = next(iter(windows.items()))
         dates = f"is valid from {iso(validity.not_before)} to {iso(validity.not_after)}."
-        command = f"`sros renew {quote(str(self._root))} {self._robots_or_names(found)}`"
-        if len(found) == 1:
+        command = f"`sros renew {quote(str(self._root))} {self._robots_or_names(windows)}`"
+        if len(windows) == 1:
             return KeystoreError(
                 f"the certificate of enclave {name} is not valid now",
                 f"It {dates}",
                 f"Renew it with {command}.",
             )
         return KeystoreError(
-            f"the certificates of {len(found)} enclaves are not valid now: "
-            f"{first_few(list(found), _SHOWN)}",
+            f"the certificates of {len(windows)} enclaves are not valid now: "
+            f"{first_few(list(windows), _SHOWN)}",
             f"That of {name} {dates}",
             f"Renew them with {command}.",
         )

@@ -171,7 +171,7 @@ def restore_revocations(
             for entry in (*recorded, *unknown.values())
             if entry.what == "certificate" and entry.serial in reasons
         }
-        again = {
+        lost_revocations = {
             entry.enclave: reasons[serial]
             for serial, entry in sorted(issued.items())
             if reasons[serial] != SUPERSEDED and has_enclave(root, entry.enclave)
@@ -183,9 +183,9 @@ def restore_revocations(
             is_known = entry.serial in reasons or int(entry.serial or "0", 16) in known
             if (entry.enclave, entry.key) in replaced_keys and not is_known:
                 reasons[entry.serial], issued[entry.serial] = SUPERSEDED, entry
-        _check_names(change, tuple(again))
+        _check_names(change, tuple(lost_revocations))
         revocations = []
-        for name, reason in again.items():
+        for name, reason in lost_revocations.items():
             revocations += lists.revocations({name: _move_to_revoked(change, name)}, reason)
         done = {entry.serial for entry in revocations}
         for serial, reason in reasons.items():
@@ -198,7 +198,7 @@ def restore_revocations(
                     if serial in unknown:
                         entry = entry._replace(enclave=of.enclave, not_after=of.not_after)
                 revocations.append(entry)
-        gone = frozenset(again)
+        gone = frozenset(lost_revocations)
         number = max(change.keystore.ledger_file.next_number(), int(now.timestamp()))
         change.entries = [Entry(iso(now), RESTORED, number=number), *unknown.values()]
         if revocations or forgotten_lists.lists:
@@ -220,7 +220,7 @@ def restore_revocations(
         change.notes.append(_unknown_note(change, unknown))
     replaced = _key_revoked_by_enclave(change, revoked, {key for _, key in replaced_keys}, gone)
     change.notes += _replaced_notes(root, replaced)
-    outcomes = dict.fromkeys(again, "revoked") | dict.fromkeys(replaced, "replaced")
+    outcomes = dict.fromkeys(lost_revocations, "revoked") | dict.fromkeys(replaced, "replaced")
     return change.result(Changed, outcomes=outcomes)
 
 
@@ -302,10 +302,10 @@ def _unknown_note(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Note:
 
 def restored_note(restored: Changed, lists_from: str) -> Note:
     """Return a note on lists that `restore_revocations` took from ``lists_from``."""
-    again = "would be revoked again" if restored.dry_run else "is revoked again"
+    verb = "would be revoked again" if restored.dry_run else "is revoked again"
     text = (
         f"{lists_from} a revocation list that the keystore signed but does not know: the keystore "
-        f"was restored from a backup, or is a copy. Everything on the list {again}"
+        f"was restored from a backup, or is a copy. Everything on the list {verb}"
     )
     if again_revoked := restored.names("revoked"):
         text += f", with {first_few(again_revoked, _SHOWN)}"
@@ -395,15 +395,15 @@ def _move_to_revoked(change: KeystoreChange, name: str) -> Entry:
         )
     target = f"{REVOKED}/{certificate.serial_number:x}"
     with os.scandir(transaction.root / folder) as entries:
-        there = {entry.name: entry for entry in entries}
-    links = [file for file in _FILES if file in there and there[file].is_symlink()]
-    files = [file for file in _FILES if file in there and file not in links]
+        by_name = {entry.name: entry for entry in entries}
+    links = [file for file in _FILES if file in by_name and by_name[file].is_symlink()]
+    files = [file for file in _FILES if file in by_name and file not in links]
     if (
         name != "/"
         and CERTIFICATE_FILE in files
-        and len(files) + len(links) == len(there)
-        and all(there[file].is_file() for file in files)
-        and not (_PRIVATE in files and there[_PRIVATE].stat().st_mode & 0o077)
+        and len(files) + len(links) == len(by_name)
+        and all(by_name[file].is_file() for file in files)
+        and not (_PRIVATE in files and by_name[_PRIVATE].stat().st_mode & 0o077)
         and not os.path.lexists(transaction.root / target)
     ):
         transaction.move_folder(folder, target, files, links)
@@ -412,7 +412,7 @@ def _move_to_revoked(change: KeystoreChange, name: str) -> Entry:
         path = f"{folder}/{file}"
         if name == "/" and file == "governance.p7s":
             continue  # the governance of the keystore is in the folder of the enclave /
-        if file not in there:
+        if file not in by_name:
             continue
         if file not in links:
             known = file == CERTIFICATE_FILE

@@ -801,13 +801,13 @@ def _make_successors(
                 "Leave out --identity and --permissions.",
             )
     check_places(new_keys, replace(template, separate_authorities=len(files) > 1))
-    found = []
+    successors = []
     for file, serves in files.items():
         if wanted & set(serves):
             _check_place(change, file, serves[0], new_keys)
             at = f"{PRIVATE}/{'next_' if next_to else ''}{file}.key.pem"
-            found.append(_make_successor(change, file, serves, at, new_keys, validity))
-    return found
+            successors.append(_make_successor(change, file, serves, at, new_keys, validity))
+    return successors
 
 
 def _check_place(change: KeystoreChange, file: str, role: str, new_keys: Keyring) -> None:
@@ -852,7 +852,7 @@ def _make_successor(
 
 def _distributed_successors(change: KeystoreChange, rotation: Rotation) -> list[_Successor]:
     """Return the new CAs of a rotation at the stage DISTRIBUTE, with their keys."""
-    found = []
+    successors = []
     files = change.keystore.authority_files
     for replacement in rotation.replacements:
         roles = files[replacement.file]
@@ -871,8 +871,10 @@ def _distributed_successors(change: KeystoreChange, rotation: Rotation) -> list[
                 "Restore the key from a backup.",
             )
         old = tuple(certificate for certificate in certificates if certificate != new)
-        found.append(_Successor(replacement.file, roles, old, Authority(new, key), replacement.key))
-    return found
+        successors.append(
+            _Successor(replacement.file, roles, old, Authority(new, key), replacement.key)
+        )
+    return successors
 
 
 def _check_later(old: x509.Certificate, new: x509.Certificate) -> None:

@@ -144,10 +144,12 @@ def read_rotation(keystore: Keystore) -> Rotation:
             issuing = (
                 replacement.old if rotation.stage is RotationStage.DISTRIBUTE else replacement.new
             )
-            there = [
+            present_digests = [
                 digest(certificate) for certificate in keystore.certificates_of(replacement.file)
             ]
-            if there[0] != issuing or not {replacement.old, replacement.new} <= set(there):
+            if present_digests[0] != issuing or not {replacement.old, replacement.new} <= set(
+                present_digests
+            ):
                 raise ValueError
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise KeystoreError(

@@ -381,16 +381,16 @@ _ONLY_STATED = ("name", "description", "distributions")
 
 def _pending_stages(present_settings: PresentSettings, goal: _Goal) -> tuple[UpdateStage, ...]:
     """Return the stages that change something, in order."""
-    found = []
+    stages = []
     before, after = present_settings.settings, _first_step(present_settings, goal).settings
     if before != after:
-        found.append(UpdateStage.CREDENTIALS)
+        stages.append(UpdateStage.CREDENTIALS)
     if goal.governance() != present_settings.governance or present_settings.edits.governance:
-        found.append(UpdateStage.GOVERNANCE)
+        stages.append(UpdateStage.GOVERNANCE)
     named = any(getattr(before, key) != getattr(goal.settings, key) for key in _ONLY_STATED)
-    if not found and (named or present_settings.edits or present_settings.written is None):
-        found.append(UpdateStage.CREDENTIALS)
-    return tuple(found)
+    if not stages and (named or present_settings.edits or present_settings.written is None):
+        stages.append(UpdateStage.CREDENTIALS)
+    return tuple(stages)
 
 
 @dataclass(frozen=True, slots=True)
@@ -518,11 +518,11 @@ class _Updater:
 
     def _reissue(self, names: Sequence[str], progress: Progress | None) -> list[_Reissued]:
         before, after = self._present.settings, self._goal.settings
-        same = (before.default_permissions, before.short_lived) == (
+        same_permissions = (before.default_permissions, before.short_lived) == (
             after.default_permissions,
             after.short_lived,
         )
-        if same and not self._permissions:
+        if same_permissions and not self._permissions:
             return []
 
         closes = before.default_permissions == EVERYTHING != after.default_permissions
@@ -533,8 +533,8 @@ class _Updater:
             try:
                 state = read_credentials(keystore, name)
                 done = self._reissue_one(state)
-                same = done is None or not done.rights.lost
-                if closes and same and allows_everything(state.grant):
+                same_permissions = done is None or not done.rights.lost
+                if closes and same_permissions and allows_everything(state.grant):
                     return _KeptOpen(name, done)
                 return done
             except CaServiceError:
@@ -542,14 +542,16 @@ class _Updater:
             except SrosError as error:
                 return UnreadableEnclave(name, error)
 
-        found = self._writer.for_each(names, work, progress).values()
-        unreadable = tuple(enclave for enclave in found if isinstance(enclave, UnreadableEnclave))
+        enclaves = self._writer.for_each(names, work, progress).values()
+        unreadable = tuple(
+            enclave for enclave in enclaves if isinstance(enclave, UnreadableEnclave)
+        )
         refuse_unreadable(unreadable, "updated")
-        opened = [kept_open for kept_open in found if isinstance(kept_open, _KeptOpen)]
+        opened = [kept_open for kept_open in enclaves if isinstance(kept_open, _KeptOpen)]
         self._kept_open = tuple(kept_open.name for kept_open in opened)
         reissued = [
             kept_open.reissued if isinstance(kept_open, _KeptOpen) else kept_open
-            for kept_open in found
+            for kept_open in enclaves
         ]
         return [document for document in reissued if isinstance(document, _Reissued)]
 

@@ -228,8 +228,8 @@ _MOVED = re.compile(rf"{REVOKED}/[0-9a-f]+")
 
 def _stays_inside(path: str, target: str) -> bool:
     """Return whether a link at ``path`` to ``target`` leads to a place inside the keystore."""
-    whole = os.path.normpath(f"{os.path.dirname(path)}/{target}")
-    return not target.startswith("/") and not whole.startswith("..")
+    target_path = os.path.normpath(f"{os.path.dirname(path)}/{target}")
+    return not target.startswith("/") and not target_path.startswith("..")
 
 
 _KNOWN = re.compile(
@@ -292,15 +292,15 @@ def check_interrupted(folder: Folder) -> tuple[str | None, tuple[Move, ...]]:
 
 def _check_added(folder: Folder, path: str) -> None:
     """Raise `KeystoreError` unless all files below an added folder can belong to a keystore."""
-    whole = f"{STAGE}/{ADDED}/{path}".rstrip("/")
-    if stat.S_ISDIR(folder.mode(whole)):
-        _check_owner(folder, whole)
-        for name in folder.names(whole):
+    added_path = f"{STAGE}/{ADDED}/{path}".rstrip("/")
+    if stat.S_ISDIR(folder.mode(added_path)):
+        _check_owner(folder, added_path)
+        for name in folder.names(added_path):
             _check_added(folder, f"{path}/{name}".lstrip("/"))
         return
     if not is_layout_path(path):
         raise _damaged_stage_error(folder, f"{ADDED}/{path} is not a file of a keystore.")
-    _check_file(folder, whole)
+    _check_file(folder, added_path)
 
 
 def _check_file(folder: Folder, path: str) -> None:

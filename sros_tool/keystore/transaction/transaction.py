@@ -336,12 +336,12 @@ class Transaction:
 
         Links to a first revocation list are left out.
         """
-        found: dict[str, set[str]] = {}
+        folders: dict[str, set[str]] = {}
         for run in self.changes.since(0):
             if run.file:
                 continue
-            found.setdefault(run.folder.removesuffix("/"), set()).update(run.names)
-        return found
+            folders.setdefault(run.folder.removesuffix("/"), set()).update(run.names)
+        return folders
 
     def link(self, path: str, target: str) -> None:
         """Stage a symbolic link to ``target``, which is relative to the folder of ``path``."""
@@ -362,8 +362,8 @@ class Transaction:
 
     def remove(self, path: str) -> None:
         """Stage the removal of a file or link, and of folders that become empty."""
-        there = self._prepare_folder(path.rpartition("/")[0], wanted=False)
-        before = self._present_content(path) if there else None
+        exists = self._prepare_folder(path.rpartition("/")[0], wanted=False)
+        before = self._present_content(path) if exists else None
         if before is None:
             raise KeystoreError(f"'{self.root}/{path}' does not exist")
         self._begin_change(path, "remove")
@@ -538,8 +538,8 @@ class Transaction:
         if self._new_root:
             return []
         # What costs as much as the keystore has enclaves is left to who looks at all of them.
-        every = self._adopts or "enclaves" in self.__dict__
-        changed = None if every else self.changed_folders()
+        is_complete = self._adopts or "enclaves" in self.__dict__
+        changed = None if is_complete else self.changed_folders()
         return [path for path in _open_keys(self.root, changed) if not self.is_staged(path)]
 
     def _finish(self) -> None:
@@ -661,8 +661,8 @@ class _Bridge:
             kept = _path_of_old_content(move)
             self._folder.symlink(stage_link_target(move.path), kept)
             if not self._folder.exchange(kept, move.path):
-                whole = str(self._folder.path / move.path)
-                raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP), whole)
+                full_path = str(self._folder.path / move.path)
+                raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP), full_path)
 
     def keep(self, moves: Sequence[Move]) -> bool:
         """Hard-link or copy each old file into ``before``; return whether a file was copied."""
@@ -782,8 +782,8 @@ class KeystoreLock:
 
     def _is_there(self, handle: int) -> bool:
         """Return whether the locked file is still in the folder; unlocking removes it."""
-        there = self._folder.state(LOCK)
-        return there is not None and os.path.samestat(there, os.fstat(handle))
+        state = self._folder.state(LOCK)
+        return state is not None and os.path.samestat(state, os.fstat(handle))
 
     def release(self) -> None:
         """Unlock the keystore."""
@@ -956,15 +956,15 @@ def _make_folders(folder: Folder, paths: Iterable[str]) -> None:
     Raises:
         KeystoreError: a path exists and is not a real folder.
     """
-    there = {""}
+    existing = {""}
 
     def make(path: str) -> None:
-        if path in there:
+        if path in existing:
             return
         make(path.rpartition("/")[0])
         if not folder.is_folder(path):
             folder.mkdir(path, folder_mode(path))
-        there.add(path)
+        existing.add(path)
 
     for path in paths:
         make(path)
