@@ -760,6 +760,7 @@ def _revoked_names(
         yield Note(
             "zenoh.revoked-name",
             f"a revoked certificate of {', '.join(revoked_again)} has not expired: "
-            "Zenoh has no revocation list, so anyone who has the certificate gets the rights of that "
-            "enclave. Give the enclave another name, or replace the identity CA with `sros rotate_ca`.",
+            "Zenoh has no revocation list, so anyone who has the certificate gets the rights of "
+            "that enclave. Give the enclave another name, or replace the identity CA with "
+            "`sros rotate_ca`.",
         )
