@@ -588,7 +588,7 @@ def _access_on_zenoh(
         tuple(str(line.source) for line in explanation.stated.lines),
         answer.until,
         explanation.remedy,
-        question.word != "join" and asked.enclave.key_elsewhere,
+        explanation.counts_key,
     )
 
 

@@ -950,7 +950,7 @@ class ZenohOfKeystore:
 
 @shows(
     *("asked", "vendor", "vendor_title", "vendor_why", "answer", "out_of_date", "policy"),
-    *("permitted", "remedy", "change", "commands"),
+    *("permitted", "remedy", "change", "commands", "counts_key"),
     null_if_empty=("remedy",),
     spread=("asked", "answer"),
 )
@@ -1027,6 +1027,11 @@ class ZenohExplanation(NamedTuple):
     def commands(self) -> list[str]:
         """Commands that apply the change."""
         return self.stated.commands if self.wants_rights else []
+
+    @property
+    def counts_key(self) -> bool:
+        """Whether the answer assumes the enclave's key, which is not here."""
+        return self.asked.question.word != "join" and self.stated.counts_key
 
 
 def explain_on_zenoh(

@@ -290,6 +290,8 @@ def test_a_copy_without_keys_is_answered_as_if_they_were_there(keystore: Path) -
     for words in (("/talker", "publish", "/chatter"), ("--who", "publish", "/chatter")):
         said = explain(keystore, *words, "--vendor", "zenoh").ok()
         assert "note [explain.without-keys]: no enclave in" in said.err
+    assert zenoh(keystore, "/talker", "publish", "/chatter")["counts_key"] is True
+    assert zenoh(keystore, "/talker", "join")["counts_key"] is False
 
 
 def test_an_export_is_answered_by_its_own_cas(keystore: Path, tmp_path: Path) -> None:
