@@ -590,7 +590,7 @@ def test_the_table_has_every_name_and_those_that_only_one_side_may_use(
     sros("view", policy, "-o", path).ok()
     with opened(browser, path) as page:
         page.click("#tab-names")
-        assert "1 name may be used by one side only." in page.inner_text("#names")
+        assert "only names that one side may use (1)" in page.inner_text("#names")
         rows = page.locator("#names tbody tr")
         assert ["/lost" in each for each in rows.all_inner_texts()] == [False, True]
         page.fill("#search-names", "USED")
@@ -624,6 +624,15 @@ def test_a_phone_shows_first_who_may_drive_and_what_everybody_may_do(
         page.click("#names .link-button >> nth=0")
         assert "everybody may publish" in details(page)
         assert "everybody may publish" in " ".join(texts(page, "#map .card.names"))
+        page.click("#tab-map")
+        said = "May publish /cmd_vel: everybody with an identity, /mobile_robot/velocity_mux"
+        assert page.inner_text("#headlines").startswith(said)
+        # What was chosen stands alone with its neighbors, all in sight.
+        canvas = "document.querySelector('#canvas')"
+        fits = f"{canvas}.scrollWidth <= {canvas}.clientWidth"
+        assert page.locator("#map .card").count() == 5 and page.evaluate(fits)
+        page.click("#close")
+        assert page.locator("#map .card").count() > 50 and page.locator("#back").is_hidden()
 
 
 def test_it_prints_every_part(browser: Browser, robot_page: Path) -> None:

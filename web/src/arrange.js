@@ -31,16 +31,22 @@ function height(card) {
 function widthOf(card, around, least) {
   const { letter, smallLetter } = SIZES;
   const longest = (texts) => Math.max(0, ...texts.map((text) => text.length));
-  const room = Math.max(longest(card.lines) * letter, longest(card.notes) * smallLetter);
+  const lock = card.role === "names" ? 18 : 0; // it stands next to the names, not next to the notes
+  const room = Math.max(longest(card.lines) * letter, longest(card.notes) * smallLetter - lock);
   return Math.max(least, Math.round(room + around));
 }
 
-export function enclaveCard(id, path, notes = []) {
-  const card = { id, role: "enclave", members: [path], lines: wrapped(path, 22), notes, tags: "" };
-  return { ...card, width: widthOf(card, 24, 100), height: height(card) };
+// In a narrow drawing, three columns fit a phone.
+const WIDE = { enclave: 22, around: 24, name: 35, gap: 90, margin: 14 };
+const NARROW = { enclave: 15, around: 18, name: 14, gap: 26, margin: 8 };
+const sized = (narrow) => (narrow ? NARROW : WIDE);
+
+export function enclaveCard(id, path, notes = [], narrow = false) {
+  const card = { id, role: "enclave", members: [path], lines: wrapped(path, sized(narrow).enclave), notes, tags: "" };
+  return { ...card, width: widthOf(card, sized(narrow).around, 100), height: height(card) };
 }
 
-export function namesCard(id, bundle, notes = []) {
+export function namesCard(id, bundle, narrow = false) {
   const shown = bundle.names.slice(0, bundle.names.length > MOST_NAMES ? SHOWN_NAMES : MOST_NAMES);
   const rest = bundle.names.length - shown.length;
   const card = {
@@ -49,8 +55,8 @@ export function namesCard(id, bundle, notes = []) {
     kind: bundle.kind,
     level: bundle.protection.level,
     members: bundle.names,
-    lines: shown.flatMap((name) => wrapped(name, 35)),
-    notes: [...(rest ? [`and ${rest} more ${KINDS[bundle.kind]}s`] : []), ...notes, ...[bundle.open, bundle.lacks].filter(Boolean)],
+    lines: shown.flatMap((name) => wrapped(name, sized(narrow).name)),
+    notes: [...(rest ? [`and ${rest} more ${KINDS[bundle.kind]}s`] : []), ...[bundle.open, bundle.lacks].filter(Boolean)],
     tags: "",
     lacks: bundle.lacks,
   };
@@ -73,12 +79,12 @@ export function linkOf(source, target, bundle, ties) {
 }
 
 // The names that fit a filter: senders on the left, listeners on the right.
-export function columns(bundles) {
+export function columns(bundles, narrow = false) {
   const cards = new Map();
   const links = [];
   bundles.slice(0, MOST_BUNDLES).forEach((bundle, number) => {
     const id = `n${number}`;
-    cards.set(id, namesCard(id, bundle));
+    cards.set(id, namesCard(id, bundle, narrow));
     const groups = new Map();
     for (const tie of bundle.ties) {
       const key = `${sends(tie) ? "s" : "l"}${tie.enclave} ${tie.deny} ${tie.mark}`;
@@ -87,7 +93,7 @@ export function columns(bundles) {
     }
     for (const ties of groups.values()) {
       const side = `${sends(ties[0]) ? "s" : "l"}${ties[0].enclave}`;
-      if (!cards.has(side)) cards.set(side, enclaveCard(side, ties[0].enclave));
+      if (!cards.has(side)) cards.set(side, enclaveCard(side, ties[0].enclave, [], narrow));
       const ends = sends(ties[0]) ? [side, id] : [id, side];
       links.push(linkOf(...ends, bundle, ties));
     }
@@ -99,7 +105,7 @@ export function columns(bundles) {
     const width = Math.max(0, ...column.map((card) => card.width));
     for (const card of column) card.width = width;
   }
-  const scene = arranged(all, links);
+  const scene = arranged(all, links, narrow);
   return { ...scene, heads: heads(scene.cards) };
 }
 
@@ -118,7 +124,7 @@ function heads(cards) {
 
 // What flows to a name, or from it, so many hops far.  Names by which information goes between
 // the very same enclaves stand on one card.
-export function flowScene({ start, hops, steps }, upstream, most) {
+export function flowScene({ start, hops, steps }, upstream, most, narrow = false) {
   const ends = new Map();
   for (const { hop, bundle, tie, near } of steps) {
     if (hop > most || (!near && hop === most)) continue;
@@ -141,7 +147,7 @@ export function flowScene({ start, hops, steps }, upstream, most) {
   const links = [];
   [...merged].forEach(([key, { bundle, near, far }], number) => {
     const id = `n${number}`;
-    cards.push({ ...namesCard(id, bundle), chosen: key === "start" });
+    cards.push({ ...namesCard(id, bundle, narrow), chosen: key === "start" });
     for (const [side, before] of [[far, upstream], [near, !upstream]]) {
       for (const [path, ties] of side) {
         const pair = before ? [`e${path}`, id] : [id, `e${path}`];
@@ -151,14 +157,15 @@ export function flowScene({ start, hops, steps }, upstream, most) {
   });
   const used = new Set(links.flatMap((link) => [link.source, link.target]));
   for (const [path, hop] of hops) {
-    if (used.has(`e${path}`)) cards.push(enclaveCard(`e${path}`, path, [counted(hop, "hop")]));
+    if (used.has(`e${path}`)) cards.push(enclaveCard(`e${path}`, path, [counted(hop, "hop")], narrow));
   }
-  return arranged(cards, links);
+  return arranged(cards, links, narrow);
 }
 
-function arranged(cards, links) {
+function arranged(cards, links, narrow) {
+  const { gap, margin } = sized(narrow);
   const graph = new dagre.graphlib.Graph({ multigraph: true });
-  graph.setGraph({ rankdir: "LR", nodesep: 9, edgesep: 4, ranksep: 90, marginx: 14, marginy: 34 });
+  graph.setGraph({ rankdir: "LR", nodesep: 9, edgesep: 4, ranksep: gap, marginx: margin, marginy: 34 });
   graph.setDefaultEdgeLabel(() => ({}));
   for (const card of cards) graph.setNode(card.id, { width: card.width, height: card.height });
   links.forEach((link, number) => graph.setEdge(link.source, link.target, {}, `${number}`));

@@ -13,7 +13,6 @@ const VERBS = {
   call: "May call",
   execute: "May execute",
 };
-const PERMITTED = "only the enclaves below";
 const MOST = 60;
 
 function chip(kind, text) {
@@ -95,29 +94,6 @@ export function enclaveDetails(model, path, act) {
   if (found.length) {
     parts.push(section("Findings", el("ul", { class: "plain" }, found.map((each) => findingItem(each)))));
   }
-  parts.push(
-    facts([
-      ["Group", enclave.group],
-      ["Nodes", enclave.nodes.join(", ")],
-      ["Certificate", enclave.subject],
-      ["Issued by", enclave.issuer],
-      ["Serial number", enclave.serial],
-      ["Key", enclave.key],
-    ]),
-  );
-  const validities = model.validitiesOf(path);
-  if (validities.length) {
-    const items = validities.map((each) =>
-      el(
-        "li",
-        {},
-        el("b", { text: each.kind }),
-        ` ${dateText(each.not_before)} to ${dateText(each.not_after)} `,
-        chip(daysLeft(each) < 0 ? "error" : daysLeft(each) < 30 ? "warning" : "", leftText(each)),
-      ),
-    );
-    parts.push(section("Validity", el("ul", { class: "plain" }, items)));
-  }
   for (const [right, group] of byRight(ties)) {
     const names = group.flatMap(({ tie, bundle }) =>
       bundle.names.map((name) => ({ tie, kind: bundle.kind, name })),
@@ -143,6 +119,28 @@ export function enclaveDetails(model, path, act) {
     );
     parts.push(section("Wildcards as written", el("ul", { class: "plain" }, items)));
   }
+  const validities = model.validitiesOf(path);
+  if (validities.length) {
+    const items = validities.map((each) =>
+      el(
+        "li",
+        {},
+        el("b", { text: each.kind }),
+        ` ${dateText(each.not_before)} to ${dateText(each.not_after)} `,
+        chip(daysLeft(each) < 0 ? "error" : daysLeft(each) < 30 ? "warning" : "", leftText(each)),
+      ),
+    );
+    parts.push(section("Validity", el("ul", { class: "plain" }, items)));
+  }
+  const identity = facts([
+    ["Group", enclave.group],
+    ["Nodes", enclave.nodes.join(", ")],
+    ["Certificate", enclave.subject],
+    ["Issued by", enclave.issuer],
+    ["Serial number", enclave.serial],
+    ["Key", enclave.key],
+  ]);
+  if (identity.childElementCount) parts.push(section("Identity", identity));
   return parts;
 }
 
@@ -160,20 +158,6 @@ export function nameDetails(model, kind, name, act) {
       hasFlow ? el("button", { type: "button", text: "Whom it influences", onclick: () => act.flow(kind, name, false) }) : null,
     ),
   ];
-  if (protection.level === "unknown") {
-    parts.push(el("p", { class: "soft", text: "The protection is not known: a policy does not state it." }));
-  } else {
-    parts.push(
-      facts([
-        ["Protection", LEVELS[protection.level]],
-        ["Data", protection.data],
-        ["Metadata", protection.metadata],
-        ["RTPS messages", protection.rtps],
-        [`Who may ${SENDS[kind]}`, protection.write_control ? PERMITTED : bundle.everybody],
-        [`Who may ${RECEIVES[kind]}`, protection.read_control ? PERMITTED : bundle.everybody],
-      ]),
-    );
-  }
   if (bundle.lacks) parts.push(el("p", {}, chip("warning", bundle.lacks)));
   if (bundle.open) parts.push(el("p", {}, chip("warning", bundle.open)));
   for (const [title, wanted, controlled] of [
@@ -196,10 +180,18 @@ export function nameDetails(model, kind, name, act) {
       ),
     );
     const nobody = el("p", { class: "soft", text: controlled ? noneText(bundle, allowed, "Nobody.") : "Nobody is named." });
-    const everybody = controlled ? null : el("p", { text: "Everybody with an identity; permissions allow it to:" });
+    const everybody = controlled ? null : el("p", { text: `It is open to ${bundle.everybody}; permissions allow it to:` });
     const heading = controlled ? `${title} (${ties.length})` : `${title} (everybody)`;
     parts.push(section(heading, ...[everybody, ties.length ? longList(items) : nobody].filter(Boolean)));
   }
+  const level = facts([
+    ["Level", LEVELS[protection.level]],
+    ["Data", protection.data],
+    ["Metadata", protection.metadata],
+    ["RTPS messages", protection.rtps],
+  ]);
+  const unknown = el("p", { class: "soft", text: "It is not known: a policy does not state it." });
+  parts.push(section("Protection", protection.level === "unknown" ? unknown : level));
   const others = bundle.names.filter((each) => each !== name);
   if (others.length) {
     const items = others.map((each) => el("li", {}, link(each, () => act.name(kind, each))));

@@ -5,7 +5,7 @@ import { cardDetails, enclaveDetails, equalDetails, findingItem, nameDetails } f
 import { byId, counted, el, svg } from "./dom.js";
 import { drawScene, legend } from "./draw.js";
 import { Model } from "./model.js";
-import { namesTable } from "./table.js";
+import { drivers, namesTable } from "./table.js";
 import { timeline } from "./timeline.js";
 import { KINDS, LEVELS, markText } from "./words.js";
 
@@ -33,7 +33,7 @@ function currentScene() {
     const { kind, name, upstream, hops } = state.flow;
     const flow = model.flow(kind, name, upstream);
     const most = Math.max(1, ...flow.hops.values());
-    const scene = flowScene(flow, upstream, Math.min(hops, most));
+    const scene = flowScene(flow, upstream, Math.min(hops, most), isSmall());
     const within = [...flow.hops.values()].filter((hop) => hop <= hops).length;
     const verb = upstream ? "can influence" : "can be influenced by";
     scene.title = `${counted(within, "enclave")} ${verb} ${name} within ${counted(hops, "hop")}`;
@@ -43,13 +43,24 @@ function currentScene() {
   }
   if (filtering()) {
     const bundles = model.filtered({ ...state.filters, common: state.scene > 0 });
-    const scene = columns(bundles);
+    const scene = columns(bundles, isSmall());
     const names = bundles.reduce((sum, bundle) => sum + bundle.names.length, 0);
     scene.title = `${counted(names, "name")} ${names === 1 ? "fits" : "fit"}`;
     if (bundles.length > MOST_BUNDLES) scene.title += `; drawn are the first ${MOST_BUNDLES} groups of them: filter further`;
     return scene;
   }
-  return model.scenes[state.scene];
+  return alone() ?? model.scenes[state.scene];
+}
+
+// On a small screen, what was chosen is drawn with its neighbors alone: side by side, they fit.
+function alone() {
+  const { type, path, kind, name, card } = (isSmall() && state.chosen) || {};
+  if (!type || card?.role === "group" || (card && card.role !== "names")) return null;
+  const names = card?.members ?? [name];
+  const bundles = path
+    ? model.filtered({ enclave: path, common: state.scene > 0 }).map((each) => ({ ...each, ties: each.ties.filter((tie) => tie.enclave === path) }))
+    : [{ ...model.bundle(kind ?? card.kind, names[0]), names }];
+  return { ...columns(bundles, true), title: path ? `What ${path} may use` : `Who may use ${names[0]}` };
 }
 
 function showMap() {
@@ -62,7 +73,7 @@ function showMap() {
     ? `${counted(model.enclaves.length, "enclave")}, ${counted(scene.shown, "name")}${scene.hidden ? `; left out: ${counted(scene.hidden, "name")}${why}` : ""}`
     : scene.title;
   byId("summary").textContent = scene.cards.length ? summary : "Nothing fits.";
-  byId("back").hidden = !(state.flow || filtering());
+  byId("back").hidden = scene === model.scenes[state.scene];
   byId("hops").hidden = !state.flow;
   if (state.flow) byId("hops-number").textContent = counted(Math.min(state.flow.hops, scene.most), "hop");
   zoom(0);
@@ -88,7 +99,7 @@ function zoom(step) {
   const { width } = state.shown;
   const room = byId("canvas").clientWidth - 2;
   // On a small screen the letters stay readable, and the map is moved instead.
-  const least = isSmall() ? 0.9 : 0.72;
+  const least = isSmall() ? 0.76 : 0.72;
   if (step === 0) state.zoom = Math.min(1.15, Math.max(least, room / width));
   else state.zoom = Math.min(2.5, Math.max(0.05, state.zoom * (step > 0 ? 1.2 : 1 / 1.2)));
   byId("map").setAttribute("width", Math.round(width * state.zoom));
@@ -171,12 +182,14 @@ function chosen(what) {
   unfoldSheet(true);
   if (byId("details").hidden) {
     state.opener = document.activeElement;
+    state.scrolled = window.scrollY;
     byId("details").hidden = false;
     zoom(0);
   }
   byId("details").scrollTop = 0;
   byId("details-content").querySelector("h2").focus({ preventScroll: true });
-  light();
+  if (isSmall()) showMap();
+  else light();
 }
 
 // On a small screen, the details are a sheet, of which only the title shows while one looks at a flow.
@@ -190,8 +203,13 @@ function close() {
   state.chosen = null;
   byId("details").hidden = true;
   document.body.classList.remove("with-details");
-  zoom(0);
-  light();
+  if (was && isSmall()) {
+    showMap();
+    window.scrollTo(0, state.scrolled);
+  } else {
+    zoom(0);
+    light();
+  }
   const opener = state.opener?.checkVisibility() ? state.opener : document.querySelector("#map [tabindex='0']");
   if (was) opener?.focus({ preventScroll: true });
 }
@@ -280,12 +298,19 @@ function fillLists() {
   }
   byId("findings").replaceChildren(sorted.length ? list : none);
   byId("tab-findings").textContent = sorted.length ? `Findings (${sorted.length})` : "Findings";
+  const opens = (kind, name) => model.bundle(kind, name) && (() => act.name(kind, name));
+  // A focus has its own answer, and in a comparison there are two.
+  if (!model.overlay && model.scenes[0].id !== "focus") {
+    const said = drivers(model.rows, opens, () => showTab("names"));
+    if (said.length) byId("headlines").append(el("div", { class: "drivers" }, said));
+    byId("headlines").hidden = !byId("headlines").children.length;
+  }
   const lacking = model.bundles.filter((each) => each.lacks && !each.ties.every((tie) => tie.common));
   byId("names").replaceChildren(
     ...namesTable(
       model.rows,
       lacking.reduce((sum, each) => sum + each.names.length, 0),
-      (kind, name) => model.bundle(kind, name) && (() => act.name(kind, name)),
+      opens,
     ),
   );
   byId("timeline").replaceChildren(...timeline(model.validities, act.enclave));
@@ -335,7 +360,10 @@ function start() {
       event.preventDefault();
     }
   });
-  byId("back").addEventListener("click", () => setScene(state.scene));
+  byId("back").addEventListener("click", () => {
+    if (isSmall()) close();
+    setScene(state.scene);
+  });
   byId("close").addEventListener("click", close);
   byId("sheet").addEventListener("click", () => unfoldSheet(document.body.classList.contains("with-title-only")));
   byId("canvas").addEventListener("scroll", fadeEdges);
@@ -369,7 +397,15 @@ function start() {
   fillLists();
   showTab(isSmall() && !model.overlay && model.scenes[0].id !== "focus" ? "names" : "map");
   showMap();
+  if (startsWithoutEnclaves()) showTab("names");
   document.body.dataset.ready = "true";
+}
+
+// The top of a long map may have names only; then the table says more.
+function startsWithoutEnclaves() {
+  const { id, cards } = state.shown;
+  const tops = cards.filter((card) => card.role !== "names").map((card) => card.y);
+  return id === "essential" && !model.overlay && Math.min(...tops) * state.zoom > byId("canvas").clientHeight;
 }
 
 function hop(step) {

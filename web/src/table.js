@@ -5,12 +5,15 @@ import { KINDS, LEVELS, RECEIVES, SENDS, noneText } from "./words.js";
 
 const SHOWN = 4;
 const MOST = 400;
+const DRIVERS = 3;
 // What usually moves a robot stands first, then what is open to everybody; what only one side may
 // use is last.  Each part is in the order of names.
 const MOVES = /(^|\/)(cmd_vel|[^/]*commands?$|joint_trajectory|follow_joint_trajectory)/;
 
+const moves = (name) => MOVES.test(name);
+
 function rank(row) {
-  return row.names.some((name) => MOVES.test(name)) ? 0 : row.all_send || row.all_receive ? 1 : row.lacks ? 3 : 2;
+  return row.names.some(moves) ? (row.lacks ? 1 : 0) : row.all_send || row.all_receive ? 2 : row.lacks ? 4 : 3;
 }
 
 function mentions(row, text) {
@@ -29,6 +32,26 @@ function folded(items) {
   const rest = items.slice(SHOWN);
   if (!rest.length) return items;
   return [...items.slice(0, SHOWN), el("details", {}, el("summary", { text: `and ${rest.length} more` }), rest)];
+}
+
+// Who may drive the robot, for the top of the map; `onRest` shows the names that are left out.
+export function drivers(rows, opens, onRest) {
+  const found = rows.filter((row) => rank(row) < 2).sort((a, b) => rank(a) - rank(b));
+  const said = found.slice(0, DRIVERS).map((row) => {
+    const name = row.names.find(moves);
+    const all = [...(row.all_send ? [row.everybody] : []), ...row.senders];
+    const rest = all.length > SHOWN ? ` and ${all.length - SHOWN} more` : "";
+    const who = all.length ? `${all.slice(0, SHOWN).join(", ")}${rest}` : noneText(row, row.receivers);
+    return el("p", {}, `May ${SENDS[row.kind]} `, button(row.kind, name, opens), `: ${who}`);
+  });
+  const rest = found.length - said.length;
+  const more = { type: "button", class: "link-button", text: `and ${rest} more in the table`, onclick: onRest };
+  return rest ? [...said, el("p", {}, el("button", more))] : said;
+}
+
+function button(kind, name, opens) {
+  const open = opens(kind, name);
+  return open ? el("button", { type: "button", class: "link-button", text: name, onclick: open }) : el("code", { text: name });
 }
 
 // `lacking` is the number of names that only one side may use;
@@ -58,19 +81,14 @@ export function namesTable(rows, lacking, opens) {
   const head = ["Name", "May publish or call", "May subscribe or serve", "Protection"].map((text) => el("th", { scope: "col", text }));
   return [
     el("label", { class: "search" }, "Name or enclave ", search),
-    el("p", {}, lacking ? `${counted(lacking, "name")} may be used by one side only.` : "Every name may be used by both sides."),
-    el("p", { class: "choices" }, el("label", {}, only, " only names that one side may use"), el("label", {}, basics, " also names that every node needs")),
+    el("p", { class: "choices" }, el("label", {}, only, ` only names that one side may use (${lacking})`), el("label", {}, basics, " also names that every node needs")),
     status,
     el("table", { class: "names" }, el("thead", {}, el("tr", {}, head)), body),
   ];
 }
 
 function line(row, opens) {
-  const names = row.names.map((name) => {
-    const open = opens(row.kind, name);
-    const link = open && el("button", { type: "button", class: "link-button", text: name, onclick: open });
-    return el("div", {}, link || el("code", { text: name }));
-  });
+  const names = row.names.map((name) => el("div", {}, button(row.kind, name, opens)));
   const denied = row.denied.length ? el("div", {}, el("span", { class: "chip deny", text: "DENY" }), " ", list(row.denied, "")) : null;
   return el(
     "tr",
