@@ -15,7 +15,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
-from itertools import groupby
+from itertools import groupby, starmap
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -213,7 +213,7 @@ _MOST_NAMES = 4
 
 def render_demo_page(result: Json, made: str) -> str:
     """Return the HTML page of a demo's result; ``made`` says by which release of sros, and when."""
-    scenarios = map(_demo_scenario, result["scenarios"])
+    scenarios = starmap(_demo_scenario, enumerate(result["scenarios"]))
     body = "\n".join((_demo_head(result, made), *scenarios, _demo_vulnerabilities(result)))
     title = f"sros demo on {result['dds']}"
     return _document(title, f"<main>{body}</main>", _asset("demo.css"))
@@ -282,8 +282,21 @@ def _demo_head(result: Json, made: str) -> str:
     return (
         f"<header><h1>sros demo: {good} of {len(rows)} attempts ended as they should</h1>"
         f"<p>On a real middleware: {', '.join(facts)}. {_sentence(made)}</p>"
-        f'<ul class="tiles">{shown}</ul><p class="soft">{_sentence(why)}</p></header>'
+        f'<ul class="tiles">{shown}</ul><p class="soft">{_sentence(why)}</p>'
+        f"{_demo_contents(result['scenarios'])}</header>"
     )
+
+
+def _demo_contents(scenarios: Sequence[Json]) -> str:
+    """Return links to the scenarios, where there are several."""
+    if len(scenarios) < 2:
+        return ""
+    lines = (
+        f'<li><a href="#scenario-{number}">{escape(each["title"])}: '
+        f"{_number_as_expected(each['rows'])} of {len(each['rows'])}</a></li>"
+        for number, each in enumerate(scenarios)
+    )
+    return f'<ul class="contents">{"".join(lines)}</ul>'
 
 
 def _demo_vulnerabilities(result: Json) -> str:
@@ -328,10 +341,10 @@ def _untried_attempts(scenario: Json) -> Sequence[str]:
     return keystore["not_tried"] if keystore else ()
 
 
-def _demo_scenario(scenario: Json) -> str:
+def _demo_scenario(number: int, scenario: Json) -> str:
     rows = scenario["rows"]
     good = _number_as_expected(rows)
-    parts = [f"<section><h2>{escape(scenario['title'])}</h2>"]
+    parts = [f'<section id="scenario-{number}"><h2>{escape(scenario["title"])}</h2>']
     if scenario.get("cast"):
         members = (
             f"<b>{escape(member['part'])}</b> {escape(member['enclave'])}"

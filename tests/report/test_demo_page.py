@@ -64,11 +64,14 @@ def test_what_was_not_tried_is_said_and_nothing_of_it_is_green() -> None:
     shown = result(row("b"), skipped) | {"left_out": 3, "as_expected": False}
     keystore = {"enclaves": 7, "elsewhere": 1, "not_tried": ["a", HOSTILE[0]]}
     cast = [{"part": "guest", "enclave": "/a", "nodes": [], "why": f"why {HOSTILE[0]}"}]
-    shown["scenarios"] = [{**shown["scenarios"][0], "keystore": keystore, "cast": cast}]
+    shown["scenarios"] = [{**shown["scenarios"][0], "keystore": keystore, "cast": cast}] * 2
     page = html.fromstring(render_demo_page(shown, ""))
+    links = {each.get("href"): each.text_content() for each in page.cssselect(".contents a")}
+    assert links == dict.fromkeys(("#scenario-0", "#scenario-1"), "every way in: 1 of 2")
+    assert all(page.cssselect(f"section{link} h2") for link in links)
     tiles = {each.text_content(): each.get("class", "") for each in page.cssselect("li.tile")}
     assert "good" not in tiles["1 of 2 attempts ended as they should"]
-    assert {"1 skipped", "3 left out", "2 not tried, but needed for a proof"} <= set(tiles)
+    assert {"1 skipped", "3 left out", "4 not tried, but needed for a proof"} <= set(tiles)
     text = page.text_content()
     assert f"Not tried, and needed for a proof: a; {HOSTILE[0]}." in text
     assert f"guest /a (why {HOSTILE[0]})" in text
