@@ -49,10 +49,20 @@ html_extra_path = ["_root"]
 html_theme_options = {"navigation_with_keys": True}
 
 
-def _keep_options_whole(
+def _mark_lines(code: re.Match[str]) -> str:
+    """Mark the lines of a block of code, so that the rest of a long line is indented further."""
+    marked = []
+    for line in code[2].splitlines(keepends=True):
+        text = re.sub(r"<[^>]+>", "", line)
+        rest = min(len(text) - len(text.lstrip(" ")), 12) + 2
+        marked.append(f'<span class="line" style="--rest: {rest}ch">{line}</span>')
+    return f"{code[1]}{''.join(marked)}</pre>"
+
+
+def _mark_code(
     _app: Sphinx, _page: str, _template: str, context: dict[str, Any], _tree: object
 ) -> None:
-    """Mark the options in commands, within which a browser would break the line."""
+    """Mark lines of code, and options in commands, within which a browser would break the line."""
     context["body"] = re.sub(
         r"<pre>.*?</pre>|<code .*?</code>",
         lambda pre: re.sub(
@@ -61,8 +71,12 @@ def _keep_options_whole(
         context.get("body", ""),
         flags=re.DOTALL,
     )
+    # Pygments closes every span at the end of a line.
+    context["body"] = re.sub(
+        r"(<pre><span></span>)(.*?)</pre>", _mark_lines, context["body"], flags=re.DOTALL
+    )
 
 
 def setup(app: Sphinx) -> None:
     """Connect to Sphinx, which calls this."""
-    app.connect("html-page-context", _keep_options_whole)
+    app.connect("html-page-context", _mark_code)
