@@ -456,16 +456,15 @@ def _finding_line(finding: Finding) -> str:
 
 
 def _undenied_lines(change: AccessChange) -> Iterator[str]:
-    """Yield a line for each DENY that is dropped."""
+    """Yield a line for each DENY that is dropped or narrowed."""
     from sros_tool.fleet.robots import folded
 
-    lines = (
-        (
-            right.enclave,
-            f"! {right.enclave} DENY {right.describe()} is gone: other policies may allow it now",
-        )
-        for right in change.undenied
-    )
+    lines = []
+    for right, name in change.undenied:
+        gone = f"gone for names such as {name}: other policies may allow them now"
+        text = f"! {right.enclave} DENY {right.describe()} is "
+        text += gone if name else "gone: other policies may allow it now"
+        lines.append((right.enclave, text))
     return folded(change.after.fleet, lines)
 
 

@@ -37,7 +37,17 @@ from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import RightsSource, SourcesDifference, compare_sources
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Profile
-from sros_tool.policy.rights import PlacedRight, Right, Rules, folded, placed_rights, policy_rights
+from sros_tool.policy.patterns import common_name
+from sros_tool.policy.rights import (
+    PlacedRight,
+    Right,
+    Rules,
+    folded,
+    parts,
+    placed_rights,
+    policy_rights,
+    unfolded,
+)
 from sros_tool.proof.commit_files import (
     CommitFiles,
     includes_files,
@@ -110,14 +120,14 @@ class ReviewRequest:
 class AccessChange:
     """Access that HEAD allows and BASE does not.
 
-    ``undenied`` are denials that HEAD drops without allowing their names: users who merge the
-    policy with others may rely on them.
+    ``undenied`` are denials that HEAD drops or narrows without allowing their names, each with a
+    name if HEAD still denies others: users who merge the policy with others may rely on them.
     """
 
     before: AccessSource
     after: AccessSource
     growth: Growth
-    undenied: tuple[Right, ...]
+    undenied: tuple[tuple[Right, str], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -736,17 +746,8 @@ class _Review:
         self, before: AccessSource, after: AccessSource, moving: Sequence[PlacedRight] = ()
     ) -> tuple[int, Content]:
         growth = compare_access(before, after)
-        stated = Rules(after.rights)
-        left = {right.enclave for right in after.rights}
-        undenied = tuple(
-            right
-            for right in sorted(folded(before.rights))
-            if right.qualifier is DENY
-            and right.enclave in left
-            and not stated.overlaps(right._replace(qualifier=ALLOW))
-            and not stated.cover(right)
-        )
-        undenied += tuple(moved.right for moved in moving if moved.right.qualifier is DENY)
+        undenied = tuple(_undenied(before, after))
+        undenied += tuple((moved.right, "") for moved in moving if moved.right.qualifier is DENY)
         status = _FOUND if growth or undenied else _OK
         return status, AccessChange(before, after, growth, undenied)
 
@@ -937,6 +938,29 @@ def _fixed_or_moving_names(before: AccessSource, after: AccessSource) -> Iterato
         denies = placed.right.qualifier is DENY
         if denies and now.cover(placed.right) and not now_elsewhere.cover(moved):
             yield next(denial for denial in denials if Rules([denial.right]).overlaps(placed.right))
+
+
+def _undenied(before: AccessSource, after: AccessSource) -> Iterator[tuple[Right, str]]:
+    """Yield denials of which ``after`` neither denies nor allows all names (`AccessChange`)."""
+    stated = Rules(after.rights)
+    left = {right.enclave for right in after.rights} | after.permissions.keys()
+
+    def undenied_name(part: Right) -> str | None:
+        if part.enclave not in left or stated.cover(part):
+            return None
+        allowed = stated.overlapping(part._replace(qualifier=ALLOW))
+        if part.kind == "dds":  # has no ROS name to search for
+            return None if allowed else part.name
+        stated_names = [right.name for right in (*allowed, *stated.overlapping(part))]
+        return common_name([part.name], stated_names)
+
+    names = {
+        part: undenied_name(part) for part in unfolded(before.rights) if part.qualifier is DENY
+    }
+    for right in sorted(folded(part for part, name in names.items() if name)):
+        part = parts(right)[0]
+        name = (names[part] or "").removesuffix(part.name.removeprefix(right.name))
+        yield right, name if stated.overlaps(right) else ""
 
 
 def _moved_rights(enclave: Enclave) -> Iterator[tuple[PlacedRight, Right]]:

@@ -164,11 +164,20 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
     ended = change.review("--policy", "robot.xml\nsecond.xml")
     assert "  ~ /c subscribe topic /arm/x has a / at its beginning, so that it does" in ended.out
     # A DENY of what nobody allows is a promise to those who merge the policy with others.
-    change.base = change.commit({"second.xml": policy_text({"/c": denies.format("/stop") + reads})})
-    change.commit({"second.xml": policy_text({"/c": reads})})
+    # Names that are still denied, or are allowed now, do not count: /cmd* is only split.
+    allows = publish("/lidar/*")
+
+    def denied(*names: str) -> str:
+        return policy_text({"/c": allows + denies.format("</topic><topic>".join(names))})
+
+    change.base = change.commit({"second.xml": denied("/stop", "/*/erase", "/cmd*", "/lidar/x")})
+    change.commit({"second.xml": denied("/lidar*/erase", "/cmd", "/cmd?*")})
     ended = change.review("--policy", "robot.xml\nsecond.xml")
-    assert ended.status == 1 and "; 1 DENY gone" in ended.out
-    assert "  ! /c DENY publish topic /stop is gone: other policies may allow it now" in ended.out
+    assert ended.status == 1 and "; 2 DENYs gone" in ended.out, ended
+    assert (
+        "  ! /c DENY publish topic /*/erase is gone for names such as /a/erase: other policies may "
+        "allow them now\n  ! /c DENY publish topic /stop is gone: other policies may allow it now"
+    ) in ended.out
 
 
 def test_a_name_has_a_line_only_if_it_is_new_in_another_namespace(change: Change) -> None:
