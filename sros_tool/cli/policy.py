@@ -271,7 +271,8 @@ def diff_policy(
     decided. sros assumes that a policy is signed with a governance that controls all access. If A
     is a policy, a keystore B that protects less than the template production counts as giving more
     access; a policy B never lowers the protection. The last line says what is assumed and what is
-    left out, such as dates.
+    left out, such as dates. A DENY that B lacks is reported only if B allows names of it; `sros
+    review` also reports the others.
 
     Example:
       $ sros diff_policy robot.xml keystore
