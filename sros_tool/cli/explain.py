@@ -259,7 +259,8 @@ def explain(
     keystore, sros decides by the permissions that the policy would give.
 
     The exit status is 0 if the operation is allowed (with --who: to at least one enclave), and 1 if
-    it is denied; with --log, 1 if the log reports a fault.
+    it is denied; with --log, 1 if the log reports a fault. An action is allowed only as a whole:
+    "in part" names the enclaves that can still command its server, for example by send_goal.
 
     Example:
       $ sros explain keystore /talker publish /chatter --policy robot.xml
@@ -916,7 +917,7 @@ def _print_answer_for_all(
     else:
         _echo(_who_lines(answer, *where))
         echo(f"decided by {decider.title}", err=True)
-        if not kind and not answer.allowed:
+        if not (kind or answer.allowed or any(outcome.in_part for outcome in answer.outcomes)):
             enclaves = {outcome.enclave for outcome in answer.outcomes}
             hint = callable_action(decider, answer.question) or names_meant(
                 decider, answer.question, enclaves
@@ -943,11 +944,15 @@ def _who_lines(
     from sros_tool.fleet.robots import folded
 
     able = [outcome for outcome in answer.outcomes if outcome.allowed]
+    in_part = [outcome for outcome in answer.outcomes if outcome.in_part]
     lines = []
     by_domains = Counter(outcome.domains for outcome in able)
     everywhere = str(domains) if domains else next(iter(by_domains), "")
     if domain is not None or not by_domains.keys() - {everywhere}:
         by_domains.clear()
+    for outcome in in_part:
+        parts = ", ".join(outcome.in_part)
+        lines.append((outcome.enclave, f"{outcome.enclave}  in part: {parts}"))
     for outcome in able:
         wildcard = f"  by the wildcard {outcome.wildcard}" if outcome.wildcard else ""
         where = f"  in domain {outcome.domains}" if by_domains else ""
@@ -962,7 +967,11 @@ def _who_lines(
     where = "" if domain is None else f" in domain {domain}"
     if by_domains:
         where = f": {', '.join(f'{n} in domain {text}' for text, n in by_domains.items())}"
-    yield f"{len(able)} of {count}{asked_in} may {answer.question}{where}"
+    whole = f"{len(able)} of {count}{asked_in} may {answer.question}"
+    if in_part:
+        whole = f"{len(in_part)} of {count}{asked_in} may {answer.question} in part, {len(able)} "
+        whole += "as a whole"
+    yield f"{whole}{where}"
 
 
 # ── --reach ────────────────────────────────────────────────────────────────────────────────

@@ -36,6 +36,8 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, VendorParticipant
 from sros_tool.keystore.reader import Keystore, Problem
 from sros_tool.names import (
+    ACTION_PARTS,
+    ACTION_SEPARATOR,
     ROS_DISCOVERY_TOPIC,
     dds_names,
     expression_problem,
@@ -180,6 +182,36 @@ def about_action(question: Question, rights: Iterable[Right]) -> Question | None
     if "actions" not in kinds or "services" in kinds:
         return None
     return ask(_OF_ACTIONS[question.word], question.name, "action")
+
+
+_COMMANDS = ("send_goal", "cancel_goal")
+"""The services of an action that command its server; get_result only asks."""
+
+
+def acting_parts(question: Question) -> dict[str, Question]:
+    """Map the parts of an action that act on the other side to questions about each part alone.
+
+    Whoever may send goals commands the server, without the right to call the whole action; whoever
+    may reply or publish for the server informs the clients.  Empty if the question is not about an
+    action.
+    """
+    if question.type != "action":
+        return {}
+    parts = {}
+    for right, inside in reversed(ACTION_PARTS[question.right]):
+        part = inside.removeprefix(ACTION_SEPARATOR)
+        if question.right == "execute" or part in _COMMANDS:
+            name = question.name + inside
+            kind = "topic" if right == "publish" else "service"
+            written = (Part(AccessVerb.PUBLISH, t) for t in dds_names(right, name).publish)
+            parts[part] = Question(right, kind, right, name, tuple(written))
+    return parts
+
+
+def text_of_parts(question: Question, parts: Iterable[str]) -> str:
+    """Return why it matters that an enclave may do these parts of an action, as a sentence."""
+    does = "command the server" if question.right == "call" else "inform the clients"
+    return f"it may do a part of the action, which is enough to {does}: {', '.join(parts)}."
 
 
 def _checked_name(name: str, word: str, kind: str) -> str:

@@ -13,7 +13,15 @@ from sros_tool.dds.decision.vendors import PRINCIPAL, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.distributions import SUPPORTED, Shipped
 from sros_tool.errors import Note, SrosError
-from sros_tool.explain.answer import Answer, Evaluator, Provenance, Question, ask
+from sros_tool.explain.answer import (
+    Answer,
+    Evaluator,
+    Provenance,
+    Question,
+    acting_parts,
+    ask,
+    text_of_parts,
+)
 from sros_tool.explain.asking import (
     Asked,
     AskedEnclave,
@@ -200,6 +208,7 @@ def explain_on_dds(
         *_provenance_notes(answer),
         *_export_notes(answer),
         *_other_type_notes(evaluator, answer, kind),
+        *_note_on_parts(evaluator, answer),
         *_not_a_topic_notes(answer, asked_enclave),
         *_similar_name_notes(answer),
         *(note_on_lacking_keys(copied) if copied else ()),
@@ -293,6 +302,18 @@ def _other_type_notes(evaluator: Evaluator, answer: Answer, kind: str | None) ->
             yield Note("explain.an-action", text)
 
 
+def _note_on_parts(evaluator: Evaluator, answer: Answer) -> Iterator[Note]:
+    """Yield a note if the enclave may do a part of an action that it is denied as a whole."""
+    if parts := _allowed_parts(evaluator, answer):
+        yield Note("explain.in-part", text_of_parts(answer.question, parts))
+
+
+def _allowed_parts(evaluator: Evaluator, answer: Answer) -> tuple[str, ...]:
+    """Return the acting parts of a denied action that the enclave may do."""
+    questions = {} if answer.allowed else acting_parts(answer.question)
+    return tuple(part for part, asked in questions.items() if evaluator.answer(asked).allowed)
+
+
 def _not_a_topic_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[Note]:
     """Yield a note if a denied topic has the name of a service or an action."""
     name = answer.question.name
@@ -356,7 +377,7 @@ def _runs_on_zenoh(keystore: Keystore, name: str) -> bool:
 
 
 @shows(
-    *("enclave", "allowed", "outcome", "reason", "expression", "wildcard", "domains"),
+    *("enclave", "allowed", "in_part", "outcome", "reason", "expression", "wildcard", "domains"),
     null_if_empty=("expression", "wildcard", "domains"),
 )
 class VendorOutcome(NamedTuple):
@@ -373,6 +394,9 @@ class VendorOutcome(NamedTuple):
     """The ROS domains in which the enclave has the right, such as ``10`` or ``10,20``, or null."""
     anybody: bool = False
     """Whether the enclave's governance also gives the right to processes without an identity."""
+    in_part: Sequence[str] = ()
+    """The parts of an action, such as ``send_goal``, by which the enclave can command the server
+    (with call) or inform the clients (with execute), although it does not have the whole right."""
 
     @property
     def allowed(self) -> bool:
@@ -448,7 +472,13 @@ def _outcome(evaluator: Evaluator, name: str, question: Question) -> VendorOutco
     expression = answer.decision.expression or ""
     anybody = _anybody_may(evaluator, question)
     return VendorOutcome(
-        name, answer.outcome, answer.reason, answer.text, expression, anybody=anybody
+        name,
+        answer.outcome,
+        answer.reason,
+        answer.text,
+        expression,
+        anybody=anybody,
+        in_part=_allowed_parts(evaluator, answer),
     )
 
 
@@ -555,8 +585,9 @@ class VendorOfKeystore(NamedTuple):
                 return _outcome(Evaluator(vendor, enclave, context), name, question)
 
             vendor = self.stated(name) or self.vendor
-            decision, domains = first_allowing_domain(_parts(enclave, self.asking.domain), decided)
-            return decision._replace(domains=domains)
+            parts = _parts(enclave, self.asking.domain)
+            decision, domains, in_part = first_allowing_domain(parts, decided)
+            return decision._replace(domains=domains, in_part=in_part)
 
         return decide_each(self.keystore.names if self.names is None else self.names, outcome)
 

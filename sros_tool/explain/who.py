@@ -63,6 +63,10 @@ class EnclaveOutcome(Protocol):
     def domains(self) -> str:
         """The ROS domains in which the enclave has the right, such as 10,20; "" for none."""
 
+    @property
+    def in_part(self) -> Sequence[str]:
+        """The acting parts of an action that the enclave may do, but not the whole."""
+
 
 _Outcome = TypeVar("_Outcome", bound=EnclaveOutcome)
 
@@ -132,7 +136,7 @@ def callable_action(decider: Decider, question: Question) -> Note | None:
     """Return a note if enclaves may call an action that has the name of a service."""
     if (question.word, question.type) == ("call", "service"):
         action = ask("call", question.name, "action")
-        if any(outcome.allowed for outcome in decider.outcomes(action)):
+        if any(outcome.allowed or outcome.in_part for outcome in decider.outcomes(action)):
             text = f"enclaves may {action}: add --type action if it is an action."
             return Note("explain.an-action", text)
     return None
@@ -162,10 +166,11 @@ def names_meant(decider: Decider, question: Question, enclaves: Container[str]) 
 
 def first_allowing_domain(
     parts: Iterable[DomainSet], decide: Callable[[int], _Outcome]
-) -> tuple[_Outcome, str]:
+) -> tuple[_Outcome, str, tuple[str, ...]]:
     """Return the decision of the first domain that gives the right, else of the first domain.
 
-    Also returns the domains that give the right, as text.
+    Also returns the domains that give the right, as text; or, if none does, the parts of an action
+    that some domain gives.
 
     ``decide`` is asked about one domain of each part, because all domains of a part have the same
     rules.
@@ -173,7 +178,8 @@ def first_allowing_domain(
     outcomes = [(part, decide(next(iter(part)))) for part in parts]
     allowing = [(part, outcome) for part, outcome in outcomes if outcome.allowed]
     domains = DomainSet.of(*((d, d) for part, _ in allowing for d in part)) if allowing else ""
-    return (allowing or outcomes)[0][1], str(domains)
+    in_part = () if allowing else dict.fromkeys(p for _, o in outcomes for p in o.in_part)
+    return (allowing or outcomes)[0][1], str(domains), tuple(in_part)
 
 
 def decide_each(names: Sequence[str], decide: Callable[[str], _Outcome]) -> tuple[_Outcome, ...]:

@@ -20,7 +20,15 @@ from typing import Annotated, Literal, NamedTuple
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
-from sros_tool.explain.answer import Answer, Evaluator, PolicyChange, Question, StatedInPolicy
+from sros_tool.explain.answer import (
+    Answer,
+    Evaluator,
+    PolicyChange,
+    Question,
+    StatedInPolicy,
+    acting_parts,
+    text_of_parts,
+)
 from sros_tool.explain.asking import (
     Asked,
     AskedEnclave,
@@ -178,6 +186,9 @@ class ZenohAnswer:
     unsigned: tuple[str, ...] = ()
     """The files that decide and that the permissions CA has not signed."""
     domains: str = ""
+    in_part: tuple[str, ...] = ()
+    """The parts of an action, such as ``send_goal``, by which the enclave can command the server
+    (with call) or inform the clients (with execute), although it does not have the whole right."""
 
     @property
     def anybody(self) -> bool:
@@ -234,7 +245,7 @@ class ZenohAnswer:
 
 
 @shows(
-    *("enclave", "in_brief", "outcome", "wildcard", "domains"),
+    *("enclave", "in_brief", "in_part", "outcome", "wildcard", "domains"),
     null_if_empty=("wildcard", "domains"),
     spread=("in_brief",),
 )
@@ -249,6 +260,9 @@ class ZenohEnclaveOutcome(NamedTuple):
     """The key expression that allows the right, if it is a wildcard, or null."""
     domains: str
     """The ROS domains in which the enclave has the right, such as ``10`` or ``10,20``, or null."""
+    in_part: Sequence[str] = ()
+    """The parts of an action, such as ``send_goal``, by which the enclave can command the server
+    (with call) or inform the clients (with execute), although it does not have the whole right."""
 
 
 class WhoOnZenoh(NamedTuple):
@@ -389,6 +403,23 @@ class ZenohEvaluator:
             reached=reached,
             wildcards=tuple(self._wildcards(own.process, wanted, checks, reached)),
         )
+
+    def with_parts(self, answer: ZenohAnswer, *, brief: bool) -> ZenohAnswer:
+        """Return an answer with the parts of a denied action that the enclave may do.
+
+        ``brief`` is as in `answer`.
+        """
+        if answer.outcome is not _Outcome.DROPPED:
+            return answer
+        parts = acting_parts(answer.question).items()
+        passing = [part for part, asked in parts if self._acts(answer.enclave, asked, brief)]
+        return replace(answer, in_part=tuple(passing))
+
+    def _acts(self, enclave: str, part: Question, brief: bool) -> bool:
+        """Return whether the data of a part of an action pass; a call acts without its reply."""
+        answer = self.answer(enclave, part, reach=False, brief=brief)
+        needed = [c for c in answer.checks if part.word == "reply" or c.message != Message.REPLY]
+        return bool(needed) and all(check.allowed for check in needed)
 
     def _dropped_by_router(self, enclave: str, question: Question) -> ZenohAnswer | None:
         """Return the answer if the router drops the message, whatever the enclave's files state.
@@ -901,10 +932,12 @@ class ZenohOfKeystore:
 
         def answer(name: str) -> ZenohAnswer:
             def decided(domain: int) -> ZenohAnswer:
-                return self._evaluators[domain].answer(name, question, reach=False, brief=True)
+                evaluator = self._evaluators[domain]
+                answered = evaluator.answer(name, question, reach=False, brief=True)
+                return evaluator.with_parts(answered, brief=True)
 
-            decision, domains = first_allowing_domain(self._parts, decided)
-            return replace(decision, domains=domains)
+            decision, domains, in_part = first_allowing_domain(self._parts, decided)
+            return replace(decision, domains=domains, in_part=in_part)
 
         return decide_each(self._names, answer)
 
@@ -921,6 +954,7 @@ class ZenohOfKeystore:
                 outcome.outcome,
                 outcome.wildcard,
                 outcome.domains,
+                outcome.in_part,
             )
             for outcome in outcomes
         ]
@@ -1061,7 +1095,7 @@ def explain_on_zenoh(
     question, taken = question_meant(stated, asked_enclave, question, kind)
     joins = question.word == "join"
     evaluator = ZenohEvaluator(keystore, moment=context.at, domain=context.domain, joining=joins)
-    answer = evaluator.answer(enclave.name, question)
+    answer = evaluator.with_parts(evaluator.answer(enclave.name, question), brief=False)
     outdated = evaluator.outdated_enclaves(answer)
     by_permissions = explain(stated, question)
     notes = (
@@ -1081,6 +1115,8 @@ def _notes(answer: ZenohAnswer, stated: Answer, outdated: Sequence[str] | None) 
         does, other = ("allow", "Zenoh drops") if stated.allowed else ("deny", "Zenoh lets through")
         text = f"the signed permissions {does} it, but {other} it: the two differ."
         yield Note("explain.zenoh-differs", text)
+    if answer.in_part:
+        yield Note("explain.in-part", text_of_parts(answer.question, answer.in_part))
     if outdated:
         text = f"out of date: {', '.join(outdated)}. The answer follows these files as they are."
         yield Note("explain.zenoh-out-of-date", text)

@@ -26,7 +26,8 @@ POLICY = policy_text(
     {
         "/talker": publish("/chatter"),
         "/listener": publish("/chatter").replace("publish", "subscribe"),
-        "/wide": publish("/cam*") + '<services request="ALLOW"><service>/add</service></services>',
+        "/wide": publish("/cam*") + '<services request="ALLOW"><service>/add</service>'
+        "<service>/go/_action/send_goal</service></services>",
         "/recorder": publish("/*").replace("publish", "subscribe"),
         "/server": '<services reply="ALLOW"><service>/add</service></services>'
         '<actions execute="ALLOW"><action>/go</action></actions>',
@@ -146,6 +147,24 @@ def test_who_may(made: Path, mode: str) -> None:
     shown = explain(made / mode, "--who", "subscribe", "/chatter", "--vendor", "zenoh").ok()
     assert f"/recorder  by the wildcard {wide}\n/router\n3 of 7 enclaves may" in shown.out
     assert explain(made / mode, "--who", "call", "/nope", "--vendor", "zenoh").status == 1
+
+
+@pytest.mark.parametrize("vendor", ["zenoh", "fastdds"])
+def test_who_may_command_an_action_without_calling_the_whole(made: Path, vendor: str) -> None:
+    """/wide may send goals by a right to a service, which moves the robot."""
+    by = ("--vendor", vendor)
+    lines = explain(made / "client", "--who", "call", "/go", *by).ok().out.splitlines()
+    whole = ["/client", "/router"] if vendor == "zenoh" else ["/client"]
+    assert lines[:-1] == ["/wide  in part: send_goal", *whole]
+    count = f"1 of 7 enclaves may call action /go in part, {len(whole)} as a whole"
+    assert lines[-1] == count
+    shown = json.loads(explain(made / "client", "--who", "call", "/go", *by, "--json").out)
+    parts = {each["enclave"]: each["in_part"] for each in shown["enclaves"] if each["in_part"]}
+    assert parts == {"/wide": ["send_goal"]}
+    alone = explain(made / "client", "/wide", "call", "/go", *by)
+    assert alone.status == 1
+    assert "may do a part of the action, which is enough to command the server: " in alone.err
+    assert "in-part" not in explain(made / "client", "/talker", "call", "/go", *by).err
 
 
 def test_who_may_says_what_each_enclave_is_told(made: Path) -> None:
