@@ -612,17 +612,19 @@ def _enclave_to_ask(
         if policy is not None:
             raise UsageError("two policies are named", "", "Leave policy= out.")
         alone = _policy(keystore)
-        own = alone.enclave(name)
-        if own is None:
+        stated_enclave = alone.enclave(name)
+        if stated_enclave is None:
             raise not_in_policy_error(alone, name, Path(alone.file))
-        return AskedEnclave(planned_enclave(own, None, asking)._replace(policy=own), alone)
+        return AskedEnclave(
+            planned_enclave(stated_enclave, None, asking)._replace(policy=stated_enclave), alone
+        )
     opened = OpenedOnce(Path(keystore))
     opened.check()
     signed = signed_enclave(opened, name, asking.at)
     assert signed
     stated = _policy(policy) if policy is not None else None
-    own = stated.enclave(name) if stated else None
-    return AskedEnclave(signed._replace(keystore=opened, policy=own), stated)
+    stated_enclave = stated.enclave(name) if stated else None
+    return AskedEnclave(signed._replace(keystore=opened, policy=stated_enclave), stated)
 
 
 def check(

@@ -513,7 +513,7 @@ class NameSet:
     @classmethod
     def union(cls, sets: Iterable[NameSet]) -> NameSet:
         """Return the names that are in one of several sets."""
-        others: list[_Node] = []
+        other_nodes: list[_Node] = []
         exact: set[str] = set()
         automata: set[Automaton] = set()
         for names in sets:
@@ -521,11 +521,11 @@ class NameSet:
                 exact |= names._node.exact
                 automata |= names._node.automata
             else:
-                others.append(names._node)
+                other_nodes.append(names._node)
         plain = _Some(frozenset(exact), frozenset(automata))
-        if not others:
+        if not other_nodes:
             return cls._of(plain)
-        return cls._of(_First(tuple((part, True) for part in (plain, *others)), False))
+        return cls._of(_First(tuple((part, True) for part in (plain, *other_nodes)), False))
 
     @classmethod
     def at_least(cls, count: int, sets: Iterable[NameSet]) -> NameSet:
@@ -765,15 +765,17 @@ def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
     exact = frozenset[str]().union(*(leaf.exact for leaf in leaves))
     all_required = frozenset[Automaton]().union(*(leaf.everything for leaf in leaves))
     around = _including_set(node, _fewest_automata_first)
-    for own in sorted(automata if around is None else around.automata, key=_automaton_order):
+    for required in sorted(automata if around is None else around.automata, key=_automaton_order):
         met = frozenset(
-            automaton for leaf in leaves for automaton in leaf.possibly_overlapping(own)
+            automaton for leaf in leaves for automaton in leaf.possibly_overlapping(required)
         )
-        if others := len(met) // _OF_A_STEP:
-            limit.spend(others)
-        left = _simplified(node, all_required | {own}, met)
+        if further_steps := len(met) // _OF_A_STEP:
+            limit.spend(further_steps)
+        left = _simplified(node, all_required | {required}, met)
         if left is not False:
-            yield _Search(_accepted_names(own, left), frozenset(filter(own.matches, exact)))
+            yield _Search(
+                _accepted_names(required, left), frozenset(filter(required.matches, exact))
+            )
     no_automata = frozenset[Automaton]()
     if around is None and not all_required and _simplified(node, no_automata, no_automata):
         left = _simplified(node, no_automata, None)

@@ -182,14 +182,19 @@ def replace_file(path: Path, data: bytes) -> None:
     Raises:
         OSError: the file cannot be written; the old content stays.
     """
-    target, own = _follow_own_links(path)
-    state = _state(path, follow=own)
-    if state and own and not stat.S_ISREG(state.st_mode) and not stat.S_ISDIR(state.st_mode):
+    target, follows_links = _follow_own_links(path)
+    state = _state(path, follow=follows_links)
+    if (
+        state
+        and follows_links
+        and not stat.S_ISREG(state.st_mode)
+        and not stat.S_ISDIR(state.st_mode)
+    ):
         if stat.S_ISFIFO(state.st_mode) and not _trusted(state) and _is_shared(target.parent):
             raise PermissionError(errno.EACCES, "it is a pipe of another user", str(path))
         _write_to(path, state, data)
         return
-    keep = state and own and (_trusted(state) or not _is_shared(target.parent))
+    keep = state and follows_links and (_trusted(state) or not _is_shared(target.parent))
     with staged_file(target, data, mode=0o666, like=state if keep else None) as put_in_place:
         put_in_place()
     done = "replaced" if state else "wrote"

@@ -42,8 +42,8 @@ def _prepare_labelled(self: Any, context: LaunchContext, action: Action) -> None
     command = self.final_cmd
     if self.name is None and command[: len(_RUN)] == _RUN:
         number = self.final_name.rpartition("-")[2]
-        own = Path(command[command.index("--") + 1]).name
-        self._Executable__final_name = f"{own}-{number}"
+        program_name = Path(command[command.index("--") + 1]).name
+        self._Executable__final_name = f"{program_name}-{number}"
 
 
 @expose_action("secured_nodes")
@@ -108,9 +108,9 @@ class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where i
                 context.environment.update(before)
         context.environment.update(REFUSING)
         root, file = (str(Path(path).absolute()) for path in (keystore, policy))
-        own = [*_RUN, root, "--policy", file, "--"]
+        run_command = [*_RUN, root, "--policy", file, "--"]
         prefix = context.launch_configurations.get(_PREFIX, "")
-        context.launch_configurations[_PREFIX] = f"{shlex.join(own)} {prefix}".rstrip()
+        context.launch_configurations[_PREFIX] = f"{shlex.join(run_command)} {prefix}".rstrip()
         Executable.prepare = _prepare_labelled  # not where launch only looks for this action
 
 

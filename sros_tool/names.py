@@ -43,8 +43,8 @@ _NODE_SERVICE = re.compile(rf"(?P<node>/.+)/(?:{'|'.join(NODE_SERVICES)})\Z")
 
 def node_of_service(service: str) -> str:
     """Return the full name of the node that offers a service of `NODE_SERVICES`; "" for others."""
-    own = _NODE_SERVICE.match(service)
-    return own["node"] if own else ""
+    match = _NODE_SERVICE.match(service)
+    return match["node"] if match else ""
 
 
 def nodes_served(rights: Iterable[tuple[str, str]]) -> tuple[str, ...]:

@@ -101,8 +101,8 @@ def _is_private(group: int, trusted_users: frozenset[int]) -> bool:
         name, _, _, members = grp.getgrgid(group)
     except KeyError:
         return False
-    own = any(user.pw_gid == group and user.pw_name == name for user in users)
-    return own and {user.pw_name for user in users}.issuperset(members)
+    has_user = any(user.pw_gid == group and user.pw_name == name for user in users)
+    return has_user and {user.pw_name for user in users}.issuperset(members)
 
 
 def user_name(user: int) -> str:

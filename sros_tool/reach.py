@@ -297,13 +297,13 @@ class Network:
         enclaves only.  The topics of this enclave are added to them.
         """
         directions = ("publish", "subscribe") if forward else ("subscribe", "publish")
-        own, others = (self._sides[direction] for direction in directions)
-        for end in own.of.get(enclave, ()):
+        own_side, other_side = (self._sides[direction] for direction in directions)
+        for end in own_side.of.get(enclave, ()):
             like = (end.topic, end.without, self._router_of.get(enclave, ""), end.domains)
             if like in followed:
                 continue
             followed.add(like)
-            for reached in others.possibly_overlapping(end.topic):
+            for reached in other_side.possibly_overlapping(end.topic):
                 if reached.enclave in known:
                     continue
                 writer, reader = (end, reached) if forward else (reached, end)

@@ -145,14 +145,14 @@ def hidden_protections(protection: DomainProtection) -> list[tuple[str, str]]:
     protections = []
     earlier: list[tuple[str, str]] = []
     for named in protection.named:
-        own = protected_topics(named.kind, named.name)
+        own_topics = protected_topics(named.kind, named.name)
         by = [
             next((at for one, at in earlier if covers(one, name) and covers(name, one)), "")
-            for name in own
+            for name in own_topics
         ]
         if all(by):
             protections.append((str(named), by[0]))
-        earlier += [(name, str(named)) for name in own]
+        earlier += [(name, str(named)) for name in own_topics]
     return protections
 
 

@@ -17,8 +17,8 @@ def first_few(
     texts: Sequence[str], maximum: int, separator: str = ", ", joint: str = " and "
 ) -> str:
     """Return at most ``maximum`` texts and the number of the others: "a, b and 3 more"."""
-    others = len(texts) - maximum
-    return separator.join(texts[:maximum]) + (f"{joint}{others} more" if others > 0 else "")
+    left_out = len(texts) - maximum
+    return separator.join(texts[:maximum]) + (f"{joint}{left_out} more" if left_out > 0 else "")
 
 
 def enumerated(texts: Sequence[str], joint: str = " and ") -> str:

@@ -283,7 +283,7 @@ class _Round:
     def _fetch_and_install(self, certain_time: datetime) -> tuple[Installation, bool]:
         """Fetch and install a release; return what changed, and whether the source was reached."""
         settings, state = self._settings, self._state
-        others = self._changed_files()
+        changed_files = self._changed_files()
 
         def fetch(certificate: ClientCertificate | None) -> Release | None:
             return self._machine.fetch(
@@ -291,7 +291,7 @@ class _Round:
                 settings.source,
                 settings.robot,
                 now=certain_time,
-                installed=0 if others or others is None else state.accepted,
+                installed=0 if changed_files or changed_files is None else state.accepted,
                 client_certificate=certificate,
                 tls_ca=Path(settings.tls_ca) if settings.tls_ca else None,
             )
@@ -317,7 +317,9 @@ class _Round:
             return Installation(), True
         installation = self._install(release, certain_time)
         if release.number == state.accepted:
-            repaired = (path for path in others or () if enclave_of(path) in installation.changed)
+            repaired = (
+                path for path in changed_files or () if enclave_of(path) in installation.changed
+            )
             self._note_repaired(release.number, tuple(repaired))
         return installation, True
 
@@ -326,7 +328,7 @@ class _Round:
 
         None if no release is installed with all its enclaves, or its seal cannot be read.
         """
-        state, others = self._state, []
+        state, changed_paths = self._state, []
         if not state.accepted or state.release != state.accepted:
             return None
         try:
@@ -335,10 +337,10 @@ class _Round:
                 for line in text.splitlines():
                     digest, mark, path = line.decode(errors="replace").partition("  ")
                     if mark and _sha256(opened, path) != digest:
-                        others.append(path)
+                        changed_paths.append(path)
         except (SrosError, OSError):
             return None
-        return tuple(others)
+        return tuple(changed_paths)
 
     def _note_repaired(self, release: int, paths: Sequence[str]) -> None:
         """Remember that files were replaced: every message of the next day says so."""
@@ -437,8 +439,8 @@ class _Round:
     def _note_due(self, changed: Iterable[str], names: Iterable[str]) -> None:
         """Note the restarts that are due: also for files that somebody else changed."""
         before, files = self._state.files, self._digests(names)
-        others = {name for name, digest in files.items() if before.get(name) != digest}
-        due = ({*self._state.due, *changed} & files.keys()) | others
+        changed_enclaves = {name for name, digest in files.items() if before.get(name) != digest}
+        due = ({*self._state.due, *changed} & files.keys()) | changed_enclaves
         self._state = replace(self._state, due=tuple(sorted(due)), files=files)
 
     def _digests(self, names: Iterable[str]) -> dict[str, str]:
@@ -668,8 +670,8 @@ class _Round:
         certificates: Sequence[ClientCertificate | None] = [None]
         if place.startswith("https://"):
             certificates = self._client_certificates() or certificates
-        *others, last = certificates
-        for certificate in others:
+        *earlier_certificates, last = certificates
+        for certificate in earlier_certificates:
             try:
                 return ask(certificate)
             except RefusedError:
@@ -876,11 +878,11 @@ def _waiting_key(folder: Path, name: str) -> PrivateKey:
         SrosError: the key cannot be read.
         OSError: the key cannot be written.
     """
-    own = agent_folder(folder)
-    path = own / _key_file(name)
+    agents_folder = agent_folder(folder)
+    path = agents_folder / _key_file(name)
     if os.path.lexists(path):
         return load_key(read_bytes(path, "private key"), f"of enclave {name}")
-    with Folder(own) as opened:
+    with Folder(agents_folder) as opened:
         if not opened.is_folder(_NEW_KEYS):
             opened.mkdir(_NEW_KEYS, 0o700)
     key = generate_key()

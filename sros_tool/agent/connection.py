@@ -24,8 +24,8 @@ def ended_tls(error: BaseException | None) -> bool:
 
     With TLS 1.3 this may be an alert, or only the end of the connection.
     """
-    own = ssl.SSLCertVerificationError  # of the certificate of the server
-    return isinstance(error, ssl.SSLError) and not isinstance(error, own)
+    certificate_error = ssl.SSLCertVerificationError  # of the certificate of the server
+    return isinstance(error, ssl.SSLError) and not isinstance(error, certificate_error)
 
 
 class GuardedConnection(http.client.HTTPConnection):

@@ -290,8 +290,8 @@ def _newest_validity_start(enclaves: Iterable[Mapping[str, bytes]]) -> datetime 
     moments = []
     for files in enclaves:
         with suppress(SrosError):
-            own = load_certificates(files.get(CERTIFICATE_FILE, b""), CERTIFICATE_FILE)
-            moments += [validity_of(certificate).not_before for certificate in own]
+            certificates = load_certificates(files.get(CERTIFICATE_FILE, b""), CERTIFICATE_FILE)
+            moments += [validity_of(certificate).not_before for certificate in certificates]
             lists = read_lists(files[CRL_FILE], CRL_FILE) if CRL_FILE in files else ()
             moments += [last_update(crl) for crl in lists]
     return max(moments, default=None)
@@ -395,8 +395,10 @@ def _present_key(folder: Folder, name: str, files: Mapping[str, bytes]) -> Publi
     if KEY_URI_FILE in files or folder.state(f"{place}/{KEY_URI_FILE}"):
         if (data := _content(folder, f"{place}/{REQUEST}")) is not None:
             return load_request(data, f"of enclave {name}").public_key
-        own = _content(folder, f"{place}/{CERTIFICATE_FILE}") or files.get(CERTIFICATE_FILE, b"")
-        return load_certificates(own, CERTIFICATE_FILE)[0].public_key()  # type: ignore[return-value]
+        certificate_data = _content(folder, f"{place}/{CERTIFICATE_FILE}") or files.get(
+            CERTIFICATE_FILE, b""
+        )
+        return load_certificates(certificate_data, CERTIFICATE_FILE)[0].public_key()  # type: ignore[return-value]
     raise KeystoreError(
         f"the key of enclave {name} {KEY_NOT_HERE}",
         "",

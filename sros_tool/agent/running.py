@@ -76,22 +76,25 @@ def look_at_processes(
 ) -> EnclaveProcesses:
     """Return what runs in the enclaves ``names`` of ``folder``; ``look`` reads the processes."""
     running = (look or ProcessTable().look)(now)
-    own = [process for process in running.processes if _is_of(process, folder)]
+    own_processes = [process for process in running.processes if _is_of(process, folder)]
     by_enclave: dict[str, list[Process]] = {}
-    for process in own:
+    for process in own_processes:
         by_enclave.setdefault(_enclave_of(process), []).append(process)
     states = {name: _state(by_enclave.get(name, ())) for name in names}
-    others = [
+    other_processes = [
         process
         for process in running.processes
         if _enclave_of(process) in states and not _is_of(process, folder)
     ]
-    elsewhere = [process for process in others if _folder_is_known(process)]
+    elsewhere = [process for process in other_processes if _folder_is_known(process)]
     environment = {ENABLE: "true", KEYSTORE: str(folder)}
     findings = (
         *other_folder_findings(elsewhere, folder),
         *process_findings(
-            environment, replace(running, processes=tuple(own), unseen=()), now=now, zone=zone
+            environment,
+            replace(running, processes=tuple(own_processes), unseen=()),
+            now=now,
+            zone=zone,
         ),
     )
     problems = tuple(
@@ -101,7 +104,7 @@ def look_at_processes(
     )
     complete = not (running.unseen or running.hidden or running.container) and all(
         process.enclave and not process.enclave.problem
-        for process in (*own, *others)
+        for process in (*own_processes, *other_processes)
         if process not in elsewhere
     )
     return EnclaveProcesses(

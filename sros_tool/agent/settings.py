@@ -79,12 +79,14 @@ def check_owner(folder: Path) -> None:
             "The agent runs as the owner of the security folder, and needs no root rights.",
             "Run it as that user.",
         )
-    own = agent_folder(folder)
+    agents_folder = agent_folder(folder)
     trusted = frozenset({0, user})
-    places = [(step, why) for step, why in replaceable_on_the_way(own / "x", trusted) if why]
+    places = [
+        (step, why) for step, why in replaceable_on_the_way(agents_folder / "x", trusted) if why
+    ]
     places += [
         (path, other_writers(path.lstat(), trusted))
-        for path in (own, own / SETTINGS_FILE)
+        for path in (agents_folder, agents_folder / SETTINGS_FILE)
         if os.path.lexists(path)
     ]
     for path, why in places:

@@ -53,9 +53,9 @@ def folded_findings(
     places, stay as they are.
     """
     similar_groups: dict[Hashable, list[tuple[tuple[Finding, ...], str]]] = {}
-    for group, others in _merge_robots(groups, fleet):
-        kind = group if others else _key_without_enclave(group)
-        similar_groups.setdefault(kind, []).append((group, others))
+    for group, other_robots in _merge_robots(groups, fleet):
+        kind = group if other_robots else _key_without_enclave(group)
+        similar_groups.setdefault(kind, []).append((group, other_robots))
     for members in similar_groups.values():
         first, *more = members
         if len(more) < _FEWEST_ENCLAVES:
@@ -150,15 +150,15 @@ def findings_markdown(chosen_findings: ChosenFindings, fleet: Fleet | None = Non
     shown_by = "which `sros check` shows"
     groups = folded_findings(group_by_cause(chosen_findings.shown), fleet)
     listed = bounded_list(
-        (_markdown_item(group, others) for group, others in groups), _MOST, shown_by
+        (_markdown_item(group, other_robots) for group, other_robots in groups), _MOST, shown_by
     )
     title = f"### Findings: {plain(chosen_findings.summary())}"
     return "\n\n".join(part for part in (title, listed) if part) + "\n"
 
 
-def _markdown_item(findings: Sequence[Finding], others: str) -> str:
+def _markdown_item(findings: Sequence[Finding], other_robots: str) -> str:
     lines = _finding_lines(findings[0]) if len(findings) == 1 else _cause_lines(findings)
-    return "<br>".join((*lines, *([code(others)] if others else [])))
+    return "<br>".join((*lines, *([code(other_robots)] if other_robots else [])))
 
 
 def _cause_lines(findings: Sequence[Finding]) -> Iterator[str]:

@@ -648,13 +648,13 @@ def _check_parameters_of_others(checked_policy: _CheckedPolicy) -> Iterator[Find
             text = f"may serve {name}, and has no node {node}"
             yield statement.found(OTHER_NODES_PARAMETERS, text)
         elif is_expression(node):
-            others = (
+            other_nodes = (
                 (other, path)
                 for path, theirs in nodes.items()
                 for other in sorted(theirs - nodes[enclave])
                 if path != enclave and not is_expression(other) and covers(node, other)
             )
-            for other, path in islice(others, 1):
+            for other, path in islice(other_nodes, 1):
                 text = f"may serve {name}, also as the node {other} of {path}"
                 yield statement.found(OTHER_NODES_PARAMETERS, text, _NAME_THE_NODES)
 
@@ -695,10 +695,10 @@ def _is_not_shipped(folder: str) -> bool:
     shipped = policies_dir() / COMMON
     parts = (shipped / "node.xml", *(shipped / "node").iterdir())
     with suppress(OSError):
-        own = [Path(folder, part.relative_to(shipped)) for part in parts]
-        return own[0].is_file() and any(
+        own_files = [Path(folder, part.relative_to(shipped)) for part in parts]
+        return own_files[0].is_file() and any(
             not copy.is_file() or copy.read_bytes() != part.read_bytes()
-            for copy, part in zip(own, parts, strict=True)
+            for copy, part in zip(own_files, parts, strict=True)
         )
     return False
 
@@ -896,13 +896,13 @@ def within_root(rights: Collection[Right]) -> str:
     """
     allowed = [right for right in rights if right.qualifier is ALLOW]
     root = Rules(right for right in rights if right.enclave == "/")
-    own: dict[str, list[Right]] = defaultdict(list)
+    rights_by_enclave: dict[str, list[Right]] = defaultdict(list)
     for right in allowed:
         if right.enclave != "/" and not are_basic([right]):
-            own[right.enclave].append(right)
+            rights_by_enclave[right.enclave].append(right)
     names = sorted(
         name
-        for name, allowed_rights in own.items()
+        for name, allowed_rights in rights_by_enclave.items()
         if all(root.allow("/", right.right, right.name) for right in allowed_rights)
     )
     return f"/ has all rights of {first_few(names, _NAMES_SHOWN)}" if names else ""
@@ -1297,19 +1297,19 @@ def _robots_that_are_written_out(policies: Sequence[Policy], fleet: Fleet) -> It
 
 
 def _robots_on_one_domain(
-    robots: Sequence[Robot], others: Sequence[Robot] | None = None
+    robots: Sequence[Robot], other_robots: Sequence[Robot] | None = None
 ) -> tuple[Robot, Robot] | None:
     """Return two robots that may be in the same ROS domain, or None.
 
-    The first robot is from ``others`` (None: from ``robots``), the second from ``robots``.
+    The first robot is from ``other_robots`` (None: from ``robots``), the second from ``robots``.
     """
-    seen = {robot.domain: robot for robot in others or ()}
+    seen = {robot.domain: robot for robot in other_robots or ()}
     for robot in robots:
         enclaves = (seen.get(robot.domain), seen.get(None))
         for other_robot in seen.values() if robot.domain is None else enclaves:
             if other_robot:
                 return other_robot, robot
-        if others is None:
+        if other_robots is None:
             seen[robot.domain] = robot
     return None
 

@@ -355,8 +355,10 @@ def _local_time_findings(
         return
     if vendor_of(process.rmw) is not Vendor.FAST:
         return
-    own = _zone(process.environment.get("TZ", ""), zone)
-    begin, end = (read_moment(Moments.LOCAL, e, own) for e in (grant.not_before, grant.not_after))
+    process_zone = _zone(process.environment.get("TZ", ""), zone)
+    begin, end = (
+        read_moment(Moments.LOCAL, e, process_zone) for e in (grant.not_before, grant.not_after)
+    )
     if begin is None or end is None or begin <= int(now.timestamp()) <= end:
         return
     read = " to ".join(
@@ -784,19 +786,19 @@ def _other_keystore_findings(
     enclave.
     """
     own_domain = ("", environment.get(DOMAIN) or "0") if environment is not None else None
-    own = _authorities_here(environment) if environment is not None else frozenset()
+    own_keys = _authorities_here(environment) if environment is not None else frozenset()
     for place, processes in _group_by_network_and_domain(secured).items():
         groups = _group_by_authorities(process for process in processes if not process.is_zenoh)
-        if own and place == own_domain:
+        if own_keys and place == own_domain:
             main = f"this environment has '{plain((environment or {})[KEYSTORE], _LONGEST_PATH)}'"
-            others = [group for keys, group in groups if not keys & own]
+            other_groups = [group for keys, group in groups if not keys & own_keys]
         else:
             if len(groups) < 2:
                 continue
             (_, largest), *more = sorted(groups, key=lambda pair: -len(pair[1]))
             main = f"{largest[0].label} {_domain_text(largest[0])} has '{_keystore(largest[0])}'"
-            others = [group for _, group in more]
-        for process in (process for group in others for process in group):
+            other_groups = [group for _, group in more]
+        for process in (process for group in other_groups for process in group):
             text = f"it has keystore '{_keystore(process)}', and {main}"
             yield PROCESS_OTHER_KEYSTORE.found(process.label, text)
 
@@ -890,11 +892,15 @@ def _unseen_process_findings(running: RunningProcesses) -> Iterator[Finding]:
         if process.speaks:
             text = f"it speaks ROS 2, and cannot be looked at: {process.why}"
             yield PROCESS_NOT_SEEN.found(process.label, text, remedy=remedy)
-    others = [process for process in running.unseen if not process.speaks]
+    silent_processes = [process for process in running.unseen if not process.speaks]
     reasons = [running.hidden] if running.hidden else []
-    if others:
-        why = ", ".join(sorted({process.why for process in others})[:3])
-        count = f"{len(others)} processes" if len(others) > 1 else others[0].label
+    if silent_processes:
+        why = ", ".join(sorted({process.why for process in silent_processes})[:3])
+        count = (
+            f"{len(silent_processes)} processes"
+            if len(silent_processes) > 1
+            else silent_processes[0].label
+        )
         reasons.append(f"{count} that may or may not be nodes ({why})")
     if running.container:
         text = f"{len(running.processes)} of them speak ROS 2"

@@ -432,13 +432,13 @@ def _denial_findings(document: ConfigurationDocument) -> Iterator[Finding]:
         if not denials:
             continue
         limit.spend(_COMPARISON * len(access.subjects))
-        others = [
+        other_subjects = [
             other_subject for other_subject in access.subjects if other_subject.overlaps(subject)
         ]
         for rule in denials:
             for kind, text in (
                 (DENY_IN_WILDCARD, _wildcard_that_circumvents(rule, subject, access, limit)),
-                (DENY_OVERRULED, _overruling_subject(rule, others, access, limit)),
+                (DENY_OVERRULED, _overruling_subject(rule, other_subjects, access, limit)),
             ):
                 if text and (kind.id, rule.id) not in reported:
                     reported.add((kind.id, rule.id))

@@ -320,8 +320,8 @@ def check(
                 vendor=vendor or "",
             )
         chosen = selection.choose(map(_with_relative_paths, changed.findings))
-        others = changed.enclaves - changed.compared
-        upgraded = f"; {others} already for {upgrade_to.title}" if others else ""
+        not_compared = changed.enclaves - changed.compared
+        upgraded = f"; {not_compared} already for {upgrade_to.title}" if not_compared else ""
         echo(f"compared {counted(changed.compared, 'enclave')}{upgraded}", err=True)
         _SHOW[form](chosen, selection)
         return _status(chosen, fail_on)

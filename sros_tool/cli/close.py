@@ -234,8 +234,12 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
 
 def _nodes(policy: Policy, enclave: str) -> str:
     """Return a clause on the nodes of an enclave, if it has several; "" otherwise."""
-    own = policy.enclave(enclave)
-    nodes = [f"{node.ns.rstrip('/')}/{node.node}" for node in own.all_profiles()] if own else []
+    policy_enclave = policy.enclave(enclave)
+    nodes = (
+        [f"{node.ns.rstrip('/')}/{node.node}" for node in policy_enclave.all_profiles()]
+        if policy_enclave
+        else []
+    )
     return f", for the nodes {enumerated(sorted(nodes))}" if len(nodes) > 1 else ""
 
 

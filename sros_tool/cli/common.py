@@ -952,10 +952,10 @@ def echo_folded(groups: Iterable[tuple[Finding, ...]], fleet: Fleet | None = Non
     """Print findings; those that differ only in one robot or one enclave are printed once."""
     from sros_tool.checks.formats import folded_findings
 
-    for group, others in folded_findings(groups, fleet):
+    for group, other_robots in folded_findings(groups, fleet):
         echo_findings(group)
-        if others:
-            echo(f"    {others}")
+        if other_robots:
+            echo(f"    {other_robots}")
 
 
 def finding_lines(finding: Finding) -> list[str]:

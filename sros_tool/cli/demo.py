@@ -260,8 +260,8 @@ def _run_by_hand(
 
     for parameter in ctx.command.params:
         chosen = ctx.get_parameter_source(parameter.name or "")
-        own = ("role", "backend", "topic", "message_type")
-        takes = parameter.name in own or not parameter.expose_value
+        parameters = ("role", "backend", "topic", "message_type")
+        takes = parameter.name in parameters or not parameter.expose_value
         if not takes and chosen is not ParameterSource.DEFAULT:
             option = parameter.opts[0]
             raise UsageError(f"a {role} takes no {option}", "", "Leave it out.")

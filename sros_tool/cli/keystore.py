@@ -327,10 +327,10 @@ def _created_lines(result: Creation) -> Iterator[str]:
         if not (rights.lost_text() or rights.gained_text())
     }
     signed_again = [name for name in result.changed if name in unchanged]
-    others = [name for name in result.changed if name not in unchanged]
+    new_names = [name for name in result.changed if name not in unchanged]
     for names, text in (
         (result.created, "created enclave {}"),
-        (others, "replaced the permissions of enclave {}"),
+        (new_names, "replaced the permissions of enclave {}"),
         (signed_again, "signed the permissions of enclave {} again, with the same rights"),
         (result.completed, "completed enclave {}"),
     ):
@@ -507,10 +507,10 @@ def create_keystore(
     from sros_tool.dds.domains import DomainSet
     from sros_tool.keystore.lifecycle.create import create_keystore as create
 
-    own = ros_domain() if domain is None else None
+    present_domain = ros_domain() if domain is None else None
     domains = DomainSet.parse(domain, "--domain") if domain is not None else None
-    if own is not None:
-        domains = DomainSet.of((own, own))
+    if present_domain is not None:
+        domains = DomainSet.of((present_domain, present_domain))
     template = _chosen_template(
         template_name, ca_layout, ca_validity, validity, permissions_validity
     )

@@ -145,7 +145,7 @@ def _replaced_lines(result: Changed, *, has_new_keys: bool) -> Iterator[str]:
         if result.may_work_longer:
             validity = (
                 f"the replaced certificates work at least until {end} (the keystore was restored "
-                "from a backup, and its ledger may lack later ones)"
+                "from a backup, and its ledger may lack later certificates)"
             )
         elif len(result.outcomes) == 1:
             validity = f"the replaced certificate works until {end}"
@@ -353,12 +353,12 @@ def _list_lines(lists: Sequence[RevocationList], names: Mapping[str, str]) -> It
     from sros_tool.pki.certificates import subject_text
     from sros_tool.validity import iso
 
-    newest, *others = lists
+    newest, *further_lists = lists
     yield f"revocation list {newest.number}, until {iso(newest.next_update)}"
     for entry in newest.revoked:
         serial = f"{entry.serial:x}"
         yield f"  {serial}  {iso(entry.date)}  {entry.reason}  {names.get(serial, '')}".rstrip()
-    for other_list in others:  # of the other CA during a rotation
+    for other_list in further_lists:  # of the other CA during a rotation
         yield (
             f"next to it, list {other_list.number} of the other CA, "
             f"{subject_text(other_list.list.issuer)}, until {iso(other_list.next_update)}: "

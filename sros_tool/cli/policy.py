@@ -192,20 +192,20 @@ def _print_added(merged: Merged) -> None:
     from sros_tool.policy.node_basics import NodeRights
 
     nodes = NodeRights(merged.rights)
-    own = [right for right in merged.added if not nodes.needs(right)]
-    folded = len(own) > _MOST_ADDED and not logging.getLogger("sros_tool").isEnabledFor(
+    rights_shown = [right for right in merged.added if not nodes.needs(right)]
+    folded = len(rights_shown) > _MOST_ADDED and not logging.getLogger("sros_tool").isEnabledFor(
         logging.INFO
     )
     echo(f"added {counted(count, 'right')}{' (-v lists all)' * folded}", err=True)
     if folded:
-        for enclave, rights in groupby(own, lambda right: right.enclave):
+        for enclave, rights in groupby(rights_shown, lambda right: right.enclave):
             texts = [str(right).removeprefix(f"{enclave} ") for right in rights]
             echo(f"  {enclave} {first_few(texts, _MOST_OF_ENCLAVE)}", err=True)
     else:
-        for right in own:
+        for right in rights_shown:
             echo(f"  {right}", err=True)
-    if others := count - len(own):
-        echo(f"  and {counted(others, 'right')} that every node needs", err=True)
+    if rights_of_every_node := count - len(rights_shown):
+        echo(f"  and {counted(rights_of_every_node, 'right')} that every node needs", err=True)
 
 
 def _check_includes(policy: Path, output: Path, document: bytes) -> None:
@@ -455,10 +455,10 @@ def folded_differences(
     from sros_tool.policy.rights import renamed_enclaves
 
     renamed = renamed_enclaves(first_source.rights, second_source.rights)
-    others = difference.without({*renamed, *renamed.values()})
+    unrenamed = difference.without({*renamed, *renamed.values()})
     return [
         *_renamed_lines(renamed, second_source.fleet),
-        *_difference_lines(others, first_source.fleet, second_source.fleet, sides),
+        *_difference_lines(unrenamed, first_source.fleet, second_source.fleet, sides),
     ]
 
 

@@ -439,8 +439,8 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
         ):
             singly = ((finding,) for finding in chosen.shown)
             return [
-                f"{_finding_line(finding)}{others and f' ({others})'}"
-                for (finding, *_), others in folded_findings(singly, step.fleet)
+                f"{_finding_line(finding)}{other_robots and f' ({other_robots})'}"
+                for (finding, *_), other_robots in folded_findings(singly, step.fleet)
             ]
     return []
 

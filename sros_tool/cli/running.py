@@ -277,13 +277,13 @@ class _WithCommand(Verb):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments of sros, and keep the command to run in ``ctx.meta``."""
-        own, command = args, []
+        own_arguments, command = args, []
         if "--" in args:
-            own, command = args[: args.index("--")], args[args.index("--") + 1 :]
+            own_arguments, command = args[: args.index("--")], args[args.index("--") + 1 :]
         elif self.needs_no_dashes:
             ctx.allow_interspersed_args = False
         ctx.meta[_COMMAND] = command
-        return super().parse_args(ctx, own)
+        return super().parse_args(ctx, own_arguments)
 
 
 @verb("run", cls=_WithCommand)

@@ -116,17 +116,17 @@ def known_vulnerabilities(
     read, or if no advisory is about the product.
     """
     numbers = version_numbers(version)
-    own = [
+    advisories_of_library = [
         advisory
         for advisory in (shipped_advisories() if advisories is None else advisories)
         if advisory.product == product
     ]
-    if numbers is None or not own:
+    if numbers is None or not advisories_of_library:
         return None
-    known = tuple(advisory for advisory in own if advisory.affects(numbers))
+    known = tuple(advisory for advisory in advisories_of_library if advisory.affects(numbers))
     unclear = tuple(
         advisory
-        for advisory in own
+        for advisory in advisories_of_library
         if not advisory.affects(numbers) and _line(product, numbers) in advisory.unclear_lines
     )
     return KnownVulnerabilities(known, unclear)
@@ -207,7 +207,7 @@ def _advisories_of(record: Mapping[str, Any]) -> Iterator[Advisory]:
     is_withdrawn = bool(_text(record.get("withdrawn") or ""))
     aliases = _list(record.get("aliases", []), "aliases")
     cve = (name for name in aliases if isinstance(name, str) and re.fullmatch(_CVE, name))
-    own = _object(record.get("database_specific", {}))
+    database_data = _object(record.get("database_specific", {}))
     by_product: dict[str, list[Mapping[str, Any]]] = {}
     for part in map(_object, _list(record.get("affected", []), "affected")):
         if product := _product(part):
@@ -231,11 +231,11 @@ def _advisories_of(record: Mapping[str, Any]) -> Iterator[Advisory]:
             name,
             product,
             _text(record.get("summary", "")),
-            tuple(map(_text, _list(own.get("needs", []), "needs"))),
-            _text(own.get("gives", "unclear")),
+            tuple(map(_text, _list(database_data.get("needs", []), "needs"))),
+            _text(database_data.get("gives", "unclear")),
             tuple(ranges),
             frozenset(versions),
-            tuple(map(_text, _list(own.get("unclear_lines", []), "unclear_lines"))),
+            tuple(map(_text, _list(database_data.get("unclear_lines", []), "unclear_lines"))),
             tuple(unread),
         )
 

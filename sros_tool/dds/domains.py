@@ -110,14 +110,14 @@ class DomainSet:
 
     @classmethod
     def one_of_each_kind(
-        cls, listed: Collection[DomainSet], others: Iterable[DomainSet]
+        cls, listed: Collection[DomainSet], other_sets: Iterable[DomainSet]
     ) -> tuple[int, ...]:
         """Return one domain for each group of domains that are in the same sets, sorted.
 
         Only domains in a ``listed`` set are returned, unless a range lacks one of its ends:
         vendors read such ranges differently.
         """
-        sets = dict.fromkeys((*listed, *others))
+        sets = dict.fromkeys((*listed, *other_sets))
         borders = {0}
         for part in (part for names in sets for part in names.ranges):
             borders |= {

@@ -136,7 +136,7 @@ class UserKeystore(NamedTuple):
 
     def permitted_enclave(self, row: Row) -> str:
         """Return the enclave that plays attacker and permitted party of a row, else ""."""
-        attackers, others = (
+        attackers, other_enclaves = (
             {
                 (party.role, self.cast.get(party.identity.enclave, ""))
                 for party in row.parties
@@ -144,7 +144,7 @@ class UserKeystore(NamedTuple):
             }
             for intruder in (True, False)
         )
-        return next((enclave for _, enclave in attackers & others), "")
+        return next((enclave for _, enclave in attackers & other_enclaves), "")
 
     def row_if_allowed(self, row: Row, topic: str) -> Row:
         """Return a row that expects success, if the attacker's permissions allow the attack.
@@ -250,7 +250,9 @@ class _Enclaves(NamedTuple):
 
     def rows(self) -> Iterator[Row]:
         """Yield a row for each enclave with faulty or revoked files, up to `_MOST_FAULTY`."""
-        rows = [revoked_enclave_row(name, own) for name, own in self.revoked.items()]
+        rows = [
+            revoked_enclave_row(name, has_own_list) for name, has_own_list in self.revoked.items()
+        ]
         rows += [faulty_enclave_row(name, why) for name, why in self.faulty.items()]
         yield from rows[:_MOST_FAULTY]
 
@@ -290,13 +292,13 @@ def _read_enclaves(keystore: Keystore, now: datetime, domain: int) -> _Enclaves:
     for name in keystore.names:
         state = keystore.enclave(name, now=now, domain=domain)
         faults = [problem for problem in state.problems if problem.fault is not Fault.REVOKED]
-        own = len(faults) < len(state.problems)
+        has_own_fault = len(faults) < len(state.problems)
         if any(fault.fault in (Fault.FILE_UNREADABLE, Fault.FILE_NO_FILE) for fault in faults):
             unreadable.append(name)
         elif KEY_FILE not in state.files and (state.key_on_robot or state.token):
             elsewhere.append(name)
-        elif own or (state.certificate and state.certificate.serial_number in serials):
-            revoked[name] = own
+        elif has_own_fault or (state.certificate and state.certificate.serial_number in serials):
+            revoked[name] = has_own_fault
         elif faults and all(fault.fault is Fault.PERMISSIONS_DOMAIN for fault in faults):
             other_domain.append(name)
         elif reason := str(faults[0]) if faults else _strange_authority(keystore, state):
@@ -399,19 +401,19 @@ def _best_cast(
 
 
 def _best_first(
-    rights: Mapping[str, Grant], right: str, chosen: set[str], others: set[str], topic: str
+    rights: Mapping[str, Grant], right: str, chosen: set[str], other_enclaves: set[str], topic: str
 ) -> list[str]:
     """Return ``chosen`` sorted by how well an enclave shows the ``right`` to ``topic``.
 
-    Enclaves that are not in ``others`` come first, then those whose permissions name the topic.
-    Last are enclaves with a rule that denies the other direction: Cyclone DDS 0.10 denies them
-    both.
+    Enclaves that are not in ``other_enclaves`` come first, then those whose permissions name the
+    topic.  Last are enclaves with a rule that denies the other direction: Cyclone DDS 0.10 denies
+    both directions to them.
     """
     return sorted(
         (name for name in rights if name in chosen),
         key=lambda name: (
             _is_denied(rights[name], topic),
-            name in others,
+            name in other_enclaves,
             not _allows_name(rights[name], right, topic.removeprefix("rt"), named=True),
         ),
     )
@@ -458,7 +460,7 @@ def _widest_enclaves(
     An enclave whose permissions name the topic or service counts only if it may also use names that
     no permissions state.  An enclave gets no part if another row tries it with the same attack.
     """
-    for part, right, name, others in (
+    for part, right, name, competing_parts in (
         (WIDEST_PUBLISHER, "publish", topic, ("talker", "listener", "guest")),
         (WIDEST_SUBSCRIBER, "subscribe", topic, ("talker", "listener", "guest")),
         (WIDEST_CLIENT, "request", service, ("server", "client", "guest")),
@@ -472,7 +474,7 @@ def _widest_enclaves(
             if not _allows_name(grant, right, name, named=True)
             or _allows_name(grant, right, DENIED_TOPIC)
         ]
-        tried = {cast[part] for part in others if part in cast}
+        tried = {cast[part] for part in competing_parts if part in cast}
         width = {enclave: _width(rights[enclave], right, name) for enclave in unnamed}
         free = [enclave for enclave in unnamed if enclave not in tried]
         if not free:
@@ -496,12 +498,12 @@ def _width(grant: Grant, right: str, name: str) -> tuple[bool, bool, int]:
 
 
 def _first_topic(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
-    own = [
+    own_topics = [
         topic
         for topic in _application_topics(rights[cast["talker"]], "publish")
         if topic[:3] == "rt/"
     ]
-    return next((t for t in own if allows(rights[cast["listener"]], "subscribe", t)), "")
+    return next((t for t in own_topics if allows(rights[cast["listener"]], "subscribe", t)), "")
 
 
 def _is_below(short: str, long: str) -> bool:

@@ -120,24 +120,24 @@ def parse_options(module: str, roles: Collection[str], arguments: Sequence[str])
     parser.add_argument(
         "--report", type=Path, metavar="FILE", help="append the events to FILE as JSON lines"
     )
-    own, _ = split_ros_args(arguments)
-    parsed = vars(parser.parse_args(own))
+    own_arguments, _ = split_ros_args(arguments)
+    parsed = vars(parser.parse_args(own_arguments))
     return NodeOptions(**{**parsed, "also": tuple(parsed["also"])})
 
 
 def split_ros_args(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the arguments outside and inside ``--ros-args ... --``."""
-    own: list[str] = []
+    own_arguments: list[str] = []
     ros: list[str] = []
-    target = own
+    target = own_arguments
     for argument in arguments:
         if argument == "--ros-args":
             target = ros
         elif argument == "--" and target is ros:
-            target = own
+            target = own_arguments
         else:
             target.append(argument)
-    return own, ros
+    return own_arguments, ros
 
 
 def enclave_in(arguments: Sequence[str], default: str) -> str:

@@ -277,8 +277,8 @@ def _scenario_results(
     """Yield the result of each scenario in order, with its part of the rows of all scenarios."""
     left = iter(rows)
     for scenario in scenarios:
-        own = itertools.islice(left, len(scenario.rows))
-        yield _result_of(scenario, own)
+        own_results = itertools.islice(left, len(scenario.rows))
+        yield _result_of(scenario, own_results)
 
 
 def _with_expectation(row: Row, backend: Backend, template: Template, topic: str) -> Row:

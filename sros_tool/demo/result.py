@@ -813,9 +813,9 @@ def _summary(result: DemoResult) -> str:
 def _left_out_clauses(result: DemoResult) -> Iterator[str]:
     """Yield clauses on rows and enclaves that were not tried."""
     skipped = [row for row in result.rows if row.observed is RowStatus.SKIPPED]
-    if others := sum(1 for row in skipped if row.applies):
-        yield f"{others} skipped"
-    if strange := len(skipped) - others:
+    if skipped_rows := sum(1 for row in skipped if row.applies):
+        yield f"{skipped_rows} skipped"
+    if strange := len(skipped) - skipped_rows:
         yield f"{strange} that {'does' if strange == 1 else 'do'} not apply to this keystore"
     if result.left_out:
         yield f"{result.left_out} left out with --only"
@@ -834,7 +834,7 @@ def _left_out_clauses(result: DemoResult) -> Iterator[str]:
 def summary_page(result: DemoResult, now: datetime) -> str:
     """Return a summary for reviewers in Markdown; ``now`` is the time of the demo."""
     attacks = [row for row in result.rows if row.attack and not row.defence_removed]
-    others = [row for row in result.rows if not row.attack]
+    plain_rows = [row for row in result.rows if not row.attack]
     wrong = [row for row in result.rows if not row.as_expected]
     lines = [
         "# Security demo: expected and observed",
@@ -858,8 +858,8 @@ def summary_page(result: DemoResult, now: datetime) -> str:
         lines.append("")
     if attacks:
         lines += _attack_lines(attacks, [row for row in result.rows if row.defence_removed])
-    if others:
-        lines += ["## Other rows", "", *_rows_table(others)]
+    if plain_rows:
+        lines += ["## Other rows", "", *_rows_table(plain_rows)]
     return "\n".join(lines).rstrip() + "\n"
 
 

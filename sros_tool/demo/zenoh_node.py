@@ -211,18 +211,18 @@ class _ZenohNode:
         Withdraws the token of each node, with the enclave of this process, as if the node had
         ended.
         """
-        others = [
+        other_tokens = [
             chunks
             for token in tuple(self._graph)
             if _kind_of(token) == NODE
             and (chunks := token.split("/"))[8] == name
             and chunks[6] != self._enclave
         ]
-        for chunks in others:
+        for chunks in other_tokens:
             token = "/".join((*chunks[:6], self._enclave, *chunks[7:]))
-            own = self._session.liveliness().declare_token(token)
-            own.undeclare()  # type: ignore[no-untyped-call]
-        return len(others)
+            own_token = self._session.liveliness().declare_token(token)
+            own_token.undeclare()  # type: ignore[no-untyped-call]
+        return len(other_tokens)
 
     def wire_name(self, topic: str) -> str:
         """Return a name as it is in tokens."""

@@ -93,8 +93,8 @@ _OWN_PARTS = (
 class Question(NamedTuple):
     """A question about an enclave, such as ``publish topic /chatter``.
 
-    It asks whether the enclave may do ``word`` with ``name``, an absolute ROS name, or, if
-    ``name`` is "", whether it may join.  ``only`` replaces the endpoints that the right needs.
+    It asks whether the enclave may do ``word`` with ``name``, an absolute ROS name.  If ``name`` is
+    "", it asks whether the enclave may join.  ``only`` replaces the endpoints that the right needs.
     """
 
     word: str
@@ -157,11 +157,11 @@ def ask(word: str, name: str = "", kind: str | None = None) -> Question:
     fitting = [kind_of_name for kind_of_name in TYPES if (word, kind_of_name) in _RIGHTS]
     chosen = kind or fitting[0]
     if chosen not in fitting:
-        others = " or ".join(verb for verb, right in _RIGHTS if right == chosen)
+        verbs = " or ".join(verb for verb, right in _RIGHTS if right == chosen)
         raise UsageError(
             f"nobody can {word} {_with_article(chosen)}",
             f"A node can {word} {' or '.join(map(_with_article, fitting))}, and "
-            f"{others} {_with_article(chosen)}.",
+            f"{verbs} {_with_article(chosen)}.",
             f"Leave --type out, or write --type {fitting[0]}.",
         )
     return Question(word, chosen, _RIGHTS[word, chosen], _checked_name(name, word, chosen))
@@ -227,8 +227,10 @@ def _checked_name(name: str, word: str, kind: str) -> str:
         remedy = "Write one name, as the running robot shows it."
     elif not problem and not name.startswith("/"):
         problem = "It is relative to a node, and an enclave may have nodes of many namespaces."
-        own = f"/NODE/{name[1:].lstrip('/') or 'NAME'}"
-        remedy = f"Write {own if name.startswith('~') else f'/{name}'}, or /NAMESPACE/... in full."
+        full_name = f"/NODE/{name[1:].lstrip('/') or 'NAME'}"
+        remedy = (
+            f"Write {full_name if name.startswith('~') else f'/{name}'}, or /NAMESPACE/... in full."
+        )
     elif not problem and name == "/":
         problem = "It is a namespace."
     if problem:
@@ -668,24 +670,24 @@ class Evaluator:
     def answer(self, question: Question) -> Answer:
         """Return the answer to a question, without policy lines, change and remedy."""
         access = self.access
-        own: list[tuple[Part | None, Decision]] = [(None, self._participant.join())]
+        own_decisions: list[tuple[Part | None, Decision]] = [(None, self._participant.join())]
         if access is None:
-            return self._combined_answer(question, own)
-        if own[0][1].outcome not in (Outcome.REFUSED, Outcome.CRASHES):
-            own += [(part, access.decide(part.verb, part.topic)) for part in _OWN_PARTS]
+            return self._combined_answer(question, own_decisions)
+        if own_decisions[0][1].outcome not in (Outcome.REFUSED, Outcome.CRASHES):
+            own_decisions += [(part, access.decide(part.verb, part.topic)) for part in _OWN_PARTS]
         asked = tuple(
             DecidedPart(part, access.decide(part.verb, part.topic)) for part in question.parts
         )
-        return self._combined_answer(question, own, asked)
+        return self._combined_answer(question, own_decisions, asked)
 
     def _combined_answer(
         self,
         question: Question,
-        own: Sequence[tuple[Part | None, Decision]],
+        own_decisions: Sequence[tuple[Part | None, Decision]],
         asked: tuple[DecidedPart, ...] = (),
     ) -> Answer:
         """Return the answer that follows from the decisions on the process and on its endpoints."""
-        decided = [*own, *asked]
+        decided = [*own_decisions, *asked]
         outcome = min((decision.outcome for _, decision in decided), key=_WORST_FIRST.index)
         # The first topic of the question explains an allowed outcome; any other outcome is
         # explained by the first decision that has it.

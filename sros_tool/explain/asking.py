@@ -135,24 +135,24 @@ def open_to_ask(
         KeystoreError: the keystore does not have the enclave.
         PolicyError: the policy does not have the enclave.
     """
-    policy = own = stated = None
+    policy = own_enclave = stated = None
     keystore = Keystore(root) if root else None
     if policy_file:
         stated, policy = policy_to_ask(policy_file, fleet_of(asking.fleet_file, keystore))
-        own = policy.enclave(name)
-        if own is None and not is_enclave(Path(name)):
+        own_enclave = policy.enclave(name)
+        if own_enclave is None and not is_enclave(Path(name)):
             raise not_in_policy_error(policy, name, policy_file)
-    enclave = signed_enclave(keystore, name, asking.at, planned=own is not None)
+    enclave = signed_enclave(keystore, name, asking.at, planned=own_enclave is not None)
     if enclave is None:
-        assert own is not None
-        enclave = planned_enclave(own, keystore, asking)
-    elif own is None and policy_file and policy:
-        own = policy.enclave(enclave.name)
-        if own is None and not is_enclave(Path(enclave.name)):
+        assert own_enclave is not None
+        enclave = planned_enclave(own_enclave, keystore, asking)
+    elif own_enclave is None and policy_file and policy:
+        own_enclave = policy.enclave(enclave.name)
+        if own_enclave is None and not is_enclave(Path(enclave.name)):
             raise not_in_policy_error(policy, enclave.name, policy_file)
     enclave = enclave._replace(
         keystore=keystore,
-        policy=own,
+        policy=own_enclave,
         policy_file=policy_file,
         has_placeholders=policy != stated
         or (policy_file is None and keystore is not None and _is_of_robot(keystore, enclave.name)),
@@ -224,8 +224,8 @@ def signed_enclave(
     if is_enclave(root) and not (root / "enclaves").is_dir():
         enclave = _load_enclave(root, moment)
         if enclave.name != name:
-            own = enclave.name or "no enclave"
-            raise KeystoreError(f"'{root}' is the folder of {own}, not of {name}")
+            found_name = enclave.name or "no enclave"
+            raise KeystoreError(f"'{root}' is the folder of {found_name}, not of {name}")
         return enclave
     keystore.check()
     if has_enclave(root, name):

@@ -149,7 +149,7 @@ def audited_enclaves(
             or is with ``fleet``.
         PolicyError: two policies state the same enclave.
     """
-    path, *others = paths
+    path, *other_paths = paths
     rights = load_rights(path, fleet)
     if fleet and rights.kind != "policy":
         raise UsageError(
@@ -158,8 +158,8 @@ def audited_enclaves(
             "Omit --fleet.",
         )
     if rights.kind == "keystore":
-        if others:
-            raise UsageError("a keystore is audited alone", "", f"Leave '{others[0]}' out.")
+        if other_paths:
+            raise UsageError("a keystore is audited alone", "", f"Leave '{other_paths[0]}' out.")
         names = enclave_names(path)
         with_nodes = [
             name for name in names if not (enclave_path(path, name) / ROUTER_FILE).exists()
@@ -482,10 +482,10 @@ _OF_EVERY_NODE = ("/rosout", "/parameter_events")
 
 def _only_observes(node: ObservedNode) -> bool:
     """Return whether a node has only its own services and its log, as every node has."""
-    own = expand("~/", node.ns, node.name)
+    own_prefix = expand("~/", node.ns, node.name)
     folded = rights_of_endpoints(node.endpoints)
     return not (folded.halves or folded.foreign) and all(
-        right.name in _OF_EVERY_NODE or right.name.startswith(own) for right in folded.rights
+        right.name in _OF_EVERY_NODE or right.name.startswith(own_prefix) for right in folded.rights
     )
 
 

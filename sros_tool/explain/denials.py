@@ -295,13 +295,13 @@ def as_learned(
     Raises:
         UsageError: The log does not name the enclave of a denial, and ``enclave`` is "".
     """
-    profiles, others, wholes = [], dict[str, str](), dict[str, str]()
+    profiles, other_nodes, wholes = [], dict[str, str](), dict[str, str]()
     for path, rights in sorted(_rights_by_enclave(missing_rights, enclave).items()):
         present = _profiles(policy, path)
         for profile, denied in sorted(_rights_by_profile(rights, node, present).items()):
             if present and node is None and profile not in (_ANY_NODE, *present):
                 profile_names = ", ".join(sorted(map(_full_name, present)))
-                others[_full_name(profile)] = f"enclave {path} has {profile_names}"
+                other_nodes[_full_name(profile)] = f"enclave {path} has {profile_names}"
                 continue
             has = present.get(profile, frozenset())
             parts = _denied_common_part(denied, profile, has, common) if common else ()
@@ -320,7 +320,7 @@ def as_learned(
     notes = [
         Note(name, text.format("; ".join(f"{who}: {reason}" for who, reason in denials.items())))
         for name, text, denials in (
-            ("log.other-node", _OTHER, others),
+            ("log.other-node", _OTHER, other_nodes),
             ("log.common-part", _WHOLE, wholes),
             ("log.other-enclave", _ELSEWHERE, elsewhere),
         )
@@ -356,10 +356,10 @@ def _rights_by_profile(
     """Return the rights by the profile to which they are added: its namespace and node name."""
     if node is not None:
         return {node: rights}
-    own = nodes_served((right.right, right.name) for right in rights)
+    nodes_by_right = nodes_served((right.right, right.name) for right in rights)
     rights_by_profile: dict[tuple[str, str], set[NodeRight]] = {}
     (only,) = present if len(present) == 1 else (None,)
-    (only_profile,) = own if len(own) == 1 else (None,)
+    (only_profile,) = nodes_by_right if len(nodes_by_right) == 1 else (None,)
     default_profile = only or (
         _profile_of_node(only_profile, present) if only_profile and not present else _ANY_NODE
     )

@@ -224,8 +224,13 @@ def _filled_remedy(text: str, root: str, enclave: str, file: str) -> str:
 
 def _is_own_copy(keystore: Path, enclave: str, file: str) -> bool:
     """Return whether an enclave has its own copy of a file, and no link to the keystore's file."""
-    own, common = enclave_path(keystore, enclave) / file, keystore / _SHARED.get(file, "")
-    return file in _SHARED and own.is_file() and common.is_file() and not own.samefile(common)
+    own_file, common = enclave_path(keystore, enclave) / file, keystore / _SHARED.get(file, "")
+    return (
+        file in _SHARED
+        and own_file.is_file()
+        and common.is_file()
+        and not own_file.samefile(common)
+    )
 
 
 def _is_rotating(keystore: Path) -> bool:
@@ -324,16 +329,16 @@ def _blocking_denials(rights: Iterable[Right], answer: Answer) -> list[Right]:
     """
     expression = answer.decision.expression or ""
     publishes = answer.part is not None and answer.part.verb is AccessVerb.PUBLISH
-    own: list[Right] = []
+    denials_of_name: list[Right] = []
     other: list[Right] = []
     for right in rights:
         if right.qualifier is DENY:
             names = right.topics
             if expression in (names.publish if publishes else names.subscribe):
-                own.append(right)
+                denials_of_name.append(right)
             elif expression in names.publish + names.subscribe:
                 other.append(right)
-    return own or other
+    return denials_of_name or other
 
 
 _ANY_NODE = ("/", "*")
@@ -402,12 +407,12 @@ def likely_meaning(right: Right, used: Collection[Right], named: Iterable[Right]
     """
     if right.kind == "dds":
         return ""
-    others = [other for other in named if other not in used]
-    for other in others:
+    unused = [other for other in named if other not in used]
+    for other in unused:
         if other.name == right.name and {other.kind, right.kind} == {"services", "actions"}:
             kind = "an action" if other.kind == "actions" else "a service"
             return f"the policy has it as {kind} ({other.right})"
-    names = {other.name for other in others if other.right == right.right}
+    names = {other.name for other in unused if other.right == right.right}
     similar = _similar_names(right.name, names, right.kind == "services", or_only=True)
     meaning = f"perhaps the policy means {' or '.join(similar)}" if similar else ""
     if len(similar) == 1 and right.kind != "actions":
@@ -436,9 +441,9 @@ def _similar_names(
     from difflib import get_close_matches  # for this alone, which is asked last
 
     similar = get_close_matches(name, sorted(names), n=_SHOWN, cutoff=_ALIKE)
-    others = [other for other in names - GLOBAL_TOPICS if not node_of_service(other)]
-    is_only = or_only and len(others) == 1 and name not in GLOBAL_TOPICS
-    return tuple(similar or (others if is_only else ()))
+    candidates = [other for other in names - GLOBAL_TOPICS if not node_of_service(other)]
+    is_only = or_only and len(candidates) == 1 and name not in GLOBAL_TOPICS
+    return tuple(similar or (candidates if is_only else ()))
 
 
 _SHOWN = 3

@@ -276,8 +276,10 @@ def explain_log(
         if examiner.is_security_message(group[0])
     ]
     findings += [examiner.denial(denial, named) for denial, named in denials]
-    own = find("")
-    findings += _dropped_message_findings(lines, root, own.name if own else "", keystore)
+    own_enclave = find("")
+    findings += _dropped_message_findings(
+        lines, root, own_enclave.name if own_enclave else "", keystore
+    )
     return tuple(sorted(findings, key=lambda finding: finding.line))
 
 
@@ -441,11 +443,11 @@ _GRAPH: Mapping[tuple[str, bool], str] = {
 
 
 def _dropped_message_findings(
-    lines: Iterable[str], root: str, own: str, keystore: SearchedKeystore | None
+    lines: Iterable[str], root: str, own_name: str, keystore: SearchedKeystore | None
 ) -> Iterator[LogFinding]:
     """Yield a finding for each right whose lack made Zenoh drop messages.
 
-    ``own`` is the enclave of the process that wrote the log, "" if unknown.  Its rules for its
+    ``own_name`` is the enclave of the process that wrote the log, "" if unknown.  Its rules for its
     router are its own rights: where these drop a message, the process itself lacks a right.
     """
     numbered = ((n, *labelled_line(line[:_LONGEST])) for n, line in enumerate(lines, 1))
@@ -454,7 +456,7 @@ def _dropped_message_findings(
     routers = keystore.zenoh_routers if keystore and dropped else frozenset[str]()
     for message in dropped:
         # Routers check each other, too: without its name, the process may be one of them.
-        is_node = own not in routers if own else len(routers) == 1
+        is_node = own_name not in routers if own_name else len(routers) == 1
         lacks_own = message.name in routers and is_node
         kind = message.message, message.ingress is not lacks_own
         _, name = name_of_key(message.key)
@@ -466,7 +468,7 @@ def _dropped_message_findings(
     for (process, who, lacks_own, dropped_right), messages in groups.items():
         first = messages[0]
         if lacks_own:
-            enclave, lacking = own, own or "the process that wrote this log"
+            enclave, lacking = own_name, own_name or "the process that wrote this log"
         else:
             enclave = first.name
             lacking = enclave or f"the process with the zid {who}"
@@ -595,12 +597,12 @@ class _Examiner:
 
     def _with_names(self, text: str, enclave: LoadedEnclave | None, hit: _Hit) -> str:
         """Return a remedy with keystore, enclave and the hit's fields for its placeholders."""
-        own = "" if hit.meaning in (NO_ENCLAVE, RUNS_OPEN) or not enclave else enclave.name
+        own_name = "" if hit.meaning in (NO_ENCLAVE, RUNS_OPEN) or not enclave else enclave.name
         if self._is_export and NEEDS_CA_KEYS.search(text):
             text = self._for_export(text)
         else:
             text = _with_name(text, "KEYSTORE", self._root)
-        return _with_name(text, "ENCLAVE", own).format(**hit.quoted)
+        return _with_name(text, "ENCLAVE", own_name).format(**hit.quoted)
 
     @cached_property
     def _is_export(self) -> bool:
@@ -709,12 +711,14 @@ class _Examiner:
                 loaded = signed_enclave(None, str(folder), self._context(enclave).at)
         if loaded is None:
             return [], ""
-        own = Evaluator(denial.vendor, loaded, self._context(loaded)).answer(_question(denial))
-        if own.allowed:
+        own_answer = Evaluator(denial.vendor, loaded, self._context(loaded)).answer(
+            _question(denial)
+        )
+        if own_answer.allowed:
             return [f"the process runs from '{folder}', whose permissions also allow it"], (
                 "Restart the process: it loaded earlier permissions."
             )
-        return [f"the process runs from '{folder}', and there {own.decision.text}"], (
+        return [f"the process runs from '{folder}', and there {own_answer.decision.text}"], (
             f"Export enclave {enclave.name} again, install it there, and restart the process."
         )
 

@@ -217,8 +217,8 @@ def explain_on_dds(
     )
     asked = Asked(enclave.name, question, context)
     if compared is Compared.VENDORS:
-        others = {v: Evaluator(v, enclave, context) for v in Vendor if v is not vendor}
-        answers = [answer if v is vendor else explain(others[v], question) for v in Vendor]
+        evaluators = {v: Evaluator(v, enclave, context) for v in Vendor if v is not vendor}
+        answers = [answer if v is vendor else explain(evaluators[v], question) for v in Vendor]
         return Comparison(asked, answers, None, beside, answer.allowed, notes)
     if compared is Compared.DISTRIBUTIONS:
         deciding = {v for distribution in SUPPORTED for v in distribution.vendors}
@@ -248,10 +248,10 @@ def _vendor_differences(answers: Sequence[Answer]) -> str:
 def _differing_titles(who: str, decided: Sequence[tuple[str, Outcome]]) -> str:
     """Return a sentence with the titles whose outcome differs from the first outcome."""
     title, first = decided[0]
-    others = [f"{other} ({outcome})" for other, outcome in decided if outcome != first]
-    if not others:
+    differing = [f"{other} ({outcome})" for other, outcome in decided if outcome != first]
+    if not differing:
         return f"all {who} decide alike"
-    return f"{who.upper()} DIFFER: {title} ({first}), but {', '.join(others)}"
+    return f"{who.upper()} DIFFER: {title} ({first}), but {', '.join(differing)}"
 
 
 # ── notes ──────────────────────────────────────────────────────────────────────────────────
@@ -523,12 +523,12 @@ class VendorOfPolicy(NamedTuple):
     def outcomes(self, question: Question) -> tuple[VendorOutcome, ...]:
         """Return the outcome for each enclave, sorted by name."""
         outcomes = []
-        for own in self.policy.enclaves:
-            if any(fnmatchcase(own.path, pattern) for pattern in self.patterns):
-                enclave = planned_enclave(own, None, self.asking)
+        for policy_enclave in self.policy.enclaves:
+            if any(fnmatchcase(policy_enclave.path, pattern) for pattern in self.patterns):
+                enclave = planned_enclave(policy_enclave, None, self.asking)
                 context = self.asking.context(enclave.joined_domains)
                 evaluator = Evaluator(self.vendor, enclave, context)
-                outcomes.append(_outcome(evaluator, own.path, question))
+                outcomes.append(_outcome(evaluator, policy_enclave.path, question))
         return tuple(sorted(outcomes, key=lambda outcome: outcome.enclave))
 
     def printed(self, question: Question, outcomes: Sequence[VendorOutcome]) -> WhoByVendor:
@@ -560,11 +560,11 @@ class VendorOfKeystore(NamedTuple):
     @property
     def _reason(self) -> str:
         names = self.keystore.names if self.names is None else self.names
-        others = {vendor.title for name in names if (vendor := self.stated(name))}
-        if not (others := others - {self.vendor.title}):
+        titles = {vendor.title for name in names if (vendor := self.stated(name))}
+        if not (titles := titles - {self.vendor.title}):
             return self.why
         return (
-            f"{self.why}; {' and '.join(sorted(others))} for enclaves whose distribution is stated"
+            f"{self.why}; {' and '.join(sorted(titles))} for enclaves whose distribution is stated"
         )
 
     def rights_naming(self, name: str) -> Iterator[Right]:

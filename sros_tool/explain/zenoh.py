@@ -365,43 +365,42 @@ class ZenohEvaluator:
             raise missing_enclave_error(self.keystore, enclave, self.names)
         if brief and (dropped := self._dropped_by_router(enclave, question)):
             return dropped
-        own = self._file(enclave, self._file_of(enclave))
+        own_file = self._file(enclave, self._file_of(enclave))
         answer = ZenohAnswer(
             enclave,
             question,
-            own.process.mode if own.process else None,
+            own_file.process.mode if own_file.process else None,
             _Outcome.REFUSED,
-            own.problem,
-            until=own.until,
-            unsigned=() if brief else self.unsigned_files(own),
+            own_file.problem,
+            until=own_file.until,
+            unsigned=() if brief else self.unsigned_files(own_file),
         )
-        if own.process is None:
+        if own_file.process is None:
             return answer
-        if own.process.mode is Mode.ROUTER:
-            return self._answer_for_router(answer, own.process, brief=brief)
+        if own_file.process.mode is Mode.ROUTER:
+            return self._answer_for_router(answer, own_file.process, brief=brief)
         router = self._router_of(enclave)
         if router.process is None:
             text = f"no link to the router {router.enclave}: {router.problem}"
             return replace(answer, text=text)
-        if not _addresses_meet(own.endpoints, router.endpoints):
-            text = (
-                f"no link to the router: {own.file} connects to {_places_text(own.endpoints)}, and "
-            )
+        if not _addresses_meet(own_file.endpoints, router.endpoints):
+            places = _places_text(own_file.endpoints)
+            text = f"no link to the router: {own_file.file} connects to {places}, and "
             text += f"{ROUTER_FILE} listens at {_places_text(router.endpoints)}"
             return replace(answer, text=text)
         wanted = self._rights(enclave, question)
-        checks = self._deciding_checks(own.process, router.process, wanted, brief=brief)
+        checks = self._deciding_checks(own_file.process, router.process, wanted, brief=brief)
         answer = replace(answer, checks=checks)
         text = self._reason_text(answer.deciding)
         if answer.dropped:
             return replace(answer, outcome=_Outcome.DROPPED, text=text)
-        reached = tuple(self._reached_enclaves(own, wanted)) if reach else ()
+        reached = tuple(self._reached_enclaves(own_file, wanted)) if reach else ()
         return replace(
             answer,
             outcome=_Outcome.ALLOWED,
             text=text,
             reached=reached,
-            wildcards=tuple(self._wildcards(own.process, wanted, checks, reached)),
+            wildcards=tuple(self._wildcards(own_file.process, wanted, checks, reached)),
         )
 
     def with_parts(self, answer: ZenohAnswer, *, brief: bool) -> ZenohAnswer:
@@ -500,9 +499,13 @@ class ZenohEvaluator:
 
         The enclave's file decides; for a client, the file of its router.
         """
-        own = self._file(answer.enclave, self._file_of(answer.enclave)).process
+        own_process = self._file(answer.enclave, self._file_of(answer.enclave)).process
         wanted = self._rights(answer.enclave, answer.question)
-        if own is None or not wanted or (own.mode is Mode.CLIENT and not answer.allowed):
+        if (
+            own_process is None
+            or not wanted
+            or (own_process.mode is Mode.CLIENT and not answer.allowed)
+        ):
             return set()
         return {
             name
@@ -510,10 +513,12 @@ class ZenohEvaluator:
             if all(
                 delivery.arrives
                 for delivery in (
-                    self._deliveries_between(own, _unrestricted_process(name, Mode.CLIENT), wanted)
-                    if own.mode is Mode.CLIENT
+                    self._deliveries_between(
+                        own_process, _unrestricted_process(name, Mode.CLIENT), wanted
+                    )
+                    if own_process.mode is Mode.CLIENT
                     else self._direct_deliveries(
-                        own, _unrestricted_process(name, Mode.PEER), wanted
+                        own_process, _unrestricted_process(name, Mode.PEER), wanted
                     )
                 )
             )
@@ -571,10 +576,12 @@ class ZenohEvaluator:
     def _configuration(self, path: Path) -> tuple[Mode, MessageFilter, tuple[ZenohEndpoint, ...]]:
         """Return the mode of a process, what it enforces, and where it connects or listens."""
         data = self.keystore.read(path, "Zenoh configuration")
-        own = self._rendered.read(data)
-        if own and own.settings is SettingsEdition.RULES_ONCE:  # rules have the ids of the file
-            texts = own.listen if own.mode is Mode.ROUTER else own.connect
-            return own.mode, own.access_control, tuple(map(ZenohEndpoint, texts))
+        rendered = self._rendered.read(data)
+        if (
+            rendered and rendered.settings is SettingsEdition.RULES_ONCE
+        ):  # rules have the ids of the file
+            texts = rendered.listen if rendered.mode is Mode.ROUTER else rendered.connect
+            return rendered.mode, rendered.access_control, tuple(map(ZenohEndpoint, texts))
         document = parse_configuration(data, str(path), lines=False)
         endpoints = document.listen if document.mode is Mode.ROUTER else document.connect
         return document.mode, document.access, endpoints
@@ -685,7 +692,7 @@ class ZenohEvaluator:
         return checks
 
     def _rights(self, enclave: str, question: Question) -> tuple[Right, ...]:
-        """Return the rights that a question asks for; () for the question whether it may join."""
+        """Return the rights that a question needs; () if it asks whether the enclave may join."""
         return parts(Right(enclave, ALLOW, question.right, question.name)) if question.right else ()
 
     def _link_checks(
@@ -755,11 +762,15 @@ class ZenohEvaluator:
                 yield Reached(name, deliveries, other.problem)
 
     def _deliveries_between(
-        self, own: ZenohProcess, other: ZenohProcess, wanted_rights: Sequence[Right], key: str = ""
+        self,
+        own_process: ZenohProcess,
+        other: ZenohProcess,
+        wanted_rights: Sequence[Right],
+        key: str = "",
     ) -> tuple[Delivery, ...]:
-        ends = [self._router_of(process.name).process for process in (own, other)]
+        ends = [self._router_of(process.name).process for process in (own_process, other)]
         routers = [router for router in ends if router]
-        way = route(own, other, routers[0], routers[-1])
+        way = route(own_process, other, routers[0], routers[-1])
         return tuple(self._delivery(way, right, key) for right in wanted_rights)
 
     def _wildcards(

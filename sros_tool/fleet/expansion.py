@@ -360,8 +360,8 @@ def _as_stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Ite
     exact: dict[tuple[str, str], list[Right]] = defaultdict(list)
     for right in stated:
         for name in _names(policy, right.name, robot):
-            for part, own in zip(parts(right), parts(right._replace(name=name)), strict=True):
-                exact[own.right, own.name].append(part)
+            for part, own_part in zip(parts(right), parts(right._replace(name=name)), strict=True):
+                exact[own_part.right, own_part.name].append(part)
     rules = Rules(stated)
     wide = [(used, name, rights) for (used, name), rights in exact.items() if is_expression(name)]
     for right in observed:

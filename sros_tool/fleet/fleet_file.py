@@ -178,9 +178,9 @@ class _Reader:
                         f"Write {at}.{key}.",
                     )
                 given[key], origin[key] = value, group_key
-        own = {key: value for key, value in values.items() if key != "groups"}
+        own_values = {key: value for key, value in values.items() if key != "groups"}
         given = self._read_values(given, origin, name) | self._read_values(
-            own, {key: f"{at}.{self._word(key)}" for key in own}
+            own_values, {key: f"{at}.{self._word(key)}" for key in own_values}
         )
         usual = {"namespace": f"/{name}", "address": name, "user": "", "domain": None}
         robot = Robot(name, groups=member, **(usual | given))

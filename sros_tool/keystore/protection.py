@@ -130,9 +130,9 @@ class _Raising:
 
     def _is_for_topics(self, number: int, topics: Sequence[str]) -> bool:
         """Return whether an entry of the settings is for exactly these topics."""
-        own = protected_topics(self._named[number].kind, self._named[number].name)
-        return len(own) == len(topics) and all(
-            any(covers(topic, own_topic) and covers(own_topic, topic) for own_topic in own)
+        own_topics = protected_topics(self._named[number].kind, self._named[number].name)
+        return len(own_topics) == len(topics) and all(
+            any(covers(topic, own_topic) and covers(own_topic, topic) for own_topic in own_topics)
             for topic in topics
         )
 

@@ -1070,8 +1070,8 @@ class _EnclaveFiles:
         subject = subject_text(certificate.subject)
         grant = permissions.grant_of(subject)
         if grant is None:
-            others = ", ".join(grant.subject for grant in permissions.grants)
-            only = f", only for {others}" if others else ""
+            subjects = ", ".join(grant.subject for grant in permissions.grants)
+            only = f", only for {subjects}" if subjects else ""
             text = f"it has no grant for {subject}{only}"
             self._add(name, text, Fault.PERMISSIONS_SUBJECT)
             return

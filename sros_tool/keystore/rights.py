@@ -195,15 +195,17 @@ def rights_grouped_by_domains(
     for right in rights:
         by_enclave.setdefault(right.enclave, []).append(right)
     result: dict[DomainSet | None, set[Right]] = {}
-    for enclave, own in by_enclave.items():
+    for enclave, own_rights in by_enclave.items():
         if key_domains:
-            divided = _divide_by_keys(own, key_domains)
+            divided = _divide_by_keys(own_rights, key_domains)
         elif enclave in documents:
-            divided = _divide_by_rules(own, enclave, documents[enclave])
+            divided = _divide_by_rules(own_rights, enclave, documents[enclave])
         else:
             robot = robot_of(fleet, enclave) if fleet else None
             domain = robot.domain if robot else None
-            divided = iter([(None if domain is None else DomainSet.of((domain, domain)), own)])
+            divided = iter(
+                [(None if domain is None else DomainSet.of((domain, domain)), own_rights)]
+            )
         for domains, group in divided:
             result.setdefault(domains, set()).update(group)
     return result
@@ -232,9 +234,9 @@ def _divide_by_rules(rights: Collection[Right], enclave: str, permissions: Permi
     stated: set[Right] = set()
     for domains in DomainSet.parts(listed):
         rules = (rule for rule in grant.rules if (rule.domains.closed() & domains).ranges)
-        own = grant_rights(enclave, grant._replace(rules=tuple(rules)))
-        yield domains, own
-        stated |= own
+        granted_rights = grant_rights(enclave, grant._replace(rules=tuple(rules)))
+        yield domains, granted_rights
+        stated |= granted_rights
     yield None, [right for right in rights if right not in stated]
 
 
@@ -690,9 +692,9 @@ def _without_observer(source: RightsSource, other: RightsSource) -> RightsSource
     if folder_of_closed_robot(source.path) and not any(
         e.enclave == CLOSED_OBSERVER for e in other.rights
     ):
-        own = (right for right in source.rights if right.enclave != CLOSED_OBSERVER)
+        stated_rights = (right for right in source.rights if right.enclave != CLOSED_OBSERVER)
         scope = None if source.scope is None else source.scope - {CLOSED_OBSERVER}
-        return replace(source, rights=frozenset(own), scope=scope)
+        return replace(source, rights=frozenset(stated_rights), scope=scope)
     return source
 
 

@@ -185,9 +185,11 @@ def _robots_enclaves(
         )
     enclaves: list[str] = []
     for name in robots:
-        own = enclaves_of_robot(root, fleet, fleet.robots[name]) if name in fleet.robots else ()
-        own += unrecorded[name].below if name in unrecorded else ()
-        if not own:
+        own_enclaves = (
+            enclaves_of_robot(root, fleet, fleet.robots[name]) if name in fleet.robots else ()
+        )
+        own_enclaves += unrecorded[name].below if name in unrecorded else ()
+        if not own_enclaves:
             if left := _enclaves_named_after(keystore, name):
                 raise KeystoreError(
                     f"the fleet in keystore '{root}' gives no enclave to a robot {name}",
@@ -201,7 +203,7 @@ def _robots_enclaves(
                 "",
                 f"See `sros list_enclaves {quote(str(root))}`.",
             )
-        enclaves += own
+        enclaves += own_enclaves
     return enclaves
 
 

@@ -244,15 +244,15 @@ def _out_of_date(configuration: Configuration, file: str, name: str, state: Open
     nodes = nodes_in_rules((rule for remote in control.remotes for rule in remote.rules), name)
     try:
         stated = {domain: rights_in_domain(name, state.grant, domain) for domain in domains}
-        own = remote_of(name, stated, nodes)
+        own_rights = remote_of(name, stated, nodes)
     except SrosError as error:
         return f"Zenoh cannot state the permissions of the enclave: {error.what}"
     # The router may do what the enclave lets it, and other processes nothing else.
-    mirrored = joined(rule.mirrored() for rule in own.rules)
+    mirrored = joined(rule.mirrored() for rule in own_rights.rules)
     if not any(remote.rules == mirrored for remote in control.remotes) or not all(
-        is_within(remote, own) for remote in control.remotes
+        is_within(remote, own_rights) for remote in control.remotes
     ):
-        names = stated_names(own.rules)
+        names = stated_names(own_rights.rules)
         if any(
             stated_names(rule.mirrored() for rule in remote.rules) == names
             for remote in control.remotes
@@ -636,12 +636,12 @@ def _router_files(
 
 def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int, ...]:
     """Return the ROS domains of the network, all of which the governance has."""
-    if others := [domain for domain in network.domains if domain not in domains]:
+    if unserved := [domain for domain in network.domains if domain not in domains]:
         raise UsageError(
-            f"the Zenoh network has domain {others[0]}, and keystore '{root}' only {domains}",
+            f"the Zenoh network has domain {unserved[0]}, and keystore '{root}' only {domains}",
             "DDS and Zenoh would enforce different rights.",
             f"Name other domains with `sros zenoh --domain`, or add the domain with `sros "
-            f"update_keystore {quote(str(root))} --domain {domains},{others[0]} --allow-looser`.",
+            f"update_keystore {quote(str(root))} --domain {domains},{unserved[0]} --allow-looser`.",
         )
     chosen = network.domains or tuple(domains)
     if len(chosen) > _MOST_DOMAINS:

@@ -424,14 +424,14 @@ def likely_issued(certificate: x509.Certificate, authority: x509.Certificate) ->
     named = extension(certificate, x509.AuthorityKeyIdentifier)
     if named is None:
         return True
-    own = extension(authority, x509.SubjectKeyIdentifier)
+    key_identifier = extension(authority, x509.SubjectKeyIdentifier)
     issuers = [
         name.value
         for name in named.authority_cert_issuer or ()
         if isinstance(name, x509.DirectoryName)
     ]
     return (
-        (not own or named.key_identifier in (None, own.digest))
+        (not key_identifier or named.key_identifier in (None, key_identifier.digest))
         and named.authority_cert_serial_number in (None, authority.serial_number)
         and (not issuers or same_name(issuers[0], authority.issuer))
     )

@@ -313,7 +313,7 @@ def _authority(certificate: x509.Certificate) -> _Authority:
 
 
 def _netscape_type(certificate: x509.Certificate) -> int | None:
-    """Return the bits of the extension nsCertType, or None without it; -1 for unreadable ones."""
+    """Return the bits of the extension nsCertType, None without it, -1 if it is unreadable."""
     kinds = [
         extension.value for extension in certificate.extensions if extension.oid == _NETSCAPE_TYPE
     ]

@@ -484,8 +484,12 @@ def _issuer(
 
 def _identifies(identifier: x509.AuthorityKeyIdentifier, authority: x509.Certificate) -> bool:
     """Return whether a key identifier names the CA (X509_check_akid)."""
-    own = extension(authority, x509.SubjectKeyIdentifier)
-    if identifier.key_identifier is not None and own and identifier.key_identifier != own.digest:
+    own_identifier = extension(authority, x509.SubjectKeyIdentifier)
+    if (
+        identifier.key_identifier is not None
+        and own_identifier
+        and identifier.key_identifier != own_identifier.digest
+    ):
         return False
     if identifier.authority_cert_serial_number not in (None, authority.serial_number):
         return False

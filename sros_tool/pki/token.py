@@ -37,14 +37,14 @@ def _module_of(parsed: TokenUri, *, named: bool) -> str:
     Raises:
         UsageError: no library is named, or it must not be loaded.
     """
-    own = os.environ.get(MODULE_VARIABLE, "")
+    chosen_module = os.environ.get(MODULE_VARIABLE, "")
     path = Path(parsed.module)
     if parsed.module and named:
         return parsed.module
     if path.is_absolute() and (real := file_of_root(path)):
         return str(real)
-    if own:
-        return own
+    if chosen_module:
+        return chosen_module
     if not parsed.module and (proxy := _proxy()):
         return proxy
     if parsed.module:

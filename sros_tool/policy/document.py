@@ -555,8 +555,10 @@ class _Reader:
             return PolicyError(f"{where}: {error.what}", error.why, error.remedy)
         remedy = ""
         if written.startswith("{robot"):
-            own = [written.replace("{robot", "{namespace", 1)] if label == "namespace" else []
-            remedy = f"Write {' or '.join(map(_short, (*own, f'/{written}')))}."
+            suggestions = (
+                [written.replace("{robot", "{namespace", 1)] if label == "namespace" else []
+            )
+            remedy = f"Write {' or '.join(map(_short, (*suggestions, f'/{written}')))}."
         return PolicyError(f"{where}: {_short(written)} is not a valid {label}", error.why, remedy)
 
     def _read_profiles(self, element: etree._Element, place: IncludedFile) -> Profiles:

@@ -485,9 +485,13 @@ def _check_protection(path: Path, merged: Policy, additions: Policy) -> None:
     """
     present = {(e.kind, e.name): e for e in stated_protections(merged.enclaves)}
     for protection in stated_protections(additions.enclaves):
-        own = present.get((protection.kind, protection.name))
-        if own is None or own.level is not protection.level:
-            says = f'says protect="{own.word}" at {own.source}' if own else "does not state it"
+        present_level = present.get((protection.kind, protection.name))
+        if present_level is None or present_level.level is not protection.level:
+            says = (
+                f'says protect="{present_level.word}" at {present_level.source}'
+                if present_level
+                else "does not state it"
+            )
             raise PolicyError(
                 f'{protection.source}: {protection} has protect="{protection.word}", and '
                 f"'{path}' {says}",
@@ -543,13 +547,13 @@ class _Editor:
     def add(self, entries: dict[ProfileKey, tuple[AddedName, ...]]) -> bytes:
         """Return the document with ``entries`` added."""
         blocks = list(self._text.root.named("enclaves"))
-        own = {
+        enclave_elements = {
             element.get("path"): element for block in blocks for element in block.named("enclave")
         }
         for path, enclave_entries in groupby(entries.items(), key=lambda item: item[0].enclave):
             places = dict(enclave_entries)
-            if path in own:
-                self._add_to_enclave(own[path], places)
+            if path in enclave_elements:
+                self._add_to_enclave(enclave_elements[path], places)
                 continue
             included = self._policy.enclave(path)
             if included is not None or not blocks:
@@ -567,15 +571,15 @@ class _Editor:
     def _add_to_enclave(
         self, enclave: PlacedElement, places: dict[ProfileKey, tuple[AddedName, ...]]
     ) -> None:
-        own: dict[tuple[str, str], list[PlacedElement]] = {}
+        profiles_by_node: dict[tuple[str, str], list[PlacedElement]] = {}
         blocks = list(enclave.named("profiles"))
         for block in blocks:
             for profile in block.named("profile"):
                 key = (check_namespace(profile.get("ns")), profile.get("node"))
-                own.setdefault(key, []).append(profile)
+                profiles_by_node.setdefault(key, []).append(profile)
         new = []
         for place, entries in places.items():
-            if profiles := own.get((place.ns, place.node)):
+            if profiles := profiles_by_node.get((place.ns, place.node)):
                 self._add_to_profiles(profiles, entries)
             else:
                 new.append(_profile(place, entries))

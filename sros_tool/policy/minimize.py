@@ -313,10 +313,10 @@ class _Narrowing:
         for right in folded(self._in_use):
             for rule in rules_that_state(right):
                 used[rule].append(right)
-        others = Rules(kept_rights)
+        kept_rules = Rules(kept_rights)
         needed = unfolded((*self._in_use, *self._common))
         replacement: dict[Right, list[Right]] = defaultdict(list)
-        for right in folded(p for p in needed if self._is_allowed(p) and not others.cover(p)):
+        for right in folded(p for p in needed if self._is_allowed(p) and not kept_rules.cover(p)):
             replacement[rules_that_state(right)[0]].append(right)
         return tuple(
             WideRule(
@@ -483,12 +483,14 @@ def propose_wildcards(
     returns the size of a right in bytes.  The largest savings come first; wildcards that newly
     allow a known name are used only if the safe ones do not suffice.
     """
-    own = [right for right in rights if right.enclave == enclave and right.qualifier is ALLOW]
-    rules = Rules(own)
+    own_rights = [
+        right for right in rights if right.enclave == enclave and right.qualifier is ALLOW
+    ]
+    rules = Rules(own_rights)
     foreign = _names_without_right(enclave, rules, known_rights)
-    present = Rules(right for right in own if is_expression(right.name))
+    present = Rules(right for right in own_rights if is_expression(right.name))
     # A large document does not list the names that its wildcards match, so these save nothing.
-    listed = (right for right in own if not present.cover(right))
+    listed = (right for right in own_rights if not present.cover(right))
     candidates: dict[frozenset[Right], WildcardProposal] = {}
     for rule, listed_rights in _candidates(listed).items():
         other = candidates.get(frozenset(listed_rights))

@@ -444,8 +444,8 @@ def common_name(
     inner, outer = tuple(dict.fromkeys(wanted_names)), tuple(dict.fromkeys(unwanted_names))
     for name in inner:
         if not is_expression(name):
-            others = (expression for expression in inner if expression != name)
-            fits = all(matches(expression, name) for expression in others)
+            other_expressions = (expression for expression in inner if expression != name)
+            fits = all(matches(expression, name) for expression in other_expressions)
             return (
                 name
                 if fits and not any(matches(expression, name) for expression in outer)

@@ -139,9 +139,11 @@ class Worlds:
     def __init__(self, worlds: Iterable[World]) -> None:
         self._first_alike: dict[World, World] = {}
         for world in worlds:
-            others = self._first_alike.values()
+            other_worlds = self._first_alike.values()
             same_access = (
-                world_of_group for world_of_group in others if world.has_same_access(world_of_group)
+                world_of_group
+                for world_of_group in other_worlds
+                if world.has_same_access(world_of_group)
             )
             self._first_alike[world] = next(same_access, world)
 
@@ -315,15 +317,16 @@ def _first_of(uses: Mapping[str, Sequence[Use]]) -> Witness | None:
     """Return the shortest use as a witness, with a use of every other enclave."""
     if not uses:
         return None
-    best = min((use for own in uses.values() for use in own), key=_use_order)
-    others = (
+    best = min((use for uses_of_right in uses.values() for use in uses_of_right), key=_use_order)
+    other_uses = (
         min(
-            own, key=lambda use: ((use.right, use.name) != (best.right, best.name), _use_order(use))
+            uses_of_right,
+            key=lambda use: ((use.right, use.name) != (best.right, best.name), _use_order(use)),
         )
-        for enclave, own in sorted(uses.items())
+        for enclave, uses_of_right in sorted(uses.items())
         if enclave != best.enclave
     )
-    return Witness((best,), tuple((use,) for use in others))
+    return Witness((best,), tuple((use,) for use in other_uses))
 
 
 def _witness_against_must(requirement: Must, world: World, limit: SearchLimit) -> Witness | None:
@@ -333,12 +336,12 @@ def _witness_against_must(requirement: Must, world: World, limit: SearchLimit) -
     for right, names in requirement.rights:
         for name in names:
             for part in _parts_of(right):
-                own = NameSet()
+                own_names = NameSet()
                 if enclave not in world.idle:
-                    own = _own_topics(world, enclave, part.writes)
+                    own_names = _own_topics(world, enclave, part.writes)
                 topics = part.topics(name)
                 # Of a wildcard, only names that a node can have are asked for.
-                topic = (topics.valid() - own).example(limit, longest=world.longest)
+                topic = (topics.valid() - own_names).example(limit, longest=world.longest)
                 if topic:
                     lacking.append(_use(enclave, right, part, topics, topic))
     lacking += [
@@ -366,18 +369,18 @@ def _use_kept_from_others(requirement: Must, world: World, limit: SearchLimit) -
     enclave = requirement.enclave
     for right, names in requirement.rights:
         for part, name in product(_parts_of(right), names):
-            topics, own = part.topics(name), _own_topics(world, enclave, part.writes)
-            others: dict[str, str] = {}
+            topics, own_topics = part.topics(name), _own_topics(world, enclave, part.writes)
+            other_enclaves: dict[str, str] = {}
             for met in world.side(not part.writes).users_of_topics(topics, limit):
                 ends = (enclave, met.enclave) if part.writes else (met.enclave, enclave)
                 crossing = world.topics_between(*ends)
                 if crossing is None:
                     continue
-                if topic := world.example((own & met.names) - crossing, topics, limit):
-                    others[met.enclave] = topic
-            if others:
-                topic = next(iter(others.values()))
-                return KeptUse(_use(enclave, right, part, topics, topic), tuple(others))
+                if topic := world.example((own_topics & met.names) - crossing, topics, limit):
+                    other_enclaves[met.enclave] = topic
+            if other_enclaves:
+                topic = next(iter(other_enclaves.values()))
+                return KeptUse(_use(enclave, right, part, topics, topic), tuple(other_enclaves))
     return None
 
 
@@ -398,7 +401,7 @@ def _witness_against_at_most(
     """
     most = requirement.most
     best: tuple[Use, ...] = ()
-    others: tuple[Use, ...] = ()
+    other_uses: tuple[Use, ...] = ()
     for right, names in requirement.rights:
         for expression in names:
             holders: dict[str, list[tuple[_Part, TopicUser]]] = {}
@@ -420,8 +423,8 @@ def _witness_against_at_most(
                 if (use := next(_uses_of(name, enclave, right, parts), None))
             ]
             if not best or _use_order(uses[0]) < _use_order(best[0]):
-                best, others = tuple(uses[: most + 1]), tuple(uses[most + 1 :])
-    return Witness(best, tuple((use,) for use in others)) if best else None
+                best, other_uses = tuple(uses[: most + 1]), tuple(uses[most + 1 :])
+    return Witness(best, tuple((use,) for use in other_uses)) if best else None
 
 
 def _uses_of(
@@ -454,8 +457,8 @@ def _shared_by(
         stated |= names
         longest = min(longest, *(world.longest - part.longer for part, _ in parts))
         if any(met.wild for _, met in parts):
-            own = (met.names.between(part.begin, part.end) for part, met in parts)
-            wild.append(NameSet.union(own))
+            own_names = (met.names.between(part.begin, part.end) for part, met in parts)
+            wild.append(NameSet.union(own_names))
         else:
             exactly.update(names)
 
@@ -488,13 +491,13 @@ def _witness_against_widest(
             side, all_topics = world.side(part.writes), part.topics("*")
             within = NameSet.union(part.topics(name).every() for name in names)
             for enclave in enclaves:
-                own = side.of[enclave]
-                around = own.around()
+                own_topics = side.of[enclave]
+                around = own_topics.around()
                 if around is not None and not around.automata:
                     continue
                 access = world.stated[enclave]
                 exact = access.writes if part.writes else access.reads
-                if topic := world.example(own - exact - within, all_topics, limit):
+                if topic := world.example(own_topics - exact - within, all_topics, limit):
                     uses[enclave].append(_use(enclave, right, part, all_topics, topic))
     return _first_of(uses)
 

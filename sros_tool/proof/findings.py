@@ -160,11 +160,13 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
             idle = isinstance(requirement, Must) and requirement.enclave in world.idle
             similar_uses = [uses for uses in witness.others if _are_alike(uses, witness)]
             differing = [uses for uses in witness.others if not _are_alike(uses, witness)]
-            others = tuple(
+            other_steps = tuple(
                 tuple(_step(use, world, system) for use in uses)
                 for uses in (*similar_uses[:_SHOWN], *differing[:_SHOWN])
             )
-            violations.append(Violation(requirement, witness, steps, titles, missing, idle, others))
+            violations.append(
+                Violation(requirement, witness, steps, titles, missing, idle, other_steps)
+            )
         if reasons := tuple(_never_fails([verdict for _, verdict in verdicts])):
             vacuous.append((requirement, reasons))
         if not broken and (
@@ -184,8 +186,10 @@ def _step(use: Use, world: World, system: System) -> Step:
 
 def _never_fails(verdicts: Sequence[Verdict]) -> Iterator[str]:
     """Yield clauses that say why a requirement, or a part of it, cannot fail in any world."""
-    first, *others = verdicts
-    empty = [name for name in first.empty if all(name in verdict.empty for verdict in others)]
+    first, *later_verdicts = verdicts
+    empty = [
+        name for name in first.empty if all(name in verdict.empty for verdict in later_verdicts)
+    ]
     if empty:
         yield _listed_names(empty)
     if all(verdict.always for verdict in verdicts):
@@ -253,9 +257,13 @@ def _violation_finding(violation: Violation) -> Finding:
         for step in named
         if step.source
     ]
-    own = requirement.source
+    requirement_place = requirement.source
     related.append(
-        RelatedPlace(f"required: {_with_title(requirement)}", own.file, own.line or None)
+        RelatedPlace(
+            f"required: {_with_title(requirement)}",
+            requirement_place.file,
+            requirement_place.line or None,
+        )
     )
     return VIOLATED.found(
         _subject(violation),
@@ -331,22 +339,36 @@ def _listed_names(names: Sequence[str]) -> str:
 
 
 def _vacuous_finding(requirement: Requirement, why: Sequence[str]) -> Finding:
-    own = requirement.source
+    requirement_place = requirement.source
     text = f"{'; '.join(why)}: {demand(requirement)}"
-    return VACUOUS.found(own.file, text, own.file, own.line)
+    return VACUOUS.found(
+        requirement_place.file, text, requirement_place.file, requirement_place.line
+    )
 
 
 def _assumption_finding(requirement: Requirement, name: str) -> Finding:
-    own = requirement.source
+    requirement_place = requirement.source
     text = f"{demand(requirement)}: {assumption_text(name)}"
-    return ASSUMED.found(own.file, text, own.file, own.line)
+    return ASSUMED.found(
+        requirement_place.file, text, requirement_place.file, requirement_place.line
+    )
 
 
 def _not_crossing_finding(requirement: Requirement, kept_use: KeptUse) -> Finding:
-    own, use, others = requirement.source, kept_use.use, _listed_names(kept_use.others)
-    ends = f"from {use.enclave} to {others}" if use.writes else f"from {others} to {use.enclave}"
+    requirement_place, use, other_names = (
+        requirement.source,
+        kept_use.use,
+        _listed_names(kept_use.others),
+    )
+    ends = (
+        f"from {use.enclave} to {other_names}"
+        if use.writes
+        else f"from {other_names} to {use.enclave}"
+    )
     text = f"{use.name} does not pass between routers {ends}: {demand(requirement)}"
-    return NOT_CROSSING.found(own.file, text, own.file, own.line)
+    return NOT_CROSSING.found(
+        requirement_place.file, text, requirement_place.file, requirement_place.line
+    )
 
 
 def assumption_text(name: str) -> str:

@@ -221,8 +221,8 @@ class Growth:
         names = {*renamed, *renamed.values()}
 
         def is_no_rename(gain: Gain) -> bool:
-            own = gain.right is not None and gain.enclaves == (gain.right.enclave,)
-            return not own or gain.enclaves[0] not in names or gain.denied is not None
+            is_own_right = gain.right is not None and gain.enclaves == (gain.right.enclave,)
+            return not is_own_right or gain.enclaves[0] not in names or gain.denied is not None
 
         added, removed = (
             tuple(filter(is_no_rename, gains)) for gains in (self.added, self.removed)
@@ -559,12 +559,12 @@ def _access_by_rights(
         ]
 
     def access(enclave: str, domain: int) -> _Access:
-        own = rights_in(enclave, domain)
+        own_rights = rights_in(enclave, domain)
         allowed, denied = (
             {
                 verb: [
                     topic
-                    for right in own
+                    for right in own_rights
                     if (right.qualifier is ALLOW) is allows
                     for topic in getattr(right.topics, verb)
                 ]
@@ -583,7 +583,7 @@ def _access_by_rights(
             granted = names_of(Style.FNMATCH, allowed[verb]) - names_of(Style.FNMATCH, denied[verb])
             return granted & ROS_TOPICS
 
-        return _Access({verb: topics(verb) for verb in _VERBS}, decide, joins=bool(own))
+        return _Access({verb: topics(verb) for verb in _VERBS}, decide, joins=bool(own_rights))
 
     return access
 
@@ -851,8 +851,8 @@ class _Stated:
         denied = self._denials(enclave, verb, world.style)
         for right, topics in allowed:
             for expression in topics:
-                own = added_names & names_of(world.style, (expression,))
-                topic = self._example(own, (enclave, verb, expression), world, limit)
+                own_names = added_names & names_of(world.style, (expression,))
+                topic = self._example(own_names, (enclave, verb, expression), world, limit)
                 if topic is None:
                     continue
                 gain = self._gain(enclave, verb, right, expression, topic, world, domain)
@@ -860,7 +860,7 @@ class _Stated:
                 if gain.denied and is_expression(expression):
                     # Perhaps there is more than a denial that is gone.
                     topic = self._example(
-                        own - denied.names, (enclave, verb, expression), world, limit
+                        own_names - denied.names, (enclave, verb, expression), world, limit
                     )
                     if topic is not None:
                         yield self._gain(enclave, verb, right, expression, topic, world, domain)
@@ -1089,12 +1089,12 @@ def _completed(side: AccessSource, other: AccessSource) -> AccessSource:
         }
     if side.governance:
         return replace(side, permissions=permissions)
-    own = DomainSet.of(*((domain, domain) for domain in domains.values()))
+    own_domains = DomainSet.of(*((domain, domain) for domain in domains.values()))
     if side.kind != "policy":
-        own = _certified_domains(side)
-    governance = _with_access_control(other.governance, own)
+        own_domains = _certified_domains(side)
+    governance = _with_access_control(other.governance, own_domains)
     if governance is None:
-        known = DomainSet((*own.ranges, *_certified_domains(other).ranges)).closed()
+        known = DomainSet((*own_domains.ranges, *_certified_domains(other).ranges)).closed()
         open_ended = {"policy"} >= {side.kind, other.kind}
         governance = governance_for(strict_protection(), ALL_DOMAINS if open_ended else known)
     return replace(side, permissions=permissions, governance=governance)

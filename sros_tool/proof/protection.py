@@ -444,8 +444,8 @@ def _names(crossing: _Crossing) -> NameSet:
 
 
 def _expressions(network: ZenohNetwork, router: str) -> _Crossing:
-    own = next((each.crossing for each in network.routers if each.name == router), ())
-    return tuple(dict.fromkeys(filter(None, (network.crossing, own))))
+    own_expressions = next((each.crossing for each in network.routers if each.name == router), ())
+    return tuple(dict.fromkeys(filter(None, (network.crossing, own_expressions))))
 
 
 def _crossing_of_both(network: ZenohNetwork, first_router: str, second_router: str) -> _Crossing:

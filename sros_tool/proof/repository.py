@@ -493,12 +493,12 @@ class Repository:
             DocumentError: git fails, warns, or does not end in time.
             UnavailableError: git is not installed.
         """
-        own = {name: text for name, text in os.environ.items() if name not in _ELSEWHERE}
+        variables = {name: text for name, text in os.environ.items() if name not in _ELSEWHERE}
         try:
             done = subprocess.run(
-                [_program(own.get("PATH", os.defpath)), *_SAFE, *words],
+                [_program(variables.get("PATH", os.defpath)), *_SAFE, *words],
                 cwd=self.folder,
-                env={**own, **_ALWAYS, **(environment or _READING)},
+                env={**variables, **_ALWAYS, **(environment or _READING)},
                 input=stdin,
                 capture_output=True,
                 timeout=wait,

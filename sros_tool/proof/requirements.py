@@ -257,11 +257,11 @@ def _enclaves_text(enclaves: Iterable[str], of_robots: Iterable[RobotNames]) -> 
             shown = [name for name in shown if name not in robot_names.names]
             names.remove(robot_names.own)
     # "All other robots" already names the exception of the own robot, unless other names need it.
-    own = {robot_names.own for robot_names in of_robots} - {*names}
+    own_names = {robot_names.own for robot_names in of_robots} - {*names}
     excepted = [
         enclave
         for enclave in excepted
-        if enclave not in own or any(overlap(enclave, name) for name in names)
+        if enclave not in own_names or any(overlap(enclave, name) for name in names)
     ]
     text = _listed_names(shown)
     return f"{text} (but not {_listed_names(excepted)})" if excepted else text
@@ -699,8 +699,8 @@ def _filled_words(text: object, used_placeholders: Iterable[Placeholder], robot:
 
 
 def _only_from(table: _Table) -> Only:
-    own = table.known(*KIND_OF, "enclaves")
-    return Only(**own, rights=table.rights(), enclaves=table.enclaves("enclaves"))
+    known_keys = table.known(*KIND_OF, "enclaves")
+    return Only(**known_keys, rights=table.rights(), enclaves=table.enclaves("enclaves"))
 
 
 def _nobody_from(table: _Table) -> Nobody:
@@ -708,7 +708,7 @@ def _nobody_from(table: _Table) -> Nobody:
 
 
 def _must_from(table: _Table) -> Must:
-    own = table.known(*KIND_OF, "enclave")
+    known_keys = table.known(*KIND_OF, "enclave")
     enclave = table.text("enclave")
     problem = expression_problem(enclave)
     if is_expression(enclave):
@@ -719,11 +719,11 @@ def _must_from(table: _Table) -> Must:
             f"{_short(enclave)} is not an enclave",
             problem or "An enclave begins with '/'.",
         )
-    return Must(**own, rights=table.rights(), enclave=enclave)
+    return Must(**known_keys, rights=table.rights(), enclave=enclave)
 
 
 def _at_most_from(table: _Table) -> AtMost:
-    own = table.known(*KIND_OF, "enclaves")
+    known_keys = table.known(*KIND_OF, "enclaves")
     most = table.values.get("enclaves")
     if type(most) is not int or not 0 < most < 2**31:
         raise table.error(
@@ -731,22 +731,24 @@ def _at_most_from(table: _Table) -> AtMost:
             f"enclaves has {_short(most)}, which is not a number",
             "Write how many enclaves may use one name, from 1; for none there is [[nobody]].",
         )
-    return AtMost(**own, rights=table.rights(), most=most)
+    return AtMost(**known_keys, rights=table.rights(), most=most)
 
 
 def _widest_from(table: _Table) -> Widest:
-    own = table.known(*KIND_OF, "enclaves")
-    return Widest(**own, rights=table.rights(least=0), enclaves=table.enclaves("enclaves"))
+    known_keys = table.known(*KIND_OF, "enclaves")
+    return Widest(**known_keys, rights=table.rights(least=0), enclaves=table.enclaves("enclaves"))
 
 
 def _nothing_but_from(table: _Table) -> NothingBut:
-    own = table.known(*KIND_OF, "enclaves")
-    return NothingBut(**own, rights=table.rights(least=0), enclaves=table.enclaves("enclaves"))
+    known_keys = table.known(*KIND_OF, "enclaves")
+    return NothingBut(
+        **known_keys, rights=table.rights(least=0), enclaves=table.enclaves("enclaves")
+    )
 
 
 def _not_both_from(table: _Table) -> NotBoth:
     rights: list[RightNames] = []
-    own = table.known("first", "second")
+    known_keys = table.known("first", "second")
     for key in ("first", "second"):
         value = table.values.get(key)
         if not isinstance(value, dict) or not value or set(value) - set(KIND_OF):
@@ -758,11 +760,11 @@ def _not_both_from(table: _Table) -> NotBoth:
         line = table.lines.get(key, table.source.line)
         inner = _Table(f"not_both.{key}", value, Source(table.source.file, line), {})
         rights.append(inner.rights())
-    return NotBoth(**own, first=rights[0], second=rights[1])
+    return NotBoth(**known_keys, first=rights[0], second=rights[1])
 
 
 def _protected_from(table: _Table) -> Protected:
-    own = table.known(*RIGHTS, "level")
+    known_keys = table.known(*RIGHTS, "level")
     level = table.values.get("level")
     if not isinstance(level, str) or level not in _LEVELS:
         raise table.error(
@@ -771,14 +773,14 @@ def _protected_from(table: _Table) -> Protected:
     names = tuple((k, name) for k in RIGHTS if k in table.values for name in table.names(k))
     if not names:
         raise table.error("", "[[protected]] names nothing", f"Write one of {', '.join(RIGHTS)}.")
-    return Protected(**own, names=names, level=_LEVELS[level])
+    return Protected(**known_keys, names=names, level=_LEVELS[level])
 
 
 def _apart_from(table: _Table) -> Apart:
-    own = table.known("from", "to", "through")
+    known_keys = table.known("from", "to", "through")
     through = table.enclaves("through") if "through" in table.values else ()
     return Apart(
-        **own, sources=table.enclaves("from"), targets=table.enclaves("to"), through=through
+        **known_keys, sources=table.enclaves("from"), targets=table.enclaves("to"), through=through
     )
 
 

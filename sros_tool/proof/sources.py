@@ -434,12 +434,12 @@ def _trusts(
     """
 
     @lru_cache(maxsize=8)  # most enclaves have the same files
-    def trust(pem: bytes, own: bytes | None) -> Trust:
+    def trust(pem: bytes, own_list: bytes | None) -> Trust:
         authorities = load_certificates(pem, IDENTITY_CA_FILE)
         keys = [(authority, key_digest(authority.public_key())) for authority in authorities]  # type: ignore[arg-type]
         revoked = set()
         lists: dict[str, bytes] = {}
-        for data in dict.fromkeys(([] if own is None else [own]) + embedded_lists(pem)):
+        for data in dict.fromkeys(([] if own_list is None else [own_list]) + embedded_lists(pem)):
             crl = load_crl(data, CRL_FILE)
             key = next((key for certificate, key in keys if signed_by(crl.list, certificate)), "")
             if refusal := refusal_of(crl.list) or ("" if key else "another CA signed it"):

@@ -199,8 +199,10 @@ def _with_placeholder(name: str, robot: Robot, placeholder: Placeholder) -> str:
     space = f"{robot.namespace}/"
     if placeholder.value == "namespace" and robot.namespace != "/" and name.startswith(space):
         begin, rest = str(placeholder), name[len(robot.namespace) :]
-    own = str(placeholder._replace(value="robot"))
-    return begin + "/".join(own if part == robot.name else part for part in rest.split("/"))
+    placeholder_text = str(placeholder._replace(value="robot"))
+    return begin + "/".join(
+        placeholder_text if part == robot.name else part for part in rest.split("/")
+    )
 
 
 def _joined_names(names: Names, value: str, fleet: Fleet) -> Names:

@@ -231,8 +231,12 @@ def _planned_zenoh(
 
     def confirm(enclave: str, writes: bool, topic: str) -> bool:
         messages = zenoh_message(topic, domain, writes=writes)
-        own = rules.get(enclave)
-        return own is not None and bool(messages) and all(own.allows(enclave, *e) for e in messages)
+        own_rules = rules.get(enclave)
+        return (
+            own_rules is not None
+            and bool(messages)
+            and all(own_rules.allows(enclave, *e) for e in messages)
+        )
 
     access = {enclave.path: ros_access(stated_rights(enclave)) for enclave in policy.enclaves}
     return World("Zenoh", access, confirm=confirm, stated_access=stated_access)

@@ -363,8 +363,8 @@ def _pairs(distributions: Sequence[Distribution]) -> Iterator[tuple[Shipped, Shi
         for shipped in distribution.shipped:
             releases = by_product.setdefault(shipped.product, {})
             releases.setdefault(shipped.vendor, shipped)
-    for first, *others in (list(releases.values()) for releases in by_product.values()):
-        yield from ((first, second) for second in others)
+    for first, *later_releases in (list(releases.values()) for releases in by_product.values()):
+        yield from ((first, second) for second in later_releases)
 
 
 _MORE, _LESS, _LOSES, _JOINS = "opens", "closes", "refused", "accepted"
@@ -429,23 +429,23 @@ class _Decided:
         context: JoinContext,
         fitting_others: Sequence[str],
     ) -> None:
-        own = files.enclaves[name]
+        own_enclave = files.enclaves[name]
         self.shipped = shipped
-        participant = VendorParticipant(shipped.vendor, own, context)
+        participant = VendorParticipant(shipped.vendor, own_enclave, context)
         self.causes = participant.causes()
         presented = (
-            own._replace(
+            own_enclave._replace(
                 permissions=files.enclaves[holder].permissions,
                 portable=files.enclaves[holder].portable,
                 state=None,
             )
             for holder in fitting_others
         )
-        others = (
+        other_accesses = (
             VendorParticipant(shipped.vendor, permissions, context).access
             for permissions in presented
         )
-        usable = (participant.access, *others) if participant.access else ()
+        usable = (participant.access, *other_accesses) if participant.access else ()
         self.access: tuple[Access, ...] = tuple(filter(None, usable))
 
     @property

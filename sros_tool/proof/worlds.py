@@ -159,14 +159,14 @@ class Side:
             for enclave in self.exact[topic]:
                 if topic in self.of[enclave]:
                     stated.setdefault(enclave, []).append(topic)
-        own = _wild(topics.expression)
-        if own is None:
+        own_automaton = _wild(topics.expression)
+        if own_automaton is None:
             matching = [
                 automaton for automaton in self._wild if automaton.matches(topics.expression)
             ]
         else:
             limit.spend(len(self._wild) // _OF_A_STEP)
-            matching = [automaton for automaton in self._wild if automaton.may_meet(own)]
+            matching = [automaton for automaton in self._wild if automaton.may_meet(own_automaton)]
         wild = {enclave for automaton in matching for enclave in self._wild[automaton]}.union(
             self._any
         )
@@ -179,10 +179,10 @@ class Side:
         """Return the exact topics in rights of all enclaves that match an expression."""
         if expression not in self._found:
             limit.spend(len(self._wild))
-            own = _wild(expression)
+            own_automaton = _wild(expression)
             self._found[expression] = (
-                tuple(self._accepted_topics(own, limit))
-                if own
+                tuple(self._accepted_topics(own_automaton, limit))
+                if own_automaton
                 else ((expression,) if expression in self.exact else ())
             )
         return self._found[expression]
@@ -208,19 +208,19 @@ class Side:
         if automata is None:
             return sorted(self.of)
         enclaves = set(self._any)
-        for own in automata:
-            if own not in self._met:
-                self._met[own] = self._users_by_wildcard(own, limit)
-            enclaves.update(self._met[own])
+        for own_automaton in automata:
+            if own_automaton not in self._met:
+                self._met[own_automaton] = self._users_by_wildcard(own_automaton, limit)
+            enclaves.update(self._met[own_automaton])
         return sorted(enclaves)
 
-    def _users_by_wildcard(self, own: Automaton, limit: SearchLimit) -> frozenset[str]:
+    def _users_by_wildcard(self, own_automaton: Automaton, limit: SearchLimit) -> frozenset[str]:
         limit.spend(len(self._wild) // _OF_A_STEP)
         met: set[str] = set()
-        for topic in self._accepted_topics(own, limit):
+        for topic in self._accepted_topics(own_automaton, limit):
             met.update(self.exact[topic])
         for automaton, enclaves in self._wild.items():
-            if automaton.may_meet(own):
+            if automaton.may_meet(own_automaton):
                 met.update(enclaves)
         limit.spend(len(met))  # they are kept
         return frozenset(met)
@@ -367,8 +367,10 @@ class World:
         """
         if enclave not in self.fitting_others or self.confirm_own(enclave, writes, topic):
             return ""
-        others = self.fitting_others[enclave]
-        return next((holder for holder in others if self.confirm_own(holder, writes, topic)), "")
+        candidates = self.fitting_others[enclave]
+        return next(
+            (holder for holder in candidates if self.confirm_own(holder, writes, topic)), ""
+        )
 
     def has_same_access(self, other: World) -> bool:
         """Return whether another world has equal sets of topics, so all decisions are equal."""
@@ -550,10 +552,10 @@ def enforced_access(enforcers: Iterable[Enforcement], enclave: str, domain: int)
         def of(keys: Iterable[str]) -> NameSet:
             return NameSet.union(_topics(key, domain, begin) for key in keys)
 
-        first, *others = (
+        first, *other_sets = (
             enforcer.passing(remote, *message, of) for message in _USES[writes, begin]
         )
-        for names in others:
+        for names in other_sets:
             first &= names
         return first & names_of_expression(f"{begin}/*{_ENDS[begin]}")
 
@@ -583,12 +585,12 @@ def is_enforced(
 
 
 def domains_of(
-    enforcers: Iterable[Enforcement], others: Collection[DomainSet] = ()
+    enforcers: Iterable[Enforcement], other_domains: Collection[DomainSet] = ()
 ) -> tuple[int, ...]:
     """Return the ROS domains of the keys in rules; of domains with the same rules, the first.
 
     If keys have a wildcard in place of the domain, a domain is added that no key names.  Domains in
-    ``others`` are added, too; domains in different sets count as having different rules.
+    ``other_domains`` are added, too; domains in different sets count as having different rules.
     """
     rules: dict[int, set[object]] = {}
     wild = False
@@ -605,10 +607,14 @@ def domains_of(
                 if _DOMAIN.match(begin):
                     rules.setdefault(int(begin), set()).add((*rule_key, rest))
     unnamed = next(domain for domain in count() if domain not in rules)
-    known = {*rules, *(range(MAX_DOMAIN + 1) if others else ()), *([unnamed] if wild else ())}
+    known = {
+        *rules,
+        *(range(MAX_DOMAIN + 1) if other_domains else ()),
+        *([unnamed] if wild else ()),
+    }
     kinds: dict[object, int] = {}
     for domain in sorted(known, reverse=True):
-        inside = tuple(domain in domain_set for domain_set in others)
+        inside = tuple(domain in domain_set for domain_set in other_domains)
         if domain in rules or any(inside) or wild:
             kinds[frozenset(rules.get(domain, ())), inside] = domain
     return tuple(sorted(kinds.values()))

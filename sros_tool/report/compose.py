@@ -151,7 +151,7 @@ def overlay(
     rights = [source.rights for source in sources]
 
     def marked_edges(known_names: Known) -> list[Edge]:
-        sides = [_edges_of(own, known_names) for own in rights]
+        sides = [_edges_of(side_rights, known_names) for side_rights in rights]
         return _marked_rights(*sides, allowed_by=kind == "use")
 
     known, edges = _with_all_wildcards(rights[0] | rights[1], marked_edges)
@@ -246,8 +246,8 @@ def _picture(
     def sides(kind: str, name: str) -> Sequence[bool]:
         known = known_names.matching_names(kind, name) if is_expression(name) else ()
         # What is not drawn under its own name is a part of an action, which has both sides.
-        others = [drawn.get((kind, known_name), (True, True)) for known_name in known]
-        return [any(ends) for ends in zip(drawn[kind, name], *others, strict=True)]
+        other_ends = [drawn.get((kind, known_name), (True, True)) for known_name in known]
+        return [any(ends) for ends in zip(drawn[kind, name], *other_ends, strict=True)]
 
     stated_protections = next(
         (source.protections for source in reversed(sources) if source.protections), ()

@@ -139,7 +139,9 @@ class FocusFlow:
     @classmethod
     def of(cls, picture: Picture) -> FocusFlow:
         """Return the flow of information of a picture that has a focus."""
-        own = frozenset(focus.name for focus in picture.focus if focus.kind == _ENCLAVE)
+        focused_enclaves = frozenset(
+            focus.name for focus in picture.focus if focus.kind == _ENCLAVE
+        )
         wanted = [(focus.kind, focus.name) for focus in picture.focus if focus.kind != _ENCLAVE]
         targets = frozenset(
             (name.kind, name.name)
@@ -151,7 +153,11 @@ class FocusFlow:
         after: dict[str, int] = {}
         for focus in picture.focus:
             for hops_of, near, far in (
-                (before, (focus.name,) if focus.name in own else focus.senders, focus.influencing),
+                (
+                    before,
+                    (focus.name,) if focus.name in focused_enclaves else focus.senders,
+                    focus.influencing,
+                ),
                 (after, focus.receivers, focus.influenced),
             ):
                 for enclave, hops in (
@@ -163,7 +169,7 @@ class FocusFlow:
             # Those that are denied a name, or that use a part of an action, belong to it.
             if (edge.kind, edge.name) in targets:
                 (before if edge.sends else after).setdefault(edge.enclave, 1)
-        flow = cls(own, targets, before, after, {})
+        flow = cls(focused_enclaves, targets, before, after, {})
         ends = defaultdict[tuple[str, str], tuple[set[int], set[int]]](lambda: (set(), set()))
         for edge in picture.edges:
             for side in (0, 1):

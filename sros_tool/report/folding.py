@@ -366,10 +366,10 @@ class _Draft:
                 usual.setdefault(self._units[members[0]].family, members[0])
         sizes = Counter(unit.family for unit in self._units)
         named = self._named_by(usual)
-        for unit, *others in classes.values():
+        for unit, *later_units in classes.values():
             family = self._units[unit].family
             near = family in usual and _are_alike(parts[unit], parts[usual[family]])
-            if not others and not (near and 2 * named[unit] <= sizes[family]):
+            if not later_units and not (near and 2 * named[unit] <= sizes[family]):
                 self._symbols[unit] = -unit - 2
         before = [0] * len(parts)
         for number, members in classes.items():
@@ -488,7 +488,7 @@ class _Draft:
 
     def _edges(self, differing_parts: Set[Edge | str]) -> Iterator[Edge]:
         """Yield the rights to draw: of drawn units, and of enclaves that belong to no unit."""
-        others = self._other_units_text()
+        texts_of_others = self._other_units_text()
         for edge in self._picture.edges:
             unit = self._of.get(edge.enclave)
             if unit is not None and not self._is_drawn(unit):
@@ -498,7 +498,7 @@ class _Draft:
             def word(named: int, at: int, edge: Edge = edge, unit: int | None = unit) -> str:
                 if unit is None or not self._is_counted(unit, named):
                     return self._label(named, at)
-                return others(edge, unit, named, at)
+                return texts_of_others(edge, unit, named, at)
 
             shown = name.fill(word)
             if shown != edge.name and (edge.kind, shown) not in self._names:
@@ -515,7 +515,7 @@ class _Draft:
 
     def _other_units_text(self) -> Callable[[Edge, int, int, int], str]:
         """Return a function that tells how many other units a right is for, as text."""
-        others: dict[object, set[int]] = defaultdict(set)
+        units_by_key: dict[object, set[int]] = defaultdict(set)
         families: dict[int, list[int]] = defaultdict(list)
         for n in sorted(set(self._of.values()), key=self._unit_name_order):
             families[self._units[n].family].append(n)
@@ -535,11 +535,11 @@ class _Draft:
             if unit is not None and self._is_drawn(unit):
                 for other_unit in self._text(edge.name).units:
                     if self._is_counted(unit, other_unit):
-                        others[key(edge, unit, other_unit)].add(other_unit)
+                        units_by_key[key(edge, unit, other_unit)].add(other_unit)
 
         def several(edge: Edge, unit: int, other: int, position: int) -> str:
             family = self._units[other_unit].family
-            named, all_of = others[key(edge, unit, other_unit)], families[family]
+            named, all_of = units_by_key[key(edge, unit, other_unit)], families[family]
             if not named or sorted(named) == sorted(
                 self._classes.get(self._inside.get(other_unit, -1), ())
             ):
@@ -625,10 +625,10 @@ class _Draft:
         different: list[DifferentUnit] = []
         differing_parts: set[Edge | str] = set()
         for n in sorted(near, key=self._unit_name_order):
-            own, other = seen[n], seen[near[n]]
-            if _are_alike(own, other):
-                more = [symbol for key, symbol in own.items() if key not in other]
-                fewer = [symbol for key, symbol in other.items() if key not in own]
+            own_symbols, near_symbols = seen[n], seen[near[n]]
+            if _are_alike(own_symbols, near_symbols):
+                more = [symbol for key, symbol in own_symbols.items() if key not in near_symbols]
+                fewer = [symbol for key, symbol in near_symbols.items() if key not in own_symbols]
                 differing_parts.update(more)
                 only = dict.fromkeys(self._in_words(more, n))
                 missing = dict.fromkeys(self._in_words(fewer, n, near[n]))

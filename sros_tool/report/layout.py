@@ -390,8 +390,8 @@ class _Draft:
         else:
             group = self._groups[node].rstrip("/") + "/"
             label = node.removeprefix(group) or node
-        if is_first and (own := self._own.get(node)):
-            notes += _own_text(own)
+        if is_first and (own_rights := self._own.get(node)):
+            notes += _own_text(own_rights)
         notes += self._notes.get(node, ())
         notes += [
             f"{reach} {counted(self._looking[node, right], 'name')}: see {tag}"

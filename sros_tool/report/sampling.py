@@ -85,11 +85,11 @@ def sample_of(
         if len(further) > 1 and _named_units(keystore, enclaves[first], names) <= {first}
         for n in (first, *further)
     }
-    others = [path for path in paths if names.of.get(path) not in few]
-    if len(others) > _LARGE:
+    other_paths = [path for path in paths if names.of.get(path) not in few]
+    if len(other_paths) > _LARGE:
         return whole_keystore
     named: dict[int, set[Right]] = defaultdict(set)
-    for right in load_rights(keystore, only_enclaves=others).rights:
+    for right in load_rights(keystore, only_enclaves=other_paths).rights:
         of_right = {*names.text(right.name).units}
         for n in of_right & few.keys():
             if len(of_right) > 1:
@@ -158,9 +158,9 @@ def _with_mark(text: str, word: str, mark: str) -> str:
 
     It is faster than a regular expression, which would be compiled for each of many robots.
     """
-    first, *others = f"{text}\n".split(word)
+    first, *later_parts = f"{text}\n".split(word)
     parts, before = [first], first[-1:]
-    for part in others:
+    for part in later_parts:
         alone = not (before.isalnum() or (part or word)[0].isalnum())
         parts += (mark if alone else word, part)
         before = (part or word)[-1]

@@ -347,14 +347,14 @@ class ProcessTable:
     def _with_files(self, process: Process, folder: int) -> Process:
         """Return the process with the state of its files, resolved as the process sees them."""
         try:
-            own = os.readlink("cwd", dir_fd=folder)
+            working_folder = os.readlink("cwd", dir_fd=folder)
             root = os.open("root", os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC, dir_fd=folder)
         except OSError as error:
             problem = f"its root directory cannot be looked at ({error.strerror})"
             enclave = ProcessEnclave("", "", problem=problem) if process.asks_for_security else None
             return replace(process, enclave=enclave, configuration=_configuration_of(process))
         try:
-            return with_files(process, ProcessRoot(root, self._reader), own)
+            return with_files(process, ProcessRoot(root, self._reader), working_folder)
         finally:
             os.close(root)
 
@@ -732,8 +732,8 @@ class ProcessEnclave:
         mounts of a container give a folder other paths.  For a folder that does not exist, the path
         decides.
         """
-        own = keystore / "enclaves" / self.name.strip("/")
-        for path, folder in zip((keystore, own), self.folders, strict=False):
+        enclave_folder = keystore / "enclaves" / self.name.strip("/")
+        for path, folder in zip((keystore, enclave_folder), self.folders, strict=False):
             with suppress(OSError, ValueError):
                 state = path.stat()
                 if folder == (state.st_dev, state.st_ino):
@@ -935,7 +935,7 @@ def _loaded_enclave(
     except OSError as error:
         there = (folder_of_keystore,)
         return ProcessEnclave(keystore, name, here=here, folders=there, problem=_reason(error))
-    own = [above[-1], *folders[len(above) - 1 :]]
+    own_folders = [above[-1], *folders[len(above) - 1 :]]
     return ProcessEnclave(
         keystore,
         name,
@@ -946,10 +946,10 @@ def _loaded_enclave(
         is_there=True,
         moved={
             path: _moment(state.st_ctime_ns)
-            for path, state in own
+            for path, state in own_folders
             if state.st_mtime_ns < state.st_ctime_ns
         },
-        writable=_writable_folder_clause(own, user),
+        writable=_writable_folder_clause(own_folders, user),
         here=here,
         folders=(folder_of_keystore, _identity(folders)),
     )

@@ -272,7 +272,7 @@ def job_units(
         _check_path(keystore, "the keystore"),
         _check_program(sros),
     )
-    description, words, own = {
+    description, words, own_lines = {
         Job.RENEW: (
             f"Renew the enclaves of {root} that expire within {_RENEWED_WITHIN}",
             ("renew", root, "--all-expiring", _RENEWED_WITHIN),
@@ -310,7 +310,7 @@ def job_units(
         _check_path(publishing, "the publishing folder")
     if passphrase and job in _SIGNING:
         _check_path(passphrase, "the file")
-        own += [
+        own_lines += [
             f"LoadCredential=ca-passphrase:{passphrase}",
             f"Environment=SROS_CA_PASSPHRASE_FILE=/run/credentials/{name}.service/ca-passphrase",
         ]
@@ -325,7 +325,7 @@ After=time-sync.target
 Type=oneshot
 User={_check_user(user)}
 ExecStart={" ".join((program, *words))}
-{_lines(own)}
+{_lines(own_lines)}
 {_CLOSED}
 PrivateDevices=yes
 RestrictAddressFamilies=AF_UNIX
@@ -474,10 +474,10 @@ def _refuse_folders_of_others(folder: Path, files: Iterable[str]) -> None:
     """Raise `UsageError` if another user could change the units, which systemd would run."""
     trusted = frozenset({0, os.geteuid()})
     for place in dict.fromkeys((folder, *((folder / path).parent for path in files))):
-        others = [*replaceable_on_the_way(place, trusted)]
+        replaceable = [*replaceable_on_the_way(place, trusted)]
         if os.path.lexists(place):
-            others.append((place, other_writers(place.lstat(), trusted)))
-        for place, why in others:
+            replaceable.append((place, other_writers(place.lstat(), trusted)))
+        for place, why in replaceable:
             if why:
                 raise UsageError(
                     f"the units would be in '{place}', which others can change: {why}",

@@ -68,10 +68,10 @@ def announced_nodes(rules: Iterable[AccessRule], enclave: str) -> AnnouncedNodes
     nodes: dict[bool, list[str]] = {True: [], False: []}
     for rule in rules:
         if rule.messages == _ANNOUNCING:
-            own = [_NODE if rule.allows else _EVERY_KIND, _part(enclave)]
+            own_tokens = [_NODE if rule.allows else _EVERY_KIND, _part(enclave)]
             for key in rule.key_expressions:
                 chunks = key.split("/")
-                if chunks[0] == GRAPH and chunks[5:7] == own:
+                if chunks[0] == GRAPH and chunks[5:7] == own_tokens:
                     nodes[rule.allows].append("/".join((chunks[1], *chunks[7:9])))
     return AnnouncedNodes(tuple(nodes[True]), tuple(nodes[False]))
 
@@ -285,7 +285,7 @@ def shared_nodes(announced: Mapping[str, AnnouncedNodes]) -> Iterator[SharedNode
     nearby = _with_the_same_beginning([nodes for nodes, _ in groups])
     told: dict[str, set[str]] = {}
     for number, (nodes_of_group, group) in enumerate(groups):
-        others = {
+        other_owners = {
             owner: None
             for node in _included_nodes(nodes_of_group, in_order)
             for owner in owners[node]
@@ -293,11 +293,13 @@ def shared_nodes(announced: Mapping[str, AnnouncedNodes]) -> Iterator[SharedNode
         }
         for nodes_of_other, other in (groups[later] for later in sorted(nearby.get(number, ()))):
             if _have_common(nodes_of_group, nodes_of_other):
-                others |= dict.fromkeys(other)
-        for other_enclave in others:
+                other_owners |= dict.fromkeys(other)
+        for other_enclave in other_owners:
             told.setdefault(other_enclave, set()).update(group)
-        if others or (len(group) > 1 and _have_common(nodes_of_group, nodes_of_group)):
-            yield SharedNodes(tuple(group), tuple(others), _full_names(nodes_of_group.allowed))
+        if other_owners or (len(group) > 1 and _have_common(nodes_of_group, nodes_of_group)):
+            yield SharedNodes(
+                tuple(group), tuple(other_owners), _full_names(nodes_of_group.allowed)
+            )
 
 
 _CHANGING = re.compile("[/%](?:" + "|".join(CHANGING_NODES) + ")[^/]*[*]")

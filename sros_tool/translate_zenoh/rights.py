@@ -402,9 +402,11 @@ def chunks_of(name: str) -> list[Chunks]:
         rest = name[1:]
         return (chunks_of(rest) if rest.startswith("/") else []) + chunks_of(f"/{name}")
     expressions: list[list[str]] = [[]]
-    for begin, *others in (part.split("*") for part in name[1:].split("/")):
+    for begin, *later_parts in (part.split("*") for part in name[1:].split("/")):
         expressions = [
-            before + part for before in expressions for part in _chunks_of_part([begin, *others])
+            before + part
+            for before in expressions
+            for part in _chunks_of_part([begin, *later_parts])
         ]
     return [tuple(canonical(chunks).split("/")) for chunks in expressions]
 
@@ -413,12 +415,12 @@ def _chunks_of_part(texts: list[str]) -> list[list[str]]:
     """Return the chunks for one part of a name, whose stars stand between ``texts``."""
     if texts == ["", ""]:
         return [["*", ANY_CHUNKS]]
-    first, *others = texts
+    first, *later_texts = texts
     expressions: list[list[str]] = [[first]]
-    for number, text in enumerate(others):
+    for number, text in enumerate(later_texts):
         if number == 0 and not first:
             expressions = [[ANY_CHUNKS, ANY_PART + text]]
-        elif number == len(others) - 1 and not text:
+        elif number == len(later_texts) - 1 and not text:
             expressions = [
                 [*chunks[:-1], chunks[-1] + ANY_PART, ANY_CHUNKS] for chunks in expressions
             ]
@@ -683,8 +685,8 @@ def _rights_of_subject(
         for domain, name in names_of.stated():
             lacks = tuple(
                 message.value
-                for message, others in needed
-                if not all(others.any(key, includes) for key in _keys_of(domain, name))
+                for message, other_keys in needed
+                if not all(other_keys.any(key, includes) for key in _keys_of(domain, name))
             )
             of_subject.append(StatedName(right, name, domain, lacks))
         unsaid += [(right, key) for key in names_of.keys_without_name()]

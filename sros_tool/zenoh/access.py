@@ -145,18 +145,18 @@ class AccessControl:
 
     def decide(self, remote: Remote, flow: Flow, message: Message, key: str) -> AccessDecision:
         """Return the decision that `Enforcement.decide` makes with the file of these rules."""
-        own = None if remote.common_name is None else self._by_name.get(remote.common_name)
-        if own is None:
+        own_subjects = None if remote.common_name is None else self._by_name.get(remote.common_name)
+        if own_subjects is None:
             stated = any(rights.rules for rights in self.remotes)
             return AccessDecision(False, (), (), _NO_SUBJECT if stated else _NO_RULE_AT_ALL)
         applying = [
             (rule.allows, name)
-            for name, rule in self._with_ids(own)
+            for name, rule in self._with_ids(own_subjects)
             if rule.flow is flow
             and message in rule.messages
             and _include(rule.key_expressions, key)
         ]
-        return _decide_by_rules(applying, (own.common_name,))
+        return _decide_by_rules(applying, (own_subjects.common_name,))
 
     def allowed_keys(self, common_name: str, flow: Flow, message: Message) -> tuple[str, ...]:
         """Return the key expressions that rules allow; denials are not subtracted."""
@@ -314,18 +314,18 @@ class RightsBetween:
             for name, rules in self._rules.items()
         }
 
-    def rights_for_others(self, own: str) -> Iterator[RemoteRights]:
-        """Yield the rights that a process of the enclave ``own`` gives to every other enclave.
+    def rights_for_others(self, own_name: str) -> Iterator[RemoteRights]:
+        """Yield the rights that a process of the enclave ``own_name`` gives to every other enclave.
 
         Raises:
             TooManyExpressions: the shared rights need too many key expressions.
         """
-        mine = self._mirrored[own]
-        denied = [own for own in mine if not own.rule.allows]
+        mine = self._mirrored[own_name]
+        denied = [own_name for own_name in mine if not own_name.rule.allows]
         meeting: dict[_Place, list[tuple[tuple[Message, ...], RuleKeys]]] = {}
         for remote, theirs in self._rules.items():
             shared: dict[_Place, tuple[str, ...]] = {}
-            are_apart = self._plain[own].isdisjoint(self._plain[remote])
+            are_apart = self._plain[own_name].isdisjoint(self._plain[remote])
             for place, _, keys in theirs:
                 if place not in meeting:
                     meeting[place] = [
@@ -333,10 +333,10 @@ class RightsBetween:
                         for rule_of_peer in mine
                         if (messages := _shared(place, rule_of_peer.place))
                     ]
-                for messages, others in meeting[place]:
-                    if are_apart and keys.is_plain and others.is_plain:
+                for messages, other_keys in meeting[place]:
+                    if are_apart and keys.is_plain and other_keys.is_plain:
                         continue
-                    if common_keys := keys.common(others):
+                    if common_keys := keys.common(other_keys):
                         place_and_messages = (place[0], messages, True)
                         shared[place_and_messages] = _added_keys(
                             shared.get(place_and_messages, ()), common_keys
@@ -391,9 +391,9 @@ def narrowed_rights(rights: RemoteRights, most: Iterable[AccessRule], kept: str)
         TooManyExpressions: the result needs too many key expressions.
     """
     graph = [rule for rule in rights.rules if rule.key_expressions[0].startswith(kept)]
-    others = tuple(rule for rule in rights.rules if rule not in graph)
+    other_rules = tuple(rule for rule in rights.rules if rule not in graph)
     limit = RemoteRights("", tuple(rule.mirrored() for rule in most))
-    other_rights = RemoteRights(rights.common_name, others, rights.made_of)
+    other_rights = RemoteRights(rights.common_name, other_rules, rights.made_of)
     common_rights, _ = RightsBetween((other_rights, limit)).rights_for_others("")
     return RemoteRights(rights.common_name, sorted_rules((*graph, *common_rights.rules)))
 

@@ -225,9 +225,11 @@ def _control(rendered_rights: Sequence[RenderedRights], *, once: bool) -> str:
     every_ids = rule_ids([rights.rules for rights in rendered_rights], names, once=once)
     for rights, ids in zip(rendered_rights, every_ids, strict=True):
         rules.update(zip(ids, rights.rules, strict=True))
-        own = _list([rights.name])
-        lines["subjects"].append(f'   {{"id": {own[1:-1]}, "cert_common_names": {own}}}')
-        lines["policies"].append(f'   {{"rules": {_list(ids)}, "subjects": {own}}}')
+        own_names = _list([rights.name])
+        lines["subjects"].append(
+            f'   {{"id": {own_names[1:-1]}, "cert_common_names": {own_names}}}'
+        )
+        lines["policies"].append(f'   {{"rules": {_list(ids)}, "subjects": {own_names}}}')
     lines["rules"] = [f'   {{"id": {_list([name])[1:-1]}, {rule}' for name, rule in rules.items()]
     lists = [
         f'  "{name}": [\n{text}\n  ]' if (text := ",\n".join(of)) else f'  "{name}": [\n  ]'

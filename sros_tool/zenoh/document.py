@@ -103,8 +103,8 @@ class ZenohEndpoint:
 
     def option(self, name: str, otherwise: bool) -> bool:
         """Return a yes-or-no option of TLS, or ``otherwise`` if the endpoint does not state it."""
-        own = self.options.get(name)
-        return otherwise if own is None else own == "true"
+        option_value = self.options.get(name)
+        return otherwise if option_value is None else option_value == "true"
 
 
 @dataclass(frozen=True, slots=True)

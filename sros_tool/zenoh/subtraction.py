@@ -324,8 +324,8 @@ def _chunks(first: str, first_chunks: tuple[str, ...], kinds: frozenset[frozense
     """
     kinds_of_first = _kinds(first, first_chunks)
 
-    def are_allowed(others: Iterable[frozenset[str]]) -> bool:
-        return all(any(other_kind <= kind for kind in kinds) for other_kind in others)
+    def are_allowed(other_kinds: Iterable[frozenset[str]]) -> bool:
+        return all(any(other_kind <= kind for kind in kinds) for other_kind in other_kinds)
 
     if are_allowed(kinds_of_first):
         return (first,)
@@ -335,11 +335,11 @@ def _chunks(first: str, first_chunks: tuple[str, ...], kinds: frozenset[frozense
         choices.append(_chunks_less(first, outside))
     chosen: dict[str, None] = {}
     for kind in sorted(kinds, key=sorted):
-        others = frozenset(first_chunks) - kind
+        other_chunks = frozenset(first_chunks) - kind
         if are_allowed(kind_of_chunk for kind_of_chunk in kinds_of_first if kind <= kind_of_chunk):
-            others = frozenset()
+            other_chunks = frozenset()
         chosen |= dict.fromkeys(
-            c for chunk in kinds_of_first[kind] for c in _chunks_less(chunk, others)
+            c for chunk in kinds_of_first[kind] for c in _chunks_less(chunk, other_chunks)
         )
     choices.append(tuple(chosen))
     wanted = [chunk for kind in kinds for chunk in kinds_of_first[kind]]
@@ -611,15 +611,15 @@ def _search_index(expressions: frozenset[Chunks]) -> KeyExpressions:
 
 @lru_cache(maxsize=_FEW)
 def _common_expressions(
-    expressions: frozenset[Chunks], others: frozenset[Chunks]
+    expressions: frozenset[Chunks], other_expressions: frozenset[Chunks]
 ) -> frozenset[Chunks]:
     """Return expressions for what some expressions and others match."""
-    if expressions == others:
+    if expressions == other_expressions:
         return expressions
     return frozenset(
         tuple(expression.split("/"))
         for first in expressions
-        for second in others
+        for second in other_expressions
         for expression in common("/".join(first), "/".join(second))
     )
 
@@ -729,10 +729,15 @@ def _plain_in(plain: frozenset[str], wide: RuleKeys) -> frozenset[str]:
 
 @lru_cache(maxsize=_MANY)
 def _common_of_differences(
-    differences: tuple[Difference, ...], others: tuple[Difference, ...]
+    differences: tuple[Difference, ...], other_differences: tuple[Difference, ...]
 ) -> frozenset[str]:
     try:
-        shared = [key for first in differences for second in others for key in first.common(second)]
+        shared = [
+            key
+            for first in differences
+            for second in other_differences
+            for key in first.common(second)
+        ]
     except CannotSubtract:
         raise TooManyExpressions from None
     return frozenset(shared)

@@ -240,11 +240,11 @@ def check_documents(enclave: CheckedEnclave) -> Iterator[Finding]:
         yield SEVERAL_GRANTS.found(name, f"it has {len(permissions.grants)} grants", file)
     for grant in permissions.grants:
         yield from _form_findings(grant, name, file)
-    if own := grant_of(enclave):
-        yield from _validity_findings(enclave, own, file)
-        yield from _order_findings(own, name, file)
-        yield from check_topic_names(enclave, own, file)
-        yield from _domain_findings(enclave, own, file)
+    if enclave_grant := grant_of(enclave):
+        yield from _validity_findings(enclave, enclave_grant, file)
+        yield from _order_findings(enclave_grant, name, file)
+        yield from check_topic_names(enclave, enclave_grant, file)
+        yield from _domain_findings(enclave, enclave_grant, file)
 
 
 def _domain_problems(domains: DomainSet) -> Iterator[str]:
@@ -623,8 +623,8 @@ def check_governance(
     governance = enclave.state.governance
     if governance is None:
         return
-    own = enclave.state.files[GOVERNANCE_FILE]
-    if own != common and _content(own) != _content(common):
+    enclave_governance = enclave.state.files[GOVERNANCE_FILE]
+    if enclave_governance != common and _content(enclave_governance) != _content(common):
         file = enclave.file(GOVERNANCE_FILE)
         source = "the keystore" if enclave.keystore.governance else "other enclaves"
         yield DIFFERS.found(enclave.name, f"'{file}' differs from the governance of {source}", file)
@@ -669,8 +669,8 @@ def governance_findings(
         for kind, text in _rule_findings(rule, vendors):
             # A template may choose open topics; no template chooses to lose messages, or a rule
             # that does nothing.
-            own = kind in (SIGNED_PAYLOAD, UNREACHABLE_TOPIC_RULE)
-            by = "" if own else keystore.accepts(kind, _Chosen(kind, text, domains, vendors))
+            is_own = kind in (SIGNED_PAYLOAD, UNREACHABLE_TOPIC_RULE)
+            by = "" if is_own else keystore.accepts(kind, _Chosen(kind, text, domains, vendors))
             yield kind.found(subject, text, file, accepted=by)
         for part in rule.domains.ranges:
             kind = GOVERNANCE_DOMAIN_RANGE if part.last is not None else GOVERNANCE_OPEN_RANGE
@@ -744,8 +744,8 @@ def _topic_rules(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
     for index, topic in enumerate(rule.topic_access_rules):
         yield from _topic_rule(rule, topic)
         same = topic.topic_expression
-        others = chain([same], islice(names.covering(same), 1))
-        hiding = min((e for e in others if first[e] < index), key=first.__getitem__, default=None)
+        covering = chain([same], islice(names.covering(same), 1))
+        hiding = min((e for e in covering if first[e] < index), key=first.__getitem__, default=None)
         if hiding is not None:
             yield (
                 UNREACHABLE_TOPIC_RULE,

@@ -323,16 +323,16 @@ def _trust_findings(
         if not everyone:
             continue
         usual, _ = Counter(summary.trusted[index] for summary in everyone).most_common(1)[0]
-        others = "most other enclaves"
+        trusted_elsewhere = "most other enclaves"
         if chain := keystore.authorities.get(role):
             usual = frozenset(
                 certificate.fingerprint(hashes.SHA256()).hex() for certificate in chain
             )
-            others = "the keystore"
+            trusted_elsewhere = "the keystore"
         for summary in everyone:
             if not summary.trusted[index] & usual:
                 place = f"{keystore.root}/{enclave_folder(summary.name)}/{file}"
-                text = f"{file} contains another CA than {others}"
+                text = f"{file} contains another CA than {trusted_elsewhere}"
                 yield AUTHORITIES_DIFFER.found(summary.name, text, place)
 
 
@@ -370,13 +370,13 @@ def _revocation_list_findings(
             elif (
                 summary.list_number >= 0 or not keystore.crl
             ):  # another check reports a missing list
-                own = (
+                own_list = (
                     f"has number {summary.list_number}"
                     if summary.list_number >= 0
                     else "is missing"
                 )
                 yield OLDER_LIST.found(
-                    summary.name, f"its list {own}, {of}", f"{folder}/{CRL_FILE}"
+                    summary.name, f"its list {own_list}, {of}", f"{folder}/{CRL_FILE}"
                 )
 
 

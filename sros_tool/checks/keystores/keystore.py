@@ -162,13 +162,21 @@ def keystore_findings(
                 stated.get(name, ()),
             )
             enclave = evaluation.enclave
-            own = list(_enclave_findings(enclave, wanted, common, deciding.get(name, asked)))
+            enclave_findings = list(
+                _enclave_findings(enclave, wanted, common, deciding.get(name, asked))
+            )
             if not waits_for_answer(enclave.folder):
-                shared = [] if any(finding.kind is DIFFERS for finding in own) else about_governance
-                own += check_vendors(evaluation, [*about_authorities, *shared, *own])
+                shared = (
+                    []
+                    if any(finding.kind is DIFFERS for finding in enclave_findings)
+                    else about_governance
+                )
+                enclave_findings += check_vendors(
+                    evaluation, [*about_authorities, *shared, *enclave_findings]
+                )
             if not on_robot and name not in wanted:  # a policy knows more exactly of its nodes
-                own = with_start_finding(evaluation, own)
-            found += own
+                enclave_findings = with_start_finding(evaluation, enclave_findings)
+            found += enclave_findings
             if each := summary_of(enclave):
                 issued.append(each)
             grant = enclave.state.grant
@@ -266,11 +274,13 @@ def _governing(keystore: CheckedKeystore, names: Sequence[str]) -> tuple[str, by
     """
     common = keystore.governance
     for name in names:
-        own = b""
+        own_governance = b""
         with suppress(SrosError):  # it is a finding
-            own = keystore.opened.read(keystore.opened.folder(name) / GOVERNANCE_FILE, "file")
-        if own and own == (common or own):
-            return name, own
+            own_governance = keystore.opened.read(
+                keystore.opened.folder(name) / GOVERNANCE_FILE, "file"
+            )
+        if own_governance and own_governance == (common or own_governance):
+            return name, own_governance
     return "", common
 
 

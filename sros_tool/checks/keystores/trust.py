@@ -160,19 +160,19 @@ def _strangers(
     groups: dict[tuple[tuple[str, tuple[int, ...]], ...], list[str]] = defaultdict(list)
     for targets_alike in names_by_kinds.values():
         groups[tuple(refused_by[targets_alike[0]].items())] += targets_alike
-    for group, others in combinations(groups.values(), 2):
-        if refused := refused_by[group[0]].get(others[0], ()):
+    for group, other_group in combinations(groups.values(), 2):
+        if refused := refused_by[group[0]].get(other_group[0], ()):
             authorities = " and ".join(f"{ROLES[role]} CA" for role in refused)
             text = (
                 f"nodes of {names_text(group)} do not communicate with nodes of "
-                f"{names_text(others)}: not both of them trust the other's {authorities}"
+                f"{names_text(other_group)}: not both of them trust the other's {authorities}"
             )
-            yield STRANGERS.found(others[0], text, others[0])
-            refused_pairs.update(map(frozenset, product(group, others)))
+            yield STRANGERS.found(other_group[0], text, other_group[0])
+            refused_pairs.update(map(frozenset, product(group, other_group)))
 
 
 def _refused_roles(
-    parties: Sequence[_Party], others: Sequence[_Party], roles: range
+    parties: Sequence[_Party], other_parties: Sequence[_Party], roles: range
 ) -> tuple[int, ...]:
     """Return the roles in which all pairs of enclaves refuse each other.
 
@@ -184,7 +184,7 @@ def _refused_roles(
             for role in roles
             if not (first_target.accepts(other, role) and other.accepts(first_target, role))
         )
-        for first_target, other in product(parties, others)
+        for first_target, other in product(parties, other_parties)
     )
     return min(pairs, key=len, default=())
 
@@ -306,8 +306,8 @@ class _Governed:
         return _domains_meet(self.first, other.first) or _domains_meet(self.domains, other.domains)
 
 
-def _domains_meet(domain_sets: Sequence[DomainSet], others: Sequence[DomainSet]) -> bool:
-    pairs = list(product(domain_sets, others))
+def _domains_meet(domain_sets: Sequence[DomainSet], other_sets: Sequence[DomainSet]) -> bool:
+    pairs = list(product(domain_sets, other_sets))
     return not pairs or any((first_target & other).ranges for first_target, other in pairs)
 
 
@@ -328,11 +328,11 @@ def _incompatible_governance_findings(
     """Yield findings about targets that trust each other, and differ in governance or domains."""
     groups: dict[tuple[_Incompatibility, tuple[str, ...]], list[str]] = defaultdict(list)
     shown_before: list[str] = []
-    for shown, own in governed.items():
+    for shown, own_side in governed.items():
         names_by_incompatibility: dict[_Incompatibility, list[str]] = defaultdict(list)
         for other_shown in shown_before:
             if frozenset((shown, other_shown)) not in refused_pairs and (
-                incompatibility := _incompatibility_of(own, governed[other_shown])
+                incompatibility := _incompatibility_of(own_side, governed[other_shown])
             ):
                 names_by_incompatibility[incompatibility].append(other_shown)
         for incompatibility, others in names_by_incompatibility.items():
@@ -360,10 +360,12 @@ def _incompatible_governance_findings(
         yield incompatibility.kind.found(alike_names[0], text, alike_names[0])
 
 
-def _incompatibility_of(own: _Governed, other: _Governed) -> _Incompatibility | None:
-    if not own.meets(other):
+def _incompatibility_of(own_side: _Governed, other_side: _Governed) -> _Incompatibility | None:
+    if not own_side.meets(other_side):
         return _Incompatibility(PEERS_DOMAINS)
-    different = [_differences_between(*pair) for pair in product(own.documents, other.documents)]
+    different = [
+        _differences_between(*pair) for pair in product(own_side.documents, other_side.documents)
+    ]
     if not different or not all(disturbed for disturbed, _ in different):
         return None
     disturbed, values = min(different, key=lambda each: (each[0].everything, len(each[0].names)))
@@ -377,15 +379,15 @@ _MOST_SHOWN = 3
 
 @lru_cache(maxsize=256)
 def _differences_between(
-    own: Governance, other: Governance
+    own_governance: Governance, other: Governance
 ) -> tuple[Mismatch, tuple[tuple[str, str, str], ...]]:
     """Return which communication fails between two targets, and the settings with both values."""
-    disturbed = mismatch(other, own)
+    disturbed = mismatch(other, own_governance)
     if not disturbed:
         return disturbed, ()
     values = {
         change.key: (change.key, change.after, change.before)
-        for change in compare_governance(other, own)
+        for change in compare_governance(other, own_governance)
         if change.key.startswith("protection") and not change.key.endswith(_HARMLESS)
     }
     return disturbed, tuple(values.values())

@@ -284,9 +284,9 @@ def _refusal_findings(
 def _is_named(cause: RefusalCause, known_findings: Iterable[Finding]) -> bool:
     """Return whether a known finding already names the cause of a refusal."""
     wanted = _NAMED_BY.get(cause.reason, frozenset())
-    own = f"enclave.{cause.reason}"
+    enclave_finding = f"enclave.{cause.reason}"
     return any(
-        finding.id in wanted or (finding.id == own and _file(finding) == cause.file)
+        finding.id in wanted or (finding.id == enclave_finding and _file(finding) == cause.file)
         for finding in known_findings
     )
 

@@ -53,19 +53,21 @@ def other_fitting_enclaves(
             having.setdefault(part, set()).add(name)
     fitting_others = {}
     for name, subject in certified.items():
-        own = certified_text(traits, subject)
-        several = [having.get(plain(part), set()) for part in _SEPARATORS.split(own) if part]
+        subject_of_enclave = certified_text(traits, subject)
+        several = [
+            having.get(plain(part), set()) for part in _SEPARATORS.split(subject_of_enclave) if part
+        ]
         fitting = set.intersection(*sorted(several, key=len)) if several else set()
-        others = tuple(
+        other_holders = tuple(
             holder
             for holder in sorted(fitting - {name})
             if any(
-                same_subject(traits.subjects, granted_subject.strip(), own)
+                same_subject(traits.subjects, granted_subject.strip(), subject_of_enclave)
                 for granted_subject in granted[holder]
             )
         )
-        if others:
-            fitting_others[name] = others
+        if other_holders:
+            fitting_others[name] = other_holders
     return fitting_others
 
 

@@ -197,11 +197,13 @@ class _Interface(NamedTuple):
 
     def pair(self, *, secured: bool) -> tuple[Party, Party]:
         """Return a client and a server, with the rights that they need, or unsecured."""
-        own = (Identity(OWN, "client"), Identity(OWN, "server")) if secured else (UNSECURED,) * 2
+        identities = (
+            (Identity(OWN, "client"), Identity(OWN, "server")) if secured else (UNSECURED,) * 2
+        )
         before = "" if secured else "unsecured "
         return (
-            self.party(f"{before}{self.client}", self.client_role, own[0]),
-            self.party(f"{before}{self.server}", self.server_role, own[1]),
+            self.party(f"{before}{self.client}", self.client_role, identities[0]),
+            self.party(f"{before}{self.server}", self.server_role, identities[1]),
         )
 
 

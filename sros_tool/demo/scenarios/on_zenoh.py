@@ -509,14 +509,14 @@ def _trespass_row(
         Role.SERVER: answered("client", party.name),
     }[party.role]
     on_service = party.role in (Role.CLIENT, Role.SERVER)
-    others = _service_pair(keystore) if on_service else _topic_pair(keystore)
+    other_parties = _service_pair(keystore) if on_service else _topic_pair(keystore)
     identity = replace(party.identity, keystore=keystore)
     return _attempt_row(
         name,
         expected,
         mechanism,
         claim,
-        (*others, replace(party, identity=identity)),
+        (*other_parties, replace(party, identity=identity)),
         _CALLS if on_service else _CHATTER,
         world=world,
         defence_removed=defence_removed,

@@ -225,13 +225,13 @@ def denial_in_a_wildcard(copy: KeystoreCopy) -> None:
         }
         for name in enclave_names(copy.root):
             control["subjects"].append({"id": name, "cert_common_names": [name]})
-        others = [subject["id"] for subject in control["subjects"]]
+        subjects = [subject["id"] for subject in control["subjects"]]
         control["rules"] += [
             _rule(_EVERYBODY, ("**", "@ros2_lv/**")),
             _rule("denied", names, "deny", "ingress"),
         ]
         control["policies"] += [
-            {"rules": [_EVERYBODY], "subjects": others},
+            {"rules": [_EVERYBODY], "subjects": subjects},
             {"rules": ["denied"], "subjects": [guest]},
         ]
 

@@ -559,7 +559,7 @@ class KeystoreChange:
         return another_ca_remedy(self.keystore, command)
 
     def result(self, kind: Callable[..., Result], **more: Any) -> Result:
-        """Return the result, of class ``kind``, with the fields ``more`` of the verb."""
+        """Return the result, of class ``kind``; ``more`` has the fields of this verb alone."""
         shared: dict[str, Any] = {
             "root": self.root,
             "dry_run": self.dry_run,

@@ -939,10 +939,10 @@ class _EnclaveMaker:
         return working
 
     def _lost_rights_notes(self, default: Enclave, existing_files: set[str]) -> Iterator[Note]:
-        """Yield a note if an enclave had other rights than the default ones that it gets.
+        """Yield a note if an enclave that gets the default permissions had other rights before.
 
-        The unsigned copy of lost permissions shows that an enclave had some which the ledger does
-        not record.
+        If the ledger does not record the lost permissions, their unsigned copy shows that the
+        enclave had permissions.
         """
         name, last = default.path, self._change.recorded.last(default.path)
         if last.policy == default.digest if last else "permissions.xml" not in existing_files:

@@ -229,8 +229,8 @@ def _count(
     for name in keystore.names:
         try:
             if role == IDENTITY:
-                own = keystore.certificate_of(name)
-                fits = [issued_by(own, authority) for authority in authorities]
+                own_certificate = keystore.certificate_of(name)
+                fits = [issued_by(own_certificate, authority) for authority in authorities]
             else:
                 message = keystore.read(keystore.folder(name) / PERMISSIONS_FILE, "permissions")
                 signer = keystore.files.signed(message).signer()

@@ -606,10 +606,10 @@ class _Updater:
         (grant,) = permissions_for(
             default, subject=state.grant.subject, validity=validity, domains=domains
         ).grants
-        own = grant_rights(state.name, state.grant)
+        granted_rights = grant_rights(state.name, state.grant)
         if before.default_permissions == EVERYTHING:  # ros2/sros2 adds the DDS topic *
-            own = frozenset(right for right in own if right.kind != "dds")
-        difference = compare(grant_rights(state.name, grant), own)
+            granted_rights = frozenset(right for right in granted_rights if right.kind != "dds")
+        difference = compare(grant_rights(state.name, grant), granted_rights)
         return all(right in difference.covered for _, right in difference.lines())
 
     def _grant_for_new_domains(self, name: str, grant: Grant) -> Grant:
@@ -732,7 +732,7 @@ def trust_records(
                 f"'{root}' has no enclave with rights that are only in ledger lines without a chain"
             )
         entries: list[Entry] = []
-        others: list[str] = []
+        other_names: list[str] = []
         for name in names:
             state = change.keystore.enclave(name, now=now)
             message = state.files.get(PERMISSIONS_FILE, b"")
@@ -741,13 +741,13 @@ def trust_records(
                     last[name]._replace(time=iso(now), reason="taken on trust", previous="")
                 )
             else:
-                others.append(name)
-        if others:
+                other_names.append(name)
+        if other_names:
             raise KeystoreError(
-                f"the permissions of {', '.join(others)} are not the last ones in the ledger",
+                f"the permissions of {', '.join(other_names)} are not the last ones in the ledger",
                 "Perhaps older permissions were put back, with rights that were removed since.",
                 f"State their rights with `sros create_permission {quote(str(root))} "
-                f"{' '.join(map(quote, others))} POLICY_FILE`, and try again.",
+                f"{' '.join(map(quote, other_names))} POLICY_FILE`, and try again.",
             )
         change.open_authorities()
         change.entries += entries
