@@ -321,7 +321,7 @@ def _check_accepted(options: DemoOptions) -> None:
 
 
 def find_backend(wished_backend: str, folder: Path, topic: str, now: datetime) -> Backend:
-    """Return a backend that enforces security; a temporary keystore is used to try."""
+    """Return a backend that enforces security, after trying it with a temporary keystore."""
     with TemporaryDirectory(dir=folder, prefix="probe-") as probed:
         domains = DomainSet.of((_DEFAULT_DOMAIN, _DEFAULT_DOMAIN))
         spec = KeystoreSpec(topic, domains, load_template(_DEFAULT_TEMPLATE), now)
