@@ -318,24 +318,30 @@ def compare(
     """Compare two sets of rights of the enclaves in ``scope`` (None: all enclaves).
 
     An action counts as its services and topics.  A right that only one side states is no difference
-    if wildcards that both state cover it: large permissions leave such names out.
+    if wildcards that both state cover it: large permissions leave such names out.  A part of an
+    action is one if the other side has it only with the whole action, which is a difference.
     """
     one, other = (
         folded(right for right in side if scope is None or right.enclave in scope)
         for side in (first_rights, second_rights)
     )
     common = Rules(unfolded(one) & unfolded(other) if one != other else ())
+    first_only, second_only = one - other, other - one
+    gone, new = (
+        {right for right in side if not common.cover(right)} for side in (first_only, second_only)
+    )
     only_first, only_second = (
-        tuple(sorted((right for right in side if not common.cover(right)), key=order))
-        for side in (one - other, other - one)
+        tuple(sorted(rights, key=order))
+        for rights in (gone | first_only & unfolded(new), new | second_only & unfolded(gone))
     )
     covered: dict[Right, tuple[Right, ...]] = {}
     for rights, side in ((only_first, other), (only_second, one)):
         rules = Rules(side if rights else ())
+        stated = {part: right for right in side for part in parts(right)} if rights else {}
         for right in rights:
             denied = right.qualifier is ALLOW and rules.overlaps(right._replace(qualifier=DENY))
             if not denied and (by := rules.covering_rights(right)):
-                covered[right] = tuple(sorted(folded(by), key=order))
+                covered[right] = tuple(sorted({stated[part] for part in by}, key=order))
     return RightsDifference(only_first, only_second, covered)
 
 

@@ -8,11 +8,13 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 
-from sros_tool.names import ACTION_SERVICES
+from sros_tool.names import ACTION_SERVICES, GOAL
 from sros_tool.policy.model import ALLOW, DENY, Policy
 from sros_tool.policy.rights import Right, Rules, compare, policy_rights
 from tests.policy.drawn_policies import PATHS, listed, meant, policies
 from tests.support.harness import policy_text, publish, sros, subscribe
+
+GOALS = f"/f{GOAL}"
 
 
 def right(name: str, word: str = "publish", enclave: str = "/a") -> Right:
@@ -45,6 +47,7 @@ def test_empty_only_if_dds_is_told_the_same(first: Policy, second: Policy) -> No
             [],
         ),
         (["call /f", "subscribe /*"], ["subscribe /*"], ["- call /f"]),
+        (["call /f"], [f"request {GOALS}"], [f"+ request {GOALS}", "- call /f"]),
     ],
 )
 def test_what_a_wildcard_of_both_covers_is_no_difference(
@@ -92,6 +95,10 @@ def test_wildcards_of_the_other_side_are_told() -> None:
     wide = [right("/*", "request"), right("/*", "subscribe")]
     difference = compare([right("/f", "call"), right("/x")], wide)
     assert difference.covered == {right("/f", "call"): (wide[1], wide[0])}
+    whole = right("/*", "call")
+    assert compare([right(GOALS, "request")], [whole]).covered == {
+        right(GOALS, "request"): (whole,)
+    }
     denied = Right("/a", DENY, "subscribe", "/f/_action/*")
     assert compare([right("/f", "call")], [*wide, denied]).covered == {}
 
