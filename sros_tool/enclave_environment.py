@@ -691,16 +691,16 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
     """Return the enclave that a policy assigns to the node which a command starts.
 
     Raises:
-        UsageError: the command names no node, or the policy has the node in no enclave or in
-            several.
+        UsageError: the command names no node, or names it only if its own name is a certain one,
+            or the policy has the node in no enclave or in several.
         PolicyError: the policy cannot be read.
     """
     from sros_tool.names import is_expression
     from sros_tool.policy.document import read_policy
-    from sros_tool.runtime.environment import node_argument
+    from sros_tool.runtime.environment import possible_nodes
 
-    node = node_argument(command)
-    if node is None:
+    nodes = possible_nodes(command)
+    if not nodes:
         raise UsageError(
             f"the command '{command[0]}' names no node",
             "The policy assigns enclaves to node names, and `--ros-args -r __node:=NAME` sets "
@@ -709,15 +709,19 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
             "enclave of each of its nodes, and this command in an enclave of its own: `sros run "
             "KEYSTORE ENCLAVE -- COMMAND`.",
         )
-    ns, name = node
-    policy, full = read_policy(file), _full_name(ns, name)
-    enclaves = policy.enclaves_of_node(ns, name)
+    policy = read_policy(file)
+    found = {tuple(e.path for e in policy.enclaves_of_node(*node)) for node in nodes.values()}
+    if "" not in nodes or len(found) > 1:
+        raise _unknown_node_error(command, nodes, [*found])
+    (enclaves,) = found
     if len(enclaves) == 1:
-        return enclaves[0].path
+        return enclaves[0]
+    ns, name = nodes[""]
+    full = _full_name(ns, name)
     why = "A process runs in one enclave."
     remedy = f'Give it a profile in one enclave: `<profile ns="{ns}" node="{name}">`.'
     if enclaves:
-        names = ", ".join(enclave.path for enclave in enclaves[:3])
+        names = ", ".join(enclaves[:3])
         where = f"in {len(enclaves)} enclaves, such as {names}"
     else:
         where = "in no enclave"
@@ -737,6 +741,26 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
                 f"Perhaps you mean {' or '.join(close)}. If {full} is right, give it a profile."
             )
     raise UsageError(f"the policy '{file}' has the node {full} {where}", why, remedy)
+
+
+def _unknown_node_error(
+    command: Sequence[str], nodes: Mapping[str, tuple[str, str]], found: Sequence[tuple[str, ...]]
+) -> UsageError:
+    """Return the error for a command whose node depends on the name that its program gives it.
+
+    ``nodes`` is what `sros_tool.runtime.environment.possible_nodes` returns; ``found`` are the
+    enclaves of these nodes.
+    """
+    cases = [f"{_full_name(*node)} if its own name is {own}" for own, node in nodes.items() if own]
+    other = f"else {_full_name(*nodes[''])}" if "" in nodes else "else it keeps its own name"
+    several = len(found) > 1 or len(found[0]) != 1
+    enclave = "ENCLAVE" if several else quote(found[0][0])
+    return UsageError(
+        f"sros cannot know which node the command '{command[0]}' starts",
+        f"By its remapping rules it is {', '.join(cases)}, {other}.",
+        f"Name the enclave: `sros run KEYSTORE {enclave} -- COMMAND`. Or, if the process has one "
+        "node, give its name without a node before it: `-r __node:=NAME`.",
+    )
 
 
 def other_node_notes(

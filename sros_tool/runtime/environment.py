@@ -230,22 +230,47 @@ _NODE_RULES, _NAMESPACE_RULE = ("__node", "__name"), "__ns"
 
 
 def node_argument(command: Sequence[str]) -> tuple[str, str] | None:
-    """Return namespace and name that a command gives its node, or None if it gives no name.
+    """Return namespace and name that a command certainly gives its node, or None.
 
-    Without a rule for the namespace it is "/".  `node_rules` says what counts.
+    Without a rule for the namespace it is "/".
     """
-    ns, name = node_rules(command)
-    return (ns or "/", name) if name else None
+    nodes = possible_nodes(command)
+    return nodes[""] if "" in nodes and len({*nodes.values()}) == 1 else None
+
+
+def possible_nodes(command: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """Map a node's own name to the namespace and the name that a command gives it.
+
+    "" stands for every name that is not listed; if it is missing, such a node keeps its own name.
+    """
+    names, namespaces = _node_rules(command)
+    nodes = {}
+    for own, name in names.items():
+        # rcl looks for the rule of the namespace under the new name (rcl/src/rcl/node.c).
+        ns = next((ns for of, ns in namespaces.items() if of in ("", name)), "/")
+        nodes[own] = (ns, name)
+        if not own:
+            break
+    return nodes
 
 
 def node_rules(command: Sequence[str]) -> tuple[str, str]:
     """Return the namespace and the name that a command gives its nodes; "" for what it leaves out.
 
-    They are the first rules ``-r __ns:=NAMESPACE`` and ``-r __node:=NAME`` behind ``--ros-args``,
-    as rcl takes them (``remap.c``).  Rules for one of several nodes (``-r talker:__node:=NAME``)
-    are passed over: they name no enclave of the process.
+    Rules for one of several nodes (``-r talker:__node:=NAME``) are passed over.
     """
-    rules: dict[str, str] = {}
+    names, namespaces = _node_rules(command)
+    return namespaces.get("", ""), names.get("", "")
+
+
+def _node_rules(command: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the rules for names and for namespaces of nodes, by the node that they are for.
+
+    "" stands for every node.  The rules are ``-r __node:=NAME`` and ``-r __ns:=NAMESPACE`` behind
+    ``--ros-args``.  They are in their order: rcl takes the first that matches a node (``remap.c``).
+    """
+    names: dict[str, str] = {}
+    namespaces: dict[str, str] = {}
     of_ros = False
     for before, word in pairwise(("", *command)):
         if word == ROS_ARGS:
@@ -253,10 +278,13 @@ def node_rules(command: Sequence[str]) -> tuple[str, str]:
         elif word == "--":
             of_ros = False
         elif of_ros and before in _REMAP_OPTIONS:
-            rule, mark, value = word.partition(":=")
-            if mark:
-                rules.setdefault("__node" if rule in _NODE_RULES else rule, value)
-    return rules.get(_NAMESPACE_RULE, ""), rules.get("__node", "")
+            rule, _, value = word.partition(":=")
+            node, _, what = rule.rpartition(":")
+            if value and what in _NODE_RULES:
+                names.setdefault(node, value)
+            elif value and what == _NAMESPACE_RULE:
+                namespaces.setdefault(node, value)
+    return names, namespaces
 
 
 def _is_ros2_run(command: Sequence[str]) -> bool:

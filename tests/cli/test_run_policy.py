@@ -53,6 +53,11 @@ def run(made: Path, *ros_args: str, root: tuple[object, ...] | None = None) -> E
         (("-r", "__node:=talker"), "/line/talker"),
         (("-r", "__node:=talker", "-r", "__ns:=/left/arm"), "/line/talker"),
         (("--remap", "__ns:=/", "--remap", "__node:=listener"), "/line/listener"),
+        # The first rule that matches counts; that of the namespace is for the new name.
+        (("-r", "__node:=talker", "-r", "talker:__ns:=/left/arm"), "/line/talker"),
+        (("-r", "__node:=listener", "-r", "x:__ns:=/left", "-r", "__ns:=/"), "/line/listener"),
+        (("-r", "x:__node:=talker", "-r", "__node:=talker"), "/line/talker"),
+        (("-r", "__node:=talker", "-r", "x:__node:=listener"), "/line/talker"),
         (("-r", "/a:=/b", "-r", "__name:=talker", "-r", "__node:=listener"), "/line/talker"),
     ],
 )
@@ -74,7 +79,17 @@ def test_the_keystore_may_come_from_the_environment(made: Path) -> None:
     ("ros_args", "why"),
     [
         ((), "names no node"),
-        (("-r", "talker:__node:=listener"), "names no node"),
+        (
+            ("-r", "talker:__node:=listener"),
+            "/listener if its own name is talker, else it keeps its own name. Name the enclave: "
+            "`sros run KEYSTORE /line/listener -- COMMAND`",
+        ),
+        (
+            ("-r", "talker:__node:=talker", "-r", "__node:=listener"),
+            "/talker if its own name is talker, else /listener. Name the enclave: `sros run "
+            "KEYSTORE ENCLAVE ",
+        ),
+        (("-r", "__node:=talker", "-r", "talker:__ns:=/left", "-r", "__ns:=/"), "/left/talker in"),
         (("-r", "__ns:=/left"), "names no node"),
         (("--", "-r", "__node:=talker"), "names no node"),
         (("-p", "__node:=talker"), "names no node"),
