@@ -1163,6 +1163,12 @@ def fleet_metrics(
             (Sample(int(now.timestamp()), place),),
         ),
         Metric(
+            "sros_fleet_complete",
+            "Whether `sros fleet status` has nothing to say of robots, of the keystore and of the "
+            "clock of its machine (1), or has (0); known vulnerabilities do not count.",
+            (Sample(int(status.complete), place),),
+        ),
+        Metric(
             "sros_fleet_robots",
             f"Number of robots by state ({', '.join(State)}).",
             tuple(
@@ -1198,10 +1204,10 @@ def fleet_metrics(
         Metric(
             "sros_fleet_revocation_list_in_force",
             "Whether the current revocation list is in force on a robot (1), or not, or it is not "
-            "known (0).",
-            per_robot(
-                lambda robot: None if robot.crl_in_force is None else int(robot.crl_in_force)
-            ),
+            "known (0); only if it revokes a certificate.",
+            per_robot(lambda robot: None if robot.crl_in_force is None else int(robot.crl_in_force))
+            if status.is_any_revoked
+            else (),
         ),
         Metric(
             "sros_fleet_release",
