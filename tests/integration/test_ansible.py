@@ -206,11 +206,11 @@ def test_what_robots_confirm(three: Fleet) -> None:
     """A robot without sros says exactly what sros would say of its folder."""
     done = three.play("status", sros_hosts="r1:r2", sros_confirm=True)
     assert not done.changed
-    assert "3 robots: 2 current, 1 no enclave" in done.text
+    assert "3 robots: 2 current, 1 revoked" in done.text
     status = json.loads(sros("fleet", "status", three.keystore, "--json").out)
     assert status["complete"]
     states = {each["robot"]: each["state"] for each in status["robots"]}
-    assert states == {"r1": "current", "r2": "current", "r3": "none"}
+    assert states == {"r1": "current", "r2": "current", "r3": "revoked"}
     kept = json.loads((three.keystore / "confirmed/r1.json").read_text())["confirmation"]
     said = sros("fleet", "report", three.robots["r1"].keystore, "--robot", "r1").ok()
     by_sros = {**json.loads(said.out), "time": kept["time"]}
