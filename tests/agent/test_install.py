@@ -145,7 +145,7 @@ REFUSED: dict[str, tuple[Callable[[Home], Release], str]] = {
         ),
         "is not sealed by a CA that this robot trusts",
     ),
-    "an older list": (lambda home: home.release(home.renewed.files), "is older than the one here"),
+    "an older list": (lambda home: home.release(home.renewed.files), "is older than the list here"),
 }
 
 

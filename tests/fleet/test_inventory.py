@@ -115,7 +115,7 @@ DIAMONDS = {f"g{i}": {"children": [f"g{i + 1}", f"h{i + 1}"]} for i in range(30)
         ("h.yml", "a: {vars: {sros_domain: 1}, hosts: {r: }}\nb: {vars: {sros_domain: 2}, "
          "hosts: {r: }}", "gets sros_domain from two groups"),
         ("h.json", '{"a": {"children": ["b"]}, "b": {"children": ["a"]}, "all": {"children": '
-         '["a"]}}', "in itself"),
+         '["a"]}}', "contains itself"),
         pytest.param("h.json", json.dumps(DIAMONDS), "more than 200000", marks=ONLY_LONG),
         ("h.yml", "all: {}", "no robot"),
         ("hosts", "[carriers]\nr1 ansible_host=10.0.0.1\n", "ansible-inventory -i"),
