@@ -260,14 +260,20 @@ class Snapshot:
 
 
 def settle(source: GraphSource, settling: Settling, clock: Clock) -> Snapshot:
-    """Return the graph once it stops changing, at the latest after ``settling.most`` seconds."""
-    begin = changed = clock()
+    """Return the graph once it stops changing, at the latest after ``settling.most`` seconds.
+
+    It does not count as still before the observer has reported it for the first time: on a slow
+    machine, that takes long.
+    """
+    begin = clock()
+    changed: float | None = None
     seen = all_seen = Observation()
     while True:
         now = clock()
         if now - begin >= settling.most:
             return Snapshot(seen, all_seen, now - begin, False)
-        if now - begin >= settling.least and now - changed >= settling.still:
+        is_still = changed is not None and now - changed >= settling.still
+        if now - begin >= settling.least and is_still:
             return Snapshot(seen, all_seen, now - begin, True)
         news = source.next(_TICK)
         if news is not None:

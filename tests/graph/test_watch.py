@@ -50,6 +50,8 @@ def test_a_late_change_is_waited_for() -> None:
     snapshot = settle(script, SETTLING, script.clock)
     assert snapshot.observation == TWO
     assert 2.9 <= snapshot.seconds < 3.3
+    slow = Script([(7.0, ONE)])
+    assert settle(slow, SETTLING, slow.clock).observation == ONE
 
 
 def test_the_snapshot_is_the_graph_as_it_is_now() -> None:

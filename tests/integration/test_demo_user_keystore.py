@@ -153,6 +153,7 @@ def test_a_weak_robot_fails_in_the_rows_of_its_weakness(
         *("demo", "--backend", backend, "--scenario", "attacks", "--keystore", robot, "--json"),
         *words,
     )
+    assert ended.out, ended
     rows = {row["name"]: row for row in json.loads(ended.out)["rows"]}
     joining = {each for each in rows if OTHERS in each}
     assert bool(joining) is bool(name and WEAK[name].joins)
