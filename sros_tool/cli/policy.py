@@ -308,18 +308,21 @@ def diff_policy(
         echo_lines(rights_markdown(first, second, compared))
     else:
         lines = _difference_lines(difference, first.fleet, second.fleet)
-        lines += domain_lines(compared, first.fleet or second.fleet)
+        lines += enclave_lines(compared, first.fleet or second.fleet)
         unanswered = unanswered_lines(compared, second.fleet)
         for line in (*lines, *_protection_lines(protections), *unanswered):
             echo(line)
         count = len(difference.only_first) + len(difference.only_second)
         of = f" of {first_few(sorted(compared.scope), _MOST_NEW_LINES)}" if compared.scope else ""
         differ = f"1 right{of} differs" if count == 1 else f"{count} rights{of} differ"
-        if count or not compared.domains:
+        if count or not (compared.domains or compared.enclaves):
             echo(differ if count else f"the rights{of} are the same", err=True)
         if compared.domains:
             number = counted(len(compared.domains), "enclave")
             echo(f"the ROS domains of {number} differ", err=True)
+        if compared.enclaves:
+            number = counted(len(compared.enclaves), "enclave")
+            echo(f"only one side has {number} without rights", err=True)
         if protections:
             echo("what the policies say about protection differs", err=True)
         if compared.governance_differs:
@@ -348,7 +351,7 @@ def rights_markdown(
         first_source, second_source, difference.rights, letters=_MOST_PICTURE, arrows=_MOST_LINKS
     )
     lines = folded_differences(first_source, second_source, difference.rights)
-    lines += domain_lines(difference, first_source.fleet or second_source.fleet)
+    lines += enclave_lines(difference, first_source.fleet or second_source.fleet)
     lines += _protection_lines(difference.protections)
     parts = []
     shown_by = "which `sros diff_policy` shows"
@@ -378,8 +381,10 @@ def rights_markdown(
     return "\n\n".join((title, *parts)) + "\n"
 
 
-def domain_lines(difference: SourcesDifference, fleet: Fleet | None) -> list[str]:
-    """Return the lines for enclaves whose ROS domains differ; equal lines of robots are merged."""
+def enclave_lines(difference: SourcesDifference, fleet: Fleet | None) -> list[str]:
+    """Return the lines for enclaves without rights that only one side has, and for enclaves whose
+    ROS domains differ; equal lines of robots are merged.
+    """
     from sros_tool.fleet.robots import folded
 
     sides = [
@@ -391,6 +396,14 @@ def domain_lines(difference: SourcesDifference, fleet: Fleet | None) -> list[str
             (enclave_domains.enclave, f"+ {enclave_domains.enclave} in domain {enclave_domains.b}")
             for enclave_domains in difference.domains
         ],
+    ]
+    sides += [
+        [
+            (enclave, f"{sign} {enclave}, an enclave without rights")
+            for sign, enclave in difference.enclaves
+            if sign == side
+        ]
+        for side in "-+"
     ]
     return [text for lines in sides for text in folded(fleet, lines)]
 

@@ -372,6 +372,7 @@ def _sentence(result: Review, step: ReviewStep) -> str:
                     (added, "written right", "added"),
                     (gone, "written right", "gone"),
                     (len(compared.protections), "stated protection", "changed"),
+                    (len(compared.enclaves), "empty enclave", "added or gone"),
                     (len(absolute), "name", "made absolute"),
                     (len(relative), "name", "made relative"),
                 )
@@ -423,7 +424,12 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
     """
     from sros_tool.checks.formats import folded_findings
     from sros_tool.checks.registry import ChosenFindings
-    from sros_tool.cli.policy import added_lines, domain_lines, folded_differences, unanswered_lines
+    from sros_tool.cli.policy import (
+        added_lines,
+        enclave_lines,
+        folded_differences,
+        unanswered_lines,
+    )
     from sros_tool.proof.review import AccessChange, DroppedRequirements, RightsChange
 
     match step.content:
@@ -432,7 +438,7 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
         case RightsChange(before=before, after=after, compared=compared):
             unanswered = unanswered_lines(compared, after.fleet)
             differing = folded_differences(before, after, compared.rights, ("BASE", "HEAD"))
-            differing += domain_lines(compared, after.fleet or before.fleet)
+            differing += enclave_lines(compared, after.fleet or before.fleet)
             return [*unanswered, *_absolute_lines(step.content), *differing]
         case (ChosenFindings() as chosen) | DroppedRequirements(chosen=chosen) if (
             step.status or step.allowed

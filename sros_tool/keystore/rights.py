@@ -110,6 +110,15 @@ class RightsSource:
     key_domains: Mapping[Right, frozenset[int | None]] = field(default_factory=dict)
     policy: Policy | None = None
 
+    def without_rights(self) -> set[str]:
+        """Return the enclaves of a policy or of permissions that have no rights at all."""
+        return self.stated_enclaves() - {right.enclave for right in self.rights}
+
+    def stated_enclaves(self) -> set[str]:
+        """Return the enclaves of a policy or of permissions, also those without rights."""
+        policy = self.policy.enclaves if self.policy else ()
+        return {*self.documents, *(enclave.path for enclave in policy)}
+
     @property
     def enclaves(self) -> list[str] | None:
         """Enclaves that the file or folder can give rights to; null for all."""
@@ -565,6 +574,15 @@ class DifferentProtection(NamedTuple):
     protection: StatedProtection
 
 
+class DifferentEnclave(NamedTuple):
+    """An enclave without rights that only one side has."""
+
+    only: OnlySide
+    """The side that has the enclave."""
+    enclave: str
+    """Name of the enclave."""
+
+
 class DifferentDomains(NamedTuple):
     """The ROS domains of an enclave that differ between A and B."""
 
@@ -580,7 +598,8 @@ class PolicyDifference(NamedTuple):
     """The rights that differ between A and B."""
 
     equal: bool
-    """Whether A and B give the same rights in the same domains, and demand the same protection."""
+    """Whether A and B have the same enclaves, give the same rights in the same domains, and demand
+    the same protection."""
     a: RightsSource
     """The source A."""
     b: RightsSource
@@ -594,6 +613,8 @@ class PolicyDifference(NamedTuple):
     enclave of B."""
     domains: Sequence[DifferentDomains]
     """Enclaves of both sides whose ROS domains differ; only where both sides state them."""
+    enclaves: Sequence[DifferentEnclave]
+    """Enclaves without rights that only one side has."""
     governance_differs: bool
     """Whether the governance of the enclaves of A and B differs, or cannot be read."""
 
@@ -610,12 +631,14 @@ class SourcesDifference(NamedTuple):
     """As in `PolicyDifference`; empty if a source is only for some enclaves."""
     domains: Sequence[DifferentDomains] = ()
     """As in `PolicyDifference`."""
+    enclaves: Sequence[tuple[str, str]] = ()
+    """Enclaves without rights that only one side has, with "-" for the first or "+"."""
     governance_differs: bool = False
     """As in `PolicyDifference`."""
 
     def __bool__(self) -> bool:
-        parts = self.rights, self.protections, self.domains, self.governance_differs
-        return any(map(bool, parts))
+        parts = self.rights, self.protections, self.domains, self.enclaves
+        return self.governance_differs or any(map(bool, parts))
 
 
 def compared_enclaves(
@@ -659,7 +682,15 @@ def compare_sources(
     protections = _protection_differences(first_source, second_source)
     domains = _domain_differences(first_source, second_source, scope)
     governed = governance and _governance_differs(first_source, second_source)
-    return SourcesDifference(scope, difference, protections, unanswered, domains, governed)
+    enclaves = [
+        (sign, enclave)
+        for sign, side, other in (("-", *sides), ("+", *sides[::-1]))
+        for enclave in sorted(side.without_rights() - other.stated_enclaves())
+        if other.kind != "zenoh" and (scope is None or enclave in scope)
+    ]
+    return SourcesDifference(
+        scope, difference, protections, unanswered, domains, enclaves, governed
+    )
 
 
 def _governance_differs(first_source: RightsSource, second_source: RightsSource) -> bool:
@@ -694,7 +725,10 @@ def _without_observer(source: RightsSource, other: RightsSource) -> RightsSource
     ):
         stated_rights = (right for right in source.rights if right.enclave != CLOSED_OBSERVER)
         scope = None if source.scope is None else source.scope - {CLOSED_OBSERVER}
-        return replace(source, rights=frozenset(stated_rights), scope=scope)
+        documents = {**source.documents}
+        documents.pop(CLOSED_OBSERVER, None)
+        own = frozenset(stated_rights)
+        return replace(source, rights=own, scope=scope, documents=documents)
     return source
 
 
@@ -815,6 +849,7 @@ def policy_difference(
         [DifferentProtection(_SIDES[sign], stated) for sign, stated in difference.protections],
         difference.unanswered,
         difference.domains,
+        [DifferentEnclave(_SIDES[sign], enclave) for sign, enclave in difference.enclaves],
         difference.governance_differs,
     )
 

@@ -168,6 +168,7 @@ class AccessSource:
             notes=self.notes,
             fleet=self.fleet,
             protections=self.protections,
+            policy=Policy(tuple(self.enclaves.values())),
         )
 
     def sources_of(self, enclave: str) -> dict[Right, Source]:

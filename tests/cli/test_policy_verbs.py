@@ -281,6 +281,17 @@ def test_diff_of_the_same(folder: Path) -> None:
     assert json.loads(sros("diff_policy", "a.xml", "a.xml", "--json").out)["equal"] is True
 
 
+def test_an_enclave_without_rights_is_a_difference(folder: Path) -> None:
+    rights = {"/a": publish("x")}
+    (folder / "less.xml").write_text(policy_text(rights))
+    (folder / "more.xml").write_text(policy_text({**rights, "/idle": ""}))
+    added = sros("diff_policy", "less.xml", "more.xml")
+    assert (added.status, added.out) == (1, "+ /idle, an enclave without rights\n")
+    assert added.err == "only one side has 1 enclave without rights\n"
+    value = json.loads(sros("diff_policy", "more.xml", "less.xml", "--json").out)
+    assert not value["equal"] and value["enclaves"] == [{"only": "a", "enclave": "/idle"}]
+
+
 def test_diff_with_a_keystore_and_its_parts(keystore: Path) -> None:
     same = keystore.parent / "same.xml"
     same.write_text(policy_text({"/a": publish("old_a"), "/b": publish("old_b")}))
