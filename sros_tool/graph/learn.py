@@ -937,7 +937,7 @@ def with_common_parts(path: Path, merged: bytes, others: Sequence[Policy]) -> by
 
     A profile is new if the file at ``path`` lacks it.  Without includes in ``others``, which were
     merged into the file, ``merged`` is returned.  Rights never change, and neither does a profile
-    that denies something or states a protection.
+    that states a protection, or of an enclave that denies a right of the parts.
     """
     if not any(
         group.source.file != merged_policy.file
@@ -957,31 +957,27 @@ def with_common_parts(path: Path, merged: bytes, others: Sequence[Policy]) -> by
     before = read_bytes(path, "policy file")
     known, profiles = _profiles_of(path, before), []
     for enclave in policy.enclaves:
-        allowed = frozenset(
-            NodeRight(right.right, right.name)
-            for right in policy_rights(Policy((enclave,)))
-            if right.qualifier is ALLOW
-        )
+        allowed = _allowed_rights(policy_rights(Policy((enclave,))))
         for profile in enclave.all_profiles():
             ns, node = profile.ns, profile.node
-            own = tuple(profile_rights(enclave.path, profile))
-            if (
-                (enclave.path, ns, node) in known
-                or any(right.qualifier is DENY for right in own)
-                or any(group.protect for group in profile.groups)
-            ):
+            if (enclave.path, ns, node) in known or any(g.protect for g in profile.groups):
                 continue
-            rights = frozenset(NodeRight(right.right, right.name) for right in own)
+            own = _allowed_rights(profile_rights(enclave.path, profile))
             # A merge leaves out what another profile of the enclave allows.
             chosen, _ = common.choose(allowed, ns, node)
             includes = tuple(
-                part for part in chosen if common.included_rights((part,), ns, node) & rights
+                part for part in chosen if common.included_rights((part,), ns, node) & own
             )
-            groups = _groups_not_given(common.included_rights(includes, ns, node), profile)
-            profiles.append(LearnedProfile(enclave.path, ns, node, rights, includes, groups))
+            given = common.included_rights(includes, ns, node)
+            groups = _groups_not_given(given, profile)
+            profiles.append(LearnedProfile(enclave.path, ns, node, given, includes, groups))
     document, _ = _with_includes(path, before, merged, profiles)
     is_same = policy_rights(read_policy(path, document)) == policy_rights(policy)
     return document if is_same else merged
+
+
+def _allowed_rights(rights: Iterable[Right]) -> frozenset[NodeRight]:
+    return frozenset(NodeRight(e.right, e.name) for e in rights if e.qualifier is ALLOW)
 
 
 def _groups_not_given(given_rights: frozenset[NodeRight], profile: Profile) -> tuple[Group, ...]:
@@ -992,8 +988,9 @@ def _groups_not_given(given_rights: frozenset[NodeRight], profile: Profile) -> t
             name
             for name in group.names
             if any(
-                NodeRight(right, expand(name, profile.ns, profile.node)) not in given_rights
-                for right, _ in group.rights
+                qualifier is DENY
+                or NodeRight(right, expand(name, profile.ns, profile.node)) not in given_rights
+                for right, qualifier in group.rights
             )
         )
         if names:

@@ -112,7 +112,7 @@ def test_merge_to_stdout(folder: Path) -> None:
 
 
 INCLUDE = '<xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/>'
-WITH_INCLUDE = with_includes(policy_text({"/b": INCLUDE + publish("z", "/x/y")}))
+WITH_INCLUDE = with_includes(policy_text({"/b": INCLUDE + DENY + publish("z", "/x/y")}))
 
 
 def test_merge_keeps_the_include_of_a_common_part(folder: Path) -> None:
@@ -125,6 +125,7 @@ def test_merge_keeps_the_include_of_a_common_part(folder: Path) -> None:
     included = sros(*command).ok()
     assert included.out.count(INCLUDE) == 1 and "get_parameters" not in included.out
     assert "<topic>/x/y</topic>" in included.out and "<!-- mine -->" in included.out
+    assert included.out.count('publish="DENY"') == 2, "also the denial that is added"
     assert included.err == spelt_out.err
     result = Path("a.xml")
     read = [
@@ -133,9 +134,8 @@ def test_merge_keeps_the_include_of_a_common_part(folder: Path) -> None:
     assert read[0] == read[1]
     assert "include" not in sros(*command, "-o", "other/c.xml").ok().out
     assert "include" not in Path("other/c.xml").read_text(), "for another folder"
-    denied = DENY.replace("cmd_vel", "/rosout")
-    other.write_text(WITH_INCLUDE.replace(INCLUDE, denied + INCLUDE))
-    assert "include" not in sros(*command).ok().out, "a denial"
+    other.write_text(WITH_INCLUDE.replace("cmd_vel", "/rosout"))
+    assert "include" not in sros(*command).ok().out, "a denial of what the part allows"
     (folder / "common/node/time.xml").write_text(f"<profile>{publish('/other')}</profile>")
     other.write_text(WITH_INCLUDE)
     assert "common/node.xml" not in sros(*command).ok().out, "another content"
