@@ -91,6 +91,14 @@ def check_one_format() -> None:
         raise UsageError(f"--json and the format {form} exclude each other", "", "Choose one.")
 
 
+def refuse_git_revision(paths: Iterable[Path], remedy: str) -> None:
+    """Raise `UsageError` if a path is ``git:REVISION:PATH``, which most verbs cannot read."""
+    if any(str(path).startswith("git:") and not path.exists() for path in paths):
+        raise UsageError(
+            "a git revision can only be compared with --no-new-access of diff_policy", "", remedy
+        )
+
+
 def dry_run_option(function: Decorated) -> Decorated:
     """Add ``--dry-run`` to a verb that writes."""
     return click.option(

@@ -27,6 +27,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     progress,
+    refuse_git_revision,
     save,
     verb,
 )
@@ -293,10 +294,7 @@ def diff_policy(
     form = "json" if as_json else form
     if no_new_access:
         return _show_new_access(a, b, fleets_of(fleet_files), form)
-    if any(str(path).startswith("git:") and not path.exists() for path in (a, b)):
-        raise UsageError(
-            "a git revision can only be compared with --no-new-access", "", "Add the option."
-        )
+    refuse_git_revision((a, b), "Add --no-new-access.")
     with progress("reading"):
         fleets = fleets_of(fleet_files)
         first, second = load_rights(a, fleets[0]), load_rights(b, fleets[-1])

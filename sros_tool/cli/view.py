@@ -27,6 +27,7 @@ from sros_tool.cli.common import (
     now,
     print_json,
     progress,
+    refuse_git_revision,
     robot_option,
     save,
     verb,
@@ -183,6 +184,9 @@ def view(
     check_one_format()
     if hops and not focus:
         raise UsageError("--hops is for --focus only", "", "Add --focus NAME.")
+    refuse_git_revision(
+        sources, "Check it out: `git worktree add old REVISION`, and name old/PATH."
+    )
     moment = now()
     written = _format("json" if as_json else form, output, graphviz)
     if written == "markdown" and (len(sources) > 1 or observed or hops):

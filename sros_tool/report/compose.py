@@ -102,6 +102,10 @@ class PictureSource:
         """Whether other enclaves of the system may not be in the source."""
         return self.is_export or self.origin.kind in ("enclave", "permissions")
 
+    def titled(self, title: str) -> PictureSource:
+        """Return a copy with another title."""
+        return replace(self, origin=self.origin._replace(title=title))
+
     def only_for(self, enclaves: Collection[str]) -> PictureSource:
         """Return a copy without the rights, nodes and certificates of all other enclaves."""
         return replace(

@@ -282,7 +282,7 @@ class SourceTitle(NamedTuple):
     """Title of a source in the picture: its file name, and its kind."""
 
     title: str
-    """File name of the source, without folders."""
+    """File name of the source; folders only as far as they tell two sources apart."""
     kind: str
     """Kind of the source, such as ``policy``."""
 

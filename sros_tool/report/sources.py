@@ -127,6 +127,9 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
             "Name one SOURCE and --observed, or two SOURCEs.",
         )
     read = [_read(path, fleet, drawing) for path, fleet in zip(sources, fleets, strict=False)]
+    observed = [read_source(path, now=drawing.now) for path in drawing.observed]
+    titles = _titles([*sources, *drawing.observed])
+    read = list(map(PictureSource.titled, read, titles))
     if drawing.template:
         _check_no_governance(sources, read)
         template = drawing.template
@@ -141,8 +144,8 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
         robots |= _robots(path, fleet, source)
     places = {enclave: robot.name for enclave, robot in robots.items()}
     hosts = places | _hosts(drawing.hosts)
-    if drawing.observed:
-        seen = union([read_source(path, now=drawing.now) for path in drawing.observed])
+    if observed:
+        seen = union(list(map(PictureSource.titled, observed, titles[len(read) :])))
         read.append(seen.moved_to_homes(enclaves_of_nodes(seen.nodes, read[0].nodes)))
     picture = _compared_picture(read, hosts, use=bool(drawing.observed))
     governed = [source.governance for source in read if source.governance]
@@ -491,12 +494,26 @@ def _with_findings(
     return replace(source, findings=tuple(dict.fromkeys((*source.findings, *attached))))
 
 
-def _base_name(path: Path) -> str:
-    """Return the file name of a source, without unprintable characters.
+def _titles(paths: Sequence[Path]) -> list[str]:
+    """Return the file names of sources, with as many of their folders as tell them apart."""
+    parts = [path.absolute().parts[1:] for path in paths]
+    titles = []
+    for path, own in zip(paths, parts, strict=True):
+        others = [other for other in parts if other != own]
+        shown = 1
+        while shown < len(own) and any(other[-shown:] == own[-shown:] for other in others):
+            shown += 1
+        titles.append("/".join((*map(_printable, own[-shown:-1]), _base_name(path))))
+    return titles
 
-    U+FFFD replaces them.
-    """
-    name = path.absolute().name or "/"
+
+def _base_name(path: Path) -> str:
+    """Return the file name of a source, without unprintable characters."""
+    return _printable(path.absolute().name or "/")
+
+
+def _printable(name: str) -> str:
+    """Return a name in which U+FFFD replaces unprintable characters."""
     return "".join(
         letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in name
     )

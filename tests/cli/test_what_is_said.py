@@ -201,8 +201,9 @@ def test_a_keystore_with_another_number_is_no_typing_error(tmp_path: Path) -> No
 def test_what_is_asked_in_vain_names_what_to_ask(tmp_path: Path) -> None:
     policy = tmp_path / "p.xml"
     policy.write_text(policy_text({"/a": publish("/x")}))
-    revision = sros("diff_policy", "git:HEAD:p.xml", policy)
-    assert revision.status == 2 and "only be compared with --no-new-access" in revision.err
+    for verb in ("diff_policy", "view"):
+        revision = sros(verb, "git:HEAD:p.xml", policy)
+        assert revision.status == 2 and "only be compared with --no-new-access" in revision.err
     for words, able in (("fleet status", "show the fleet"), ("agent run", "run the agent")):
         assert sros(*words.split(), tmp_path).err.startswith(f"Unable to {able}: ")
     policy.write_text("<policy><enclaves/></policy>")

@@ -167,6 +167,16 @@ def test_open_shows_the_file_that_was_written(
     assert opened == [(tmp_path / "page.html").as_uri()]
 
 
+@pytest.mark.parametrize("observed", [False, True])
+def test_two_sources_of_one_name_are_told_apart_by_folders(tmp_path: Path, observed: bool) -> None:
+    for release in ("old", "new"):
+        (tmp_path / release / "p").mkdir(parents=True)
+        write(tmp_path / release / "p", "x.xml", "/x")
+    words = ("--observed",) if observed else ()
+    ended = sros("view", tmp_path / "old/p/x.xml", *words, tmp_path / "new/p/x.xml", "--json")
+    assert json.loads(ended.ok().out)["title"] == "old/p/x.xml and new/p/x.xml"
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
