@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, tzinfo
 from functools import cache, partial
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, NamedTuple
@@ -935,32 +935,40 @@ def _fixed_or_moving_names(before: AccessSource, after: AccessSource) -> Iterato
             yield placed
     denials = [placed for placed, _ in of_after if placed.right.qualifier is DENY]
     for placed, moved in of_before:
-        denies = placed.right.qualifier is DENY
-        if denies and now.cover(placed.right) and not now_elsewhere.cover(moved):
-            yield next(denial for denial in denials if Rules([denial.right]).overlaps(placed.right))
+        here, elsewhere = (
+            placed.right.qualifier is DENY
+            and any(_undenied_name(part, rules) for part in parts(right))
+            for right, rules in ((placed.right, now), (moved, now_elsewhere))
+        )
+        if elsewhere and not here:
+            same = (denial for denial in denials if Rules([denial.right]).overlaps(placed.right))
+            yield from islice(same, 1)
 
 
 def _undenied(before: AccessSource, after: AccessSource) -> Iterator[tuple[Right, str]]:
     """Yield denials of which ``after`` neither denies nor allows all names (`AccessChange`)."""
     stated = Rules(after.rights)
     left = {right.enclave for right in after.rights} | after.permissions.keys()
-
-    def undenied_name(part: Right) -> str | None:
-        if part.enclave not in left or stated.cover(part):
-            return None
-        allowed = stated.overlapping(part._replace(qualifier=ALLOW))
-        if part.kind == "dds":  # has no ROS name to search for
-            return None if allowed else part.name
-        stated_names = [right.name for right in (*allowed, *stated.overlapping(part))]
-        return common_name([part.name], stated_names)
-
     names = {
-        part: undenied_name(part) for part in unfolded(before.rights) if part.qualifier is DENY
+        part: _undenied_name(part, stated)
+        for part in unfolded(before.rights)
+        if part.qualifier is DENY and part.enclave in left
     }
     for right in sorted(folded(part for part, name in names.items() if name)):
         part = parts(right)[0]
         name = (names[part] or "").removesuffix(part.name.removeprefix(right.name))
         yield right, name if stated.overlaps(right) else ""
+
+
+def _undenied_name(denied: Right, stated: Rules) -> str | None:
+    """Return a name that ``denied``, no action, denies and ``stated`` neither denies nor allows."""
+    if stated.cover(denied):
+        return None
+    allowed = stated.overlapping(denied._replace(qualifier=ALLOW))
+    if denied.kind == "dds":  # has no ROS name to search for
+        return None if allowed else denied.name
+    names = [right.name for right in (*allowed, *stated.overlapping(denied))]
+    return common_name([denied.name], names)
 
 
 def _moved_rights(enclave: Enclave) -> Iterator[tuple[PlacedRight, Right]]:

@@ -149,8 +149,9 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
     assert "/c subscribe topic /x has a / at its beginning, so that it does" in absolute
     assert absolute.endswith("(second.xml:3)")
     denies = '<topics publish="DENY"><topic>{}</topic></topics>'
-    change.base = change.commit({"second.xml": policy_text({"/c": denies.format("/stop")})})
-    change.commit({"second.xml": policy_text({"/c": denies.format("stop")})})
+    change.base = change.commit({"second.xml": policy_text({"/c": denies.format("/stop*")})})
+    split = denies.format("stop</topic><topic>stop?*")
+    change.commit({"second.xml": policy_text({"/c": split})})
     ended = change.review("--policy", "robot.xml\nsecond.xml")
     assert "1 name made relative" in ended.out
     assert (
