@@ -275,7 +275,11 @@ def explain_log(
         for group in _grouped_hits(hits)
         if examiner.is_security_message(group[0])
     ]
-    findings += [examiner.denial(denial, named) for denial, named in denials]
+    lacking = examiner.missing_namespaces(denied)
+    findings += [
+        examiner.denial(denial, named, lacking.get((denial.process, denial.enclave), ""))
+        for denial, named in denials
+    ]
     own_enclave = find("")
     findings += _dropped_message_findings(
         lines, root, own_enclave.name if own_enclave else "", keystore
@@ -658,8 +662,43 @@ class _Examiner:
         text = re.sub(r"\bPEER\b", lambda _: quote(only), text) if only else text
         return replace(finding, found=tuple(known), checked=bool(known), remedy=text)
 
-    def denial(self, denial: Denial, named: list[tuple[int, str]]) -> LogFinding:
-        """Return the finding for a denied topic; ``named`` are the lines that name the topic."""
+    def missing_namespaces(self, denials: Iterable[Denial]) -> dict[tuple[str, str], str]:
+        """Map pairs of process and enclave to the namespace that every denied name of it lacks.
+
+        Only if a service of a node is among the names: the process lacks its namespace then, and
+        not a name its remapping.
+        """
+        by_process = defaultdict[tuple[str, str], list[Denial]](list)
+        for denial in denials:
+            if not denial.remote:
+                by_process[denial.process, denial.enclave].append(denial)
+        missing = {}
+        for process, denied in by_process.items():
+            enclave = self._find(process[1])
+            if enclave is None or not any(map(serving_node, denied)):
+                continue
+            answer = self._answer(enclave, denied[0].vendor, ask("join"))
+            spaces = {node.rpartition("/")[0] for node in _served_names(answer)}
+            ns = spaces.pop() if len(spaces) == 1 else ""
+            if ns and all(self._is_allowed_in(ns, denial, enclave) for denial in denied):
+                missing[process] = ns
+        return missing
+
+    def _is_allowed_in(self, ns: str, denial: Denial, enclave: LoadedEnclave) -> bool:
+        """Return whether a denied topic would be allowed if its name had a namespace before it."""
+        if not denial.direction or denial.topic[2:3] != "/":
+            return False
+        moved = replace(denial, topic=f"{denial.topic[:2]}{ns}{denial.topic[2:]}")
+        now, then = (
+            self._answer(enclave, denial.vendor, _question(each)) for each in (denial, moved)
+        )
+        return then.allowed and not now.allowed
+
+    def denial(self, denial: Denial, named: list[tuple[int, str]], ns: str = "") -> LogFinding:
+        """Return the finding for a denied topic; ``named`` are the lines that name the topic.
+
+        ``ns`` is the namespace that the whole process lacks, or "".
+        """
         line, text = named[0][0], " ".join(named[0][1].split())
         right, name = _in_ros_terms(denial)
         who = "a peer" if denial.remote else denial.enclave or "the process"
@@ -691,6 +730,13 @@ class _Examiner:
             remedy = remedy or (
                 "Restart the process: it loaded earlier permissions. If it runs from an export, "
                 "export the enclave again first."
+            )
+        elif ns:
+            facts = [answer.decision.text, f"the enclave may {right} {ns}{name}"]
+            remedy = (
+                f"All names that are denied to the process lack the namespace {ns}: start it with "
+                f"`--ros-args -r __ns:={quote(ns)}`, or with `namespace=` in its launch file. If "
+                f"{name} is right, {finding.remedy}"
             )
         else:
             other, better = self._other_node_cause(denial, answer)

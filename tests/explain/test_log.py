@@ -686,6 +686,26 @@ def test_one_of_several_nodes_is_renamed_alone(keystore: Path, tmp_path: Path) -
     assert "-r __node:=food" not in found and "-r __node:=talker" not in found
 
 
+def test_a_process_without_its_namespace_gets_it_as_a_whole(keystore: Path, tmp_path: Path) -> None:
+    services = "".join(
+        f"<service>/left/{node}/{name}</service>"
+        for node in ("foo", "talker")
+        for name in PARAMETER_SERVICES
+    )
+    rights = f'<services reply="ALLOW">{services}</services>{publish("/left/scan")}'
+    (tmp_path / "left.xml").write_text(policy_text({ENCLAVE: rights}))
+    sros("create_permission", keystore, ENCLAVE, tmp_path / "left.xml").ok()
+    log = tmp_path / "log"
+    line = "[SECURITY Error] {} topic not found in allow rule. -> Function check_create_data{}\n"
+    service = line.format("rq/foo/get_parametersRequest", "reader")
+    log.write_text(service + line.format("rt/scan", "writer"))
+    found = sros("explain", keystore, ENCLAVE, "--log", log).out
+    assert found.count("start it with `--ros-args -r __ns:=/left`") == 2
+    assert "-r /scan:=" not in found and "foo:__ns:=" not in found
+    log.write_text(service + line.format("rt/other", "writer"))
+    assert "foo:__ns:=/left" in sros("explain", keystore, ENCLAVE, "--log", log).out
+
+
 def test_rcl_alone_makes_one_look_at_the_name(keystore: Path, tmp_path: Path) -> None:
     log = tmp_path / "stderr.log"
     log.write_text("RCLError: failed to create service: create_service() failed to create ...\n")
