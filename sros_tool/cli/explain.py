@@ -291,7 +291,14 @@ def explain(
     check_one_decider()
     root, rest = _split(arguments, keystore, verb=0 if who else 1)
     names_policy = root is not None and is_policy(root)
-    if names_policy and not (policy or logs or reach):
+    if names_policy and logs:
+        raise UsageError(
+            f"--log takes a keystore or an enclave's folder, and '{root}' is neither",
+            "A process loads signed files, and its log is explained by them.",
+            "Name the keystore, or ask the policy about a name in the log: `sros explain "
+            f"{quote(str(root))} ENCLAVE publish|subscribe|call|serve NAME`.",
+        )
+    if names_policy and not (policy or reach):
         policy, root = root, None
     if fleet_file and not (policy or names_policy):
         raise UsageError("--fleet goes with a policy only", "", "Leave it out.")
