@@ -296,9 +296,12 @@ def _other_type_notes(evaluator: Evaluator, answer: Answer, kind: str | None) ->
     """Yield a note if the enclave may not call the service, but an action with this name."""
     question = answer.question
     if question.word == "call" and question.type == "service" and not kind and not answer.allowed:
-        action = ask("call", question.name, "action")
-        if evaluator.answer(action).allowed:
-            text = f"it may {action}: add --type action if {question.name} is an action."
+        as_action = evaluator.answer(ask("call", question.name, "action"))
+        if as_action.allowed or _allowed_parts(evaluator, as_action):
+            asked = as_action.question
+            does = asked if as_action.allowed else f"do a part of '{asked}'"
+            text = f"it may {does}: add --type action if {question.name} is an "
+            text += "action."
             yield Note("explain.an-action", text)
 
 

@@ -136,8 +136,11 @@ def callable_action(decider: Decider, question: Question) -> Note | None:
     """Return a note if enclaves may call an action that has the name of a service."""
     if (question.word, question.type) == ("call", "service"):
         action = ask("call", question.name, "action")
-        if any(outcome.allowed or outcome.in_part for outcome in decider.outcomes(action)):
-            text = f"enclaves may {action}: add --type action if it is an action."
+        outcomes = decider.outcomes(action)
+        whole = any(outcome.allowed for outcome in outcomes)
+        if whole or any(outcome.in_part for outcome in outcomes):
+            does = action if whole else f"do a part of '{action}'"
+            text = f"enclaves may {does}: add --type action if it is an action."
             return Note("explain.an-action", text)
     return None
 

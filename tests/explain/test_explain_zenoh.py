@@ -167,6 +167,16 @@ def test_who_may_command_an_action_without_calling_the_whole(made: Path, vendor:
     assert "in-part" not in explain(made / "client", "/talker", "call", "/go", *by).err
 
 
+def test_a_part_of_an_action_that_no_enclave_names_is_noted(tmp_path: Path) -> None:
+    policy = tmp_path / "p.xml"
+    policy.write_text(
+        policy_text({"/ui": '<services request="ALLOW"><service>/go/*</service></services>'})
+    )
+    for words in (("--who", "call", "/go"), ("/ui", "call", "/go")):
+        asked = explain(policy, *words)
+        assert asked.status == 1 and "may do a part of 'call action /go': add --type" in asked.err
+
+
 def test_who_may_says_what_each_enclave_is_told(made: Path) -> None:
     """What the router drops is decided without the enclave's own files, with the same answer."""
     evaluator = ZenohEvaluator(Keystore(made / "client"), moment=now(), domain=0)
