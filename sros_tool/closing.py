@@ -1528,12 +1528,10 @@ class OpenRobot:
 
     # ── the proof ───────────────────────────────────────────────────────────────────────────
 
-    def prove(self, *, dry_run: bool) -> Closing:
+    def prove(self) -> Closing:
         """Prove that the robot is closed."""
         self._check_shell()
-        closing = self._closing()._replace(dry_run=dry_run)
-        if dry_run:
-            return closing
+        closing = self._closing()
         proofs = self._proofs(closing, _START_SECONDS)
         fails = any(proof.fails for proof in proofs)
         if not fails and self.policy.exists() and (changed := self._enclaves_changed()):

@@ -131,6 +131,8 @@ def close(
         raise UsageError("--apply, --proof and --undo exclude each other", "", "Choose one.")
     if duration and (apply or prove or undo):
         raise UsageError("--for is for watching an open robot", "", "Leave it out.")
+    if prove and dry_run:
+        raise UsageError("--proof changes nothing", "", "Leave --dry-run out.")
     if elsewhere and (prove or undo):
         raise UsageError(
             "--elsewhere changes the export",
@@ -154,7 +156,7 @@ def close(
     if undo:
         closed = robot.undo(dry_run=dry_run)
     elif prove:
-        closed = robot.prove(dry_run=dry_run)
+        closed = robot.prove()
     else:
         closed = robot.prepare(duration, partial=partial, dry_run=dry_run)
         if apply and not closed.problems:

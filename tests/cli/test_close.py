@@ -904,6 +904,7 @@ def test_processes_of_another_user_need_the_files(
     [
         ("--apply --undo", "exclude each other"),
         ("--apply --for 1s", "--for is for watching"),
+        ("--proof --dry-run", "--proof changes nothing. Leave --dry-run out."),
         ("--apply", "there is no folder 'robot' here. This is '/"),
         ("--proof", "there is no folder 'robot' here. This is '/"),
         ("--undo", "there is no folder 'robot' here. This is '/"),
