@@ -221,4 +221,5 @@ def test_what_robots_confirm(three: Fleet) -> None:
     for path in own.keys() & others.keys():  # processes come and go
         assert others[path] in (own[path], ""), "a wheel's version is only in its metadata"
     assert kept.pop("restart") == [], "which sros does not know"
+    assert by_sros.pop("problems") == [], "which the play tells by failing"
     assert by_sros == kept
