@@ -44,6 +44,8 @@ from sros_tool.keystore.layout import (
     LEDGER,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
+    ROUTER_FILE,
+    SESSION_FILE,
     enclave_path,
     search_enclaves,
 )
@@ -59,6 +61,8 @@ from sros_tool.runtime.environment import (
     OVERRIDE,
     ROUTER_URI,
     SESSION_URI,
+    override_pairs,
+    zenoh_environment,
 )
 from sros_tool.runtime.processes import Process, ProcessEnclave, RunningProcesses, plain
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW, vendor_of
@@ -66,6 +70,8 @@ from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRAT
 from sros_tool.validity import Window, iso, parse_iso
 from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
+from sros_tool.zenoh.document import ZenohEndpoint
+from sros_tool.zenoh.json5 import Json5Error, parse_json5
 
 PROCESS_OUTDATED = FindingKind(
     "runtime.process-outdated",
@@ -502,6 +508,15 @@ ZENOH_UNREAD = FindingKind(
     "Write the configuration as JSON5 objects, or start the process with the configuration of its "
     f"enclave. {OWN_CONFIGURATION}",
 )
+ZENOH_CHANGED = FindingKind(
+    "runtime.zenoh-process-changed",
+    WARNING,
+    "a Zenoh process with other settings than sros sets for its enclave",
+    "Zenoh reads the file that a variable names, and then applies ZENOH_CONFIG_OVERRIDE. So both "
+    "can let strangers in, whatever the files of the enclave say.",
+    "rmw_zenoh_cpp (zenoh_config.cpp); Zenoh 1.10.2, tested.",
+    f"Find out what sets them, remove it there, and restart the process. {OWN_CONFIGURATION}",
+)
 PROCESS_ELSEWHERE = FindingKind(
     "runtime.process-elsewhere",
     NOTE,
@@ -560,7 +575,9 @@ def _security_of(process: Process) -> Security:
         if process.configuration and process.configuration.problem:
             return Security.UNKNOWN
         try:
-            return Security.OPEN if _zenoh_opening(process) else Security.SECURED
+            if _zenoh_opening(process):
+                return Security.OPEN
+            return Security.UNKNOWN if [*_zenoh_changes(process)] else Security.SECURED
         except SrosError:
             return Security.UNKNOWN
     if not process.asks_for_security:
@@ -682,6 +699,63 @@ def _zenoh_opening(process: Process) -> str:
     )
 
 
+_MOST_KEYS = 5
+_HARMLESS_OVERRIDES = (
+    *("connect/timeout_ms", "connect/exit_on_failure", "connect/retry", "open", "timestamping"),
+    *("queries_default_timeout", "qos", "stats", "transport/link/rx", "transport/link/tx"),
+    *("transport/unicast/open_timeout", "transport/unicast/accept_timeout"),
+    *("transport/unicast/accept_pending", "transport/unicast/max_sessions"),
+)
+"""Settings of Zenoh, with those below them, that do not decide whom a process hears."""
+
+
+def _zenoh_changes(process: Process) -> Iterator[str]:
+    """Yield, as clauses, the settings of a Zenoh process that sros does not set for its enclave.
+
+    Settings that are known to be harmless are left out, and paths where the enclave is not known.
+
+    Raises:
+        SrosError: the enclave is in a place that cannot be given to Zenoh.
+    """
+    enclave, environment = process.enclave, process.environment
+    folder = enclave_path(Path(enclave.keystore), enclave.name) if enclave else Path("/")
+    files = (folder / name for name in (IDENTITY_CA_FILE, CERTIFICATE_FILE, KEY_FILE))
+    own = dict(override_pairs(zenoh_environment({}, *files)[OVERRIDE]))
+    overrides = {
+        "/".join(filter(None, key.split("/"))): value
+        for key, value in override_pairs(environment.get(OVERRIDE, ""))
+    }
+    if enclave:
+        variable = ROUTER_URI if process.is_router else SESSION_URI
+        path = folder / (ROUTER_FILE if process.is_router else SESSION_FILE)
+        uri = environment.get(variable, "")
+        if uri not in ("", NO_CONFIGURATION, str(path)):
+            yield f"{variable} names '{_plain_path(uri)}', not '{_plain_path(str(path))}'"
+    else:
+        own = {key: overrides.get(key, "") for key in own}
+    others = [
+        _plain_path(key)
+        for key, value in overrides.items()
+        if own.get(key) != value and not _is_harmless_override(key, value)
+    ]
+    if others:
+        yield f"{OVERRIDE} sets {first_few(others, _MOST_KEYS)}"
+
+
+def _is_harmless_override(key: str, value: str) -> bool:
+    """Return whether a setting leaves a process of rmw_zenoh as closed as its enclave's files."""
+    if key == "connect/endpoints":
+        with suppress(Json5Error):
+            endpoints = parse_json5(value)
+            return isinstance(endpoints, list) and all(
+                isinstance(text, str)
+                and ZenohEndpoint(text).is_encrypted()
+                and not ZenohEndpoint(text).options
+                for text in endpoints
+            )
+    return any(f"{key}/".startswith(f"{name}/") for name in _HARMLESS_OVERRIDES)
+
+
 def _zenoh_findings(process: Process) -> Iterator[Finding]:
     if not process.is_zenoh:
         return
@@ -698,11 +772,14 @@ def _zenoh_findings(process: Process) -> Iterator[Finding]:
         return
     try:
         why = _zenoh_opening(process)
+        changes = "; ".join(_zenoh_changes(process))
     except SrosError as error:
         yield ZENOH_UNREAD.found(process.label, _plain_path(str(error)))
         return
     if why and process.asks_for_security:
         yield PROCESS_OPEN.found(process.label, why)
+    elif changes and not why:
+        yield ZENOH_CHANGED.found(process.label, changes)
     elif (
         configuration
         and configuration.changed

@@ -47,6 +47,12 @@ PATHS = (
     ),
 )
 
+FILES = {
+    "ca_certificate": "identity_ca.cert.pem",
+    "private_key": "key.pem",
+    "certificate": "cert.pem",
+}
+
 
 def sound_state(bench: Bench) -> RuntimeState:
     """A host on which everything is as `sros env` sets it, with a node and the daemon running."""
@@ -197,12 +203,12 @@ def _without_ca_keys(state: RuntimeState, bench: Bench) -> RuntimeState:
 
 
 def on_zenoh(text: str | None = None, **variables: str | None) -> Change:
-    """Everything on rmw_zenoh_cpp, with a session file as sros writes it, or one with a text."""
+    """Everything on rmw_zenoh_cpp, with an unsigned session file as sros writes it, or a text."""
 
     def change(state: RuntimeState, bench: Bench) -> RuntimeState:
-        file = bench.root.parent / "session.json5"
+        file = _of(state, "session.json5")
         file.write_text(json.dumps(zenoh_cases.sound()) if text is None else text)
-        paths = {name: f"/{name}.pem" for name in PATHS}
+        paths = {name: _of(state, FILES[name.partition("_")[2]]) for name in PATHS}
         stated = {
             RMW: "rmw_zenoh_cpp",
             SESSION: str(file),
@@ -278,6 +284,7 @@ CASES: dict[str, Change] = {
         **{OVERRIDE: 'connect/endpoints=["tls/a:1"];access_control/enabled=false'}
     ),
     "runtime.zenoh-no-certificate": on_zenoh(**{OVERRIDE: None}),
+    "runtime.zenoh-process-changed": on_zenoh(**{OVERRIDE: 'mode="peer"'}),
     "runtime.zenoh-process-open": on_zenoh(**{OVERRIDE: "/access_control/enabled=false"}),
     "runtime.mixed-vendors": running(0, **{RMW: "rmw_cyclonedds_cpp"}),
     "runtime.known-vulnerabilities": on_fast_dds("/opt/ros/jazzy/lib", "2.14.5"),

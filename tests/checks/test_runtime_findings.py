@@ -33,6 +33,7 @@ from tests.checks.runtime_cases import (
     SESSION,
     SOUND,
     STRATEGY,
+    TLS,
     changed,
     having,
     on_zenoh,
@@ -128,9 +129,40 @@ def test_found(expected: str, sound_one: RuntimeState, bench: Bench) -> None:
 
 
 def test_nothing_on_zenoh_with_a_session_file(sound_one: RuntimeState, bench: Bench) -> None:
-    assert ids(on_zenoh()(sound_one, bench)) == set()
-    other_router = {OVERRIDE: 'connect/endpoints=["tls/robot:7447"]'}
-    assert "runtime.zenoh-overridden" not in ids(on_zenoh(**other_router)(sound_one, bench))
+    assert ids(on_zenoh()(sound_one, bench)) == {"zenoh.unsigned"}
+    other_router = {OVERRIDE: 'connect/endpoints=["tls/robot:7447"];transport/link/tx/lease=9'}
+    found = ids(on_zenoh(**other_router)(sound_one, bench))
+    assert not found & {"runtime.zenoh-overridden", "runtime.zenoh-process-changed"}
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "said"),
+    [
+        (
+            OVERRIDE,
+            'access_control/default_permission="allow";listen/endpoints=["tcp/127.0.0.1:7449"];'
+            'transport/link/protocols=["tcp","tls"];//mode="peer";connect/timeout_ms=-1',
+            f"{OVERRIDE} sets access_control/default_permission, listen/endpoints, "
+            "transport/link/protocols, mode",
+        ),
+        (OVERRIDE, f'{TLS}/root_ca_certificate="/x"', f"{OVERRIDE} sets {TLS}/root_ca_certificate"),
+        (OVERRIDE, 'connect/endpoints=["tcp/a:1"]', f"{OVERRIDE} sets connect/endpoints"),
+        (OVERRIDE, 'connect/endpoints={client:["tcp/a:1"]}', f"{OVERRIDE} sets connect/endpoints"),
+        (SESSION, "{}/of/another.json5", f"{SESSION} names '{{}}/of/another.json5', not '"),
+    ],
+)
+def test_a_zenoh_process_with_other_settings_than_those_of_its_enclave_is_named(
+    sound_one: RuntimeState, bench: Bench, variable: str, value: str, said: str
+) -> None:
+    place = bench.root.parent
+    (place / "of").mkdir()
+    (place / "of/another.json5").write_text(json.dumps(zenoh_cases.sound()))
+    changed = running(0, **{variable: value.replace("{}", str(place))})
+    state = seen(changed(on_zenoh()(sound_one, bench), bench))
+    (found,) = (
+        each for each in runtime_findings(state) if each.id == "runtime.zenoh-process-changed"
+    )
+    assert said.replace("{}", str(place)) in found.text and "timeout" not in found.text
 
 
 def test_a_session_file_that_changed_since_the_start(sound_one: RuntimeState, bench: Bench) -> None:
