@@ -20,7 +20,7 @@ def checking(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Figur
     from sros_tool.checks.kind import WARNING
     from sros_tool.checks.policies import policy_file_findings
     from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.template import load_template
     from sros_tool.policy.document import read_policy
 
@@ -32,11 +32,11 @@ def checking(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Figur
     generate_artifacts(root, policies=[policy], now=now)
 
     def keystore() -> None:
-        found = keystore_findings(Keystore(root), now=now)
+        found = keystore_findings(OpenedKeystore(root), now=now)
         assert not [each for each in found if each.severity >= WARNING]
 
     def with_policy() -> None:
-        found = keystore_findings(Keystore(root), now=now, policies=(policy,))
+        found = keystore_findings(OpenedKeystore(root), now=now, policies=(policy,))
         assert not [each for each in found if each.severity >= WARNING]
 
     measured = (

@@ -29,7 +29,7 @@ def explaining(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Fig
     from sros_tool.explain.vendors import VendorOfKeystore
     from sros_tool.keystore.issuing.proof import prove
     from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.rights import load_rights
     from sros_tool.keystore.template import load_template
     from sros_tool.policy.document import read_policy
@@ -52,7 +52,7 @@ def explaining(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Fig
     ]
 
     def ask_all() -> None:
-        asked = VendorOfKeystore(Keystore(root), Vendor.FAST, "", AskingContext(now, UTC, 0))
+        asked = VendorOfKeystore(OpenedKeystore(root), Vendor.FAST, "", AskingContext(now, UTC, 0))
         outcomes = asked.outcomes(ask("publish", "/robot7/topic_0"))
         assert [each.enclave for each in outcomes if each.allowed] == ["/robot7/part"]
 

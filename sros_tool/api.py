@@ -445,7 +445,7 @@ def fleet_status(
         ['r8']
     """
     from sros_tool.keystore import fleet_status as status
-    from sros_tool.keystore.reader import Keystore as OpenedKeystore
+    from sros_tool.keystore.reader import OpenedKeystore
 
     fleet = status.fleet_status(OpenedKeystore(Path(keystore)), tuple(_no_string("robots", robots)))
     return fleet.with_overdue(_time_or_now(now), max_age)
@@ -606,7 +606,7 @@ def _enclave_to_ask(
         planned_enclave,
         signed_enclave,
     )
-    from sros_tool.keystore.reader import Keystore as OpenedOnce
+    from sros_tool.keystore.reader import OpenedKeystore
 
     if not isinstance(keystore, str | PathLike) or is_policy(Path(keystore)):
         if policy is not None:
@@ -618,7 +618,7 @@ def _enclave_to_ask(
         return AskedEnclave(
             planned_enclave(stated_enclave, None, asking)._replace(policy=stated_enclave), alone
         )
-    opened = OpenedOnce(Path(keystore))
+    opened = OpenedKeystore(Path(keystore))
     opened.check()
     signed = signed_enclave(opened, name, asking.at)
     assert signed

@@ -59,7 +59,7 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.participant import JoinContext
-from sros_tool.keystore.reader import FilesReadOnce, Keystore, open_enclave
+from sros_tool.keystore.reader import FilesReadOnce, OpenedKeystore, open_enclave
 from sros_tool.keystore.selection import revocation_of
 from sros_tool.keystore.template import load_template
 from sros_tool.names import expand, is_expression
@@ -1282,7 +1282,7 @@ class OpenRobot:
 
     def _remove_enclaves(self) -> list[FileChange]:
         """Remove from the export enclaves that the keystore revoked, or of other machines."""
-        keystore = Keystore(self.keystore)
+        keystore = OpenedKeystore(self.keystore)
         left = [name for name in self._enclaves_left() if revocation_of(keystore, name)]
         removed = dict.fromkeys(left, "its enclave was revoked")
         for name in self._not_here.intersection(list_enclaves(self.export)):

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.dds.domains import DomainSet
     from sros_tool.keystore.participant import JoinContext
-    from sros_tool.keystore.reader import Keystore, OpenedEnclave
+    from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore
     from sros_tool.keystore.zenoh_files import OpenedZenoh
     from sros_tool.pki.token import TokenUri
     from sros_tool.zenoh.configuration import Configuration
@@ -93,7 +93,7 @@ def loadable_environment(
         has_enclave,
     )
     from sros_tool.keystore.participant import JoinContext
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.selection import missing_enclave_error
     from sros_tool.names import check_enclave_name
     from sros_tool.pki.token import MODULE_VARIABLE
@@ -120,7 +120,7 @@ def loadable_environment(
     if with_zenoh and not target:
         _check_release(environment)
     check_enclave_name(name)
-    keystore = Keystore(root)
+    keystore = OpenedKeystore(root)
     keystore.check()
     if not has_enclave(root, name):
         raise missing_enclave_error(keystore, name, keystore.names)
@@ -238,7 +238,9 @@ def _check_joining(
     )
 
 
-def _check_dates_here(name: str, keystore: Keystore, vendor: Vendor, context: JoinContext) -> None:
+def _check_dates_here(
+    name: str, keystore: OpenedKeystore, vendor: Vendor, context: JoinContext
+) -> None:
     """Raise `KeystoreError` if the local time zone makes DDS see valid permissions as expired.
 
     Fast DDS reads their dates, which are in UTC, as local time.
@@ -343,7 +345,7 @@ def _check_release(environment: Mapping[str, str]) -> None:
 
 
 def _opened_zenoh(
-    keystore: Keystore, name: str, state: OpenedEnclave, now: datetime
+    keystore: OpenedKeystore, name: str, state: OpenedEnclave, now: datetime
 ) -> OpenedZenoh:
     """Return the Zenoh configurations of an enclave.
 
@@ -375,7 +377,7 @@ def _opened_zenoh(
     )
 
 
-def _refuse_outdated(keystore: Keystore, name: str, now: datetime) -> None:
+def _refuse_outdated(keystore: OpenedKeystore, name: str, now: datetime) -> None:
     """Raise `KeystoreError` if the enclave's Zenoh file lacks current rights of other enclaves.
 
     A router, and a session in mode peer, enforces the rights of other enclaves: an outdated file,
@@ -772,7 +774,7 @@ def other_node_notes(
     the ledger lacks the permissions, sros knows only nodes that offer their standard services: then
     it returns a note only if the permissions have the name in another namespace.
     """
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.rights import RecordedRights
     from sros_tool.names import is_expression
     from sros_tool.policy.patterns import overlap
@@ -784,7 +786,7 @@ def other_node_notes(
     of_one_node = any(":__ns:=" in word or ":__node:=" in word for word in command)
     if of_one_node or not (ns or name or starts_nodes(command)):
         return ()
-    keystore = Keystore(root)
+    keystore = OpenedKeystore(root)
     state = keystore.enclave(enclave, now=now)
     grant = state.permissions.grant_of(state.subject) if state.permissions else None
     if grant is None or grant.default_allow:

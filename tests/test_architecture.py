@@ -587,9 +587,7 @@ def meanings(modules: Modules) -> dict[str, list[str]]:
 
 
 def test_a_class_name_has_one_meaning() -> None:
-    """To other programs a keystore is its folder, inside what was read of it."""
-    outside = {"Keystore": ["sros_tool.api", "sros_tool.keystore.reader"]}
-    assert meanings(modules_of("sros_tool")) == outside
+    assert meanings(modules_of("sros_tool")) == {}
 
 
 def test_a_class_name_with_two_meanings_is_seen() -> None:

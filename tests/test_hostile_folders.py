@@ -40,7 +40,7 @@ from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
-from sros_tool.keystore.reader import Keystore, open_enclave
+from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import transaction as locking
 from sros_tool.keystore.transaction.stage import staged_name
@@ -199,7 +199,7 @@ def test_no_verb_is_recommended_over_a_made_up_stage(
     name: str, keystore: Path, outside: Path
 ) -> None:
     MADE_UP[name](stage(keystore), outside)
-    found = keystore_findings(Keystore(keystore), now=NOW)
+    found = keystore_findings(OpenedKeystore(keystore), now=NOW)
     (of_stage,) = [each for each in found if Path(each.file).name == STAGE]
     assert of_stage.kind.id == "keystore.transaction-not-ours"
     assert "create_enclave" not in of_stage.kind.remedy
@@ -804,7 +804,7 @@ def test_the_name_of_a_file_becomes_no_command_in_a_remedy(keystore: Path) -> No
         (odd / "enclaves/a" / name).write_bytes(damage)
     (odd / "public/identity_ca.cert.pem").unlink()
     found_there = [
-        *keystore_findings(Keystore(odd), now=NOW),
+        *keystore_findings(OpenedKeystore(odd), now=NOW),
         *verify_arrival(odd, now=NOW).findings,
     ]
     commands = [each for found in found_there for each in re.findall("`(.+?)`", found.remedy)]
@@ -820,7 +820,7 @@ def test_a_file_of_the_kernel_is_not_read(keystore: Path) -> None:
     certificate = keystore / "enclaves/a/cert.pem"
     certificate.unlink()
     certificate.symlink_to("/proc/kmsg")
-    found = {each.kind.id for each in keystore_findings(Keystore(keystore), now=NOW)}
+    found = {each.kind.id for each in keystore_findings(OpenedKeystore(keystore), now=NOW)}
     assert {"enclave.file-empty", "enclave.file-unreadable"} & found
 
 

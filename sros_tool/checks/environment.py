@@ -30,7 +30,7 @@ from sros_tool.keystore.layout import (
     refuse_earlier,
     search_enclaves,
 )
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
 from sros_tool.runtime.environment import (
     NO_CONFIGURATION,
@@ -300,7 +300,7 @@ def _enclave_findings(
         effect = "" if enforced else f"; nodes RUN UNSECURED, as {STRATEGY} is not 'Enforce'"
         yield ENCLAVE_NOT_FOUND.found(ENCLAVE, f"'{root}' has no enclave {name}{hint}{effect}")
         return
-    keystore = Keystore(root)
+    keystore = OpenedKeystore(root)
     sourced = environment.get(ROS_DISTRO, "")
     stated: tuple[str, ...] = ()
     with suppress(SrosError):  # what cannot be read is a finding of the keystore

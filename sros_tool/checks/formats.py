@@ -29,7 +29,7 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_CA_FILE,
     ROLES,
 )
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.markdown import bounded_list, code, plain
 from sros_tool.pki.certificates import validity_of
 from sros_tool.pki.crl import load_crl
@@ -292,7 +292,11 @@ class Expiry:
 
 
 def keystore_metrics(
-    keystore: Keystore, findings: Iterable[Finding], *, now: datetime, each_enclave: bool = True
+    keystore: OpenedKeystore,
+    findings: Iterable[Finding],
+    *,
+    now: datetime,
+    each_enclave: bool = True,
 ) -> tuple[Metric, ...]:
     """Return the metrics of a keystore, or of an export for a robot.
 
@@ -369,7 +373,7 @@ def keystore_metrics(
     )
 
 
-def _shared_expiries(keystore: Keystore) -> Iterator[Expiry]:
+def _shared_expiries(keystore: OpenedKeystore) -> Iterator[Expiry]:
     """Yield the expiry of the files that all enclaves share; unreadable files are left out."""
     for role in ROLES:
         with suppress(SrosError):
@@ -386,7 +390,7 @@ def _shared_expiries(keystore: Keystore) -> Iterator[Expiry]:
             yield Expiry("crl", "", crl.next_update)
 
 
-def _enclave_expiries(keystore: Keystore, lifetimes: Iterable[Lifetime]) -> Iterator[Expiry]:
+def _enclave_expiries(keystore: OpenedKeystore, lifetimes: Iterable[Lifetime]) -> Iterator[Expiry]:
     for lifetime in lifetimes:
         yield Expiry("certificate", lifetime.name, lifetime.certificate.not_after)
         yield Expiry("permissions", lifetime.name, lifetime.permissions.not_after)
@@ -394,7 +398,7 @@ def _enclave_expiries(keystore: Keystore, lifetimes: Iterable[Lifetime]) -> Iter
             yield from _exported(keystore, lifetime.name)
 
 
-def _exported(keystore: Keystore, name: str) -> Iterator[Expiry]:
+def _exported(keystore: OpenedKeystore, name: str) -> Iterator[Expiry]:
     """Yield the expiry of an exported enclave's copies of the shared files."""
     folder = keystore.folder(name)
     for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE):

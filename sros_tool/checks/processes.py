@@ -50,7 +50,7 @@ from sros_tool.keystore.layout import (
     search_enclaves,
 )
 from sros_tool.keystore.ledger import Entry
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificates, subject_text, validity_of
@@ -327,7 +327,7 @@ def _entries(enclave: ProcessEnclave) -> tuple[Sequence[Entry], str]:
     if size > _MOST_LEDGER:
         return (), f"the ledger of its keystore has more than {_MOST_LEDGER // 1024**2} MiB"
     try:
-        entries = Keystore(enclave.here).ledger_with("enclave", enclave.name).entries
+        entries = OpenedKeystore(enclave.here).ledger_with("enclave", enclave.name).entries
     except SrosError as error:
         return (), f"the ledger of its keystore cannot be read: {error.what}"
     return [entry for entry in entries if entry.enclave == enclave.name], ""

@@ -22,7 +22,7 @@ from sros_tool.keystore.layout import (
     locate_enclave,
     refuse_earlier,
 )
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.policy.model import Policy
 from sros_tool.xml import read_bytes
 
@@ -50,11 +50,11 @@ class Circumstances:
     fleet: Fleet | None = None
     advisories: tuple[Advisory, ...] | None = None
     sample: Sequence[str] | None = None
-    opened: dict[Path, Keystore] = field(default_factory=dict, repr=False, compare=False)
+    opened: dict[Path, OpenedKeystore] = field(default_factory=dict, repr=False, compare=False)
 
-    def keystore(self, root: Path) -> Keystore:
+    def keystore(self, root: Path) -> OpenedKeystore:
         """Return the keystore at a path; opened once and used for all checks of it."""
-        return self.opened.setdefault(root, Keystore(root))
+        return self.opened.setdefault(root, OpenedKeystore(root))
 
 
 def path_findings(paths: Iterable[Path], circumstances: Circumstances) -> list[Finding]:
@@ -81,7 +81,7 @@ def path_findings(paths: Iterable[Path], circumstances: Circumstances) -> list[F
 
 def findings_between_folders(paths: Iterable[Path], circumstances: Circumstances) -> list[Finding]:
     """Return findings about folders among the paths whose nodes do not communicate."""
-    targets: dict[str, tuple[Keystore, Sequence[str]]] = {}
+    targets: dict[str, tuple[OpenedKeystore, Sequence[str]]] = {}
     for path in filter(Path.is_dir, paths):
         if is_keystore(path):
             keystore = circumstances.keystore(path)

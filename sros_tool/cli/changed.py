@@ -137,11 +137,11 @@ def _change_lines(root: Path, paths: Sequence[str]) -> Iterator[str]:
     """Yield the paths of files; paths that differ only in the robot of a fleet share a line."""
     from sros_tool.fleet.robots import folded
     from sros_tool.keystore.fleet import load_fleet
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
 
     fleet = None
     with suppress(SrosError):  # in a new keystore, and in an export, there is none
-        fleet = load_fleet(Keystore(root))
+        fleet = load_fleet(OpenedKeystore(root))
     lines = ((f"/{path.partition('/')[2].rpartition('/')[0]}", path) for path in paths)
     yield from folded(fleet, lines)
 
@@ -174,9 +174,9 @@ def rights_lines(
     """Yield a line for each lost or gained right; the robots of a fleet share a line."""
     from sros_tool.fleet.robots import folded
     from sros_tool.keystore.fleet import load_fleet
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
 
-    fleet = load_fleet(Keystore(root)) if replaced_rights else None
+    fleet = load_fleet(OpenedKeystore(root)) if replaced_rights else None
     together: dict[tuple[str, str], list[str]] = {}
     for rights in replaced_rights:
         for verb, text in (("lose", rights.lost_text(fleet)), ("gain", rights.gained_text(fleet))):

@@ -508,10 +508,10 @@ def _circumstances(
         fleet = read_fleet(fleet_file)
     elif policies and len(paths) == 1 and is_keystore(paths[0]):
         from sros_tool.keystore.fleet import load_fleet
-        from sros_tool.keystore.reader import Keystore
+        from sros_tool.keystore.reader import OpenedKeystore
 
         with suppress(SrosError):  # what is wrong with it is a finding
-            fleet = load_fleet(Keystore(paths[0]))
+            fleet = load_fleet(OpenedKeystore(paths[0]))
     for policy in policies:
         from sros_tool.fleet.expansion import FleetPolicy
         from sros_tool.policy.document import read_policy
@@ -672,10 +672,10 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
         expiring_enclaves,
         parse_threshold,
     )
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
 
     threshold = parse_threshold(text)
-    keystore = Keystore(root)
+    keystore = OpenedKeystore(root)
     expiring = due_enclaves(keystore, threshold, moment, keystore.template)
     if form == "json":
         print_json(expiring_enclaves(expiring))
@@ -1005,7 +1005,7 @@ def metrics(
     """
     from sros_tool.checks.formats import keystore_metrics
     from sros_tool.checks.keystores.keystore import keystore_findings
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.prometheus import KeystoreMetrics, render_metrics
 
     moment = now()
@@ -1019,7 +1019,7 @@ def metrics(
     known = advisories_of(advisories)
     wanted = tuple(policy_for(policy, fleet_file) for policy in policies)
     with progress("examining"):
-        keystore = Keystore(root)
+        keystore = OpenedKeystore(root)
         findings = keystore_findings(
             keystore, now=moment, zone=local_zone(os.environ), policies=wanted
         )

@@ -178,7 +178,7 @@ def close(
 def _show(robot: OpenRobot, closed: Closing) -> None:
     """Print on one screen who may do what, how processes are restarted, and what looks wrong."""
     from sros_tool.closing import access_lines
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.policy.document import read_policy
     from sros_tool.reach import unguarded
 
@@ -188,7 +188,7 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
     echo(f"who may do what, without what every node needs (all of it: {robot.page}):")
     for line in access_lines(policy, robot.folder):
         echo(f"  {line}")
-    for left_open in unguarded(Keystore(robot.keystore).governance):
+    for left_open in unguarded(OpenedKeystore(robot.keystore).governance):
         does = f"{left_open.direction} DDS topic {left_open.topic}"
         echo(f"  every enclave may {does}: the governance of the keystore leaves it open")
     echo(f"how to restart each process with security (all of it: {robot.start}):")

@@ -331,11 +331,16 @@ def chosen_enclaves(
     check_chosen(names, patterns, robots, all_enclaves=all_enclaves)
     if not (patterns or robots or all_enclaves):
         return tuple(names)  # the verb says what is wrong with a name
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.selection import select_enclaves
 
     return select_enclaves(
-        Keystore(root), names, patterns, robots=robots, all_enclaves=all_enclaves, checked=True
+        OpenedKeystore(root),
+        names,
+        patterns,
+        robots=robots,
+        all_enclaves=all_enclaves,
+        checked=True,
     )
 
 
@@ -476,14 +481,14 @@ def _completions(names: Iterable[str], incomplete: str) -> list[str]:
 def complete_robot(ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
     """Complete the robots of the given keystore's fleet."""
     from sros_tool.keystore.fleet import load_fleet
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
 
     words = ctx.params.get("arguments") or ctx.params.get("sources")
     words = words or (ctx.params.get("root") or ctx.params.get("folder"),)
     keystore = words[0] or os.environ.get(KEYSTORE_VARIABLE)
     fleet = None
     with suppress(SrosError):
-        fleet = load_fleet(Keystore(Path(keystore))) if keystore else None
+        fleet = load_fleet(OpenedKeystore(Path(keystore))) if keystore else None
     return _completions(fleet.robots if fleet else (), incomplete)
 
 

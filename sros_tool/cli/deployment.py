@@ -235,13 +235,13 @@ def verify(
     """
     from sros_tool.checks.keystores.arrival import verify_arrival
     from sros_tool.cli.common import echo_folded, local_zone
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.selection import select_enclaves
     from sros_tool.validity import iso
 
     wanted, moment = domain_of(domain), moment_of(at)
     chosen = patterns or robots
-    only = select_enclaves(Keystore(folder), (), patterns, robots=robots) if chosen else None
+    only = select_enclaves(OpenedKeystore(folder), (), patterns, robots=robots) if chosen else None
     zone = local_zone(os.environ)
     with progress("verifying"):
         arrival = verify_arrival(

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from sros_tool.explain.who import AnswerForAll, Decider, FollowedReach
     from sros_tool.explain.zenoh import CheckedLink, ZenohAnswer, ZenohExplanation
     from sros_tool.fleet.robots import Fleet
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.policy.model import Source
     from sros_tool.proof.requirements import Requirement
     from sros_tool.zenoh.delivery import Check
@@ -408,10 +408,10 @@ def _notes_on_past(moment: datetime, root: Path | None) -> Iterator[Note]:
         return
     changes = 0
     if root:
-        from sros_tool.keystore.reader import Keystore
+        from sros_tool.keystore.reader import OpenedKeystore
 
         with suppress(SrosError):
-            entries = Keystore(root).ledger.entries
+            entries = OpenedKeystore(root).ledger.entries
             changes = sum(entry.time > iso(moment) for entry in entries)
     text = "the current files decide for that time: they do not show what was allowed then"
     if changes:
@@ -452,7 +452,7 @@ def _note_unknown_distribution() -> None:
     print_notes(unknown_distribution(os.environ))
 
 
-def _stated_distribution(keystore: Keystore | None, enclave: str) -> Distribution | None:
+def _stated_distribution(keystore: OpenedKeystore | None, enclave: str) -> Distribution | None:
     """Return the only ROS 2 distribution that an enclave's fleet or keystore states, or None."""
     from sros_tool.distributions import find_distribution
     from sros_tool.keystore.fleet import stated_distributions
@@ -825,11 +825,11 @@ def _show_who(
     """
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.layout import is_original_keystore
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.selection import select_enclaves
 
     question = _question_to_all(other_arguments, kind)
-    keystore = Keystore(root or keystore_from_environment())
+    keystore = OpenedKeystore(root or keystore_from_environment())
     keystore.check()
     patterns, robots = only
     names = select_enclaves(keystore, (), patterns, robots=robots) if patterns or robots else None
@@ -1001,7 +1001,7 @@ def _show_reach(
     """
     from sros_tool.explain.asking import fleet_of
     from sros_tool.explain.who import follow_reach
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 
     policy, fleet_file = stated
@@ -1014,7 +1014,7 @@ def _show_reach(
             "--reach on Zenoh takes no --policy", "It uses the keystore's Zenoh files."
         )
     if zenoh:
-        source = load_zenoh_rights(Keystore(root or keystore_from_environment()))
+        source = load_zenoh_rights(OpenedKeystore(root or keystore_from_environment()))
     else:
         fleet = fleet_of(fleet_file, None)
         source = load_rights(root or policy or keystore_from_environment(), fleet)

@@ -100,12 +100,12 @@ def _inventory(root: Path, as_yaml: bool, as_list: bool) -> None:
     """
     from sros_tool.fleet.fleet_file import inventory, script_inventory
     from sros_tool.keystore.fleet import recorded_fleet
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.values import yaml_text
 
     if as_yaml and as_list:
         raise UsageError("--yaml and --list exclude each other", "", "Choose one.")
-    recorded = recorded_fleet(Keystore(root))
+    recorded = recorded_fleet(OpenedKeystore(root))
     value = script_inventory(recorded) if as_list else inventory(recorded)
     echo_document(yaml_text(value) if as_yaml else f"{json_text(value)}\n")
 
@@ -187,10 +187,10 @@ def _confirm(arguments: tuple[str, ...], robot: str, dry_run: bool, as_json: boo
     )
     from sros_tool.keystore.fleet import recorded_fleet
     from sros_tool.keystore.layout import confirmation_file
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
 
     root, file = root_and_file(arguments, "fleet confirm takes a keystore and one file")
-    recorded_fleet(Keystore(root)).robot(robot)
+    recorded_fleet(OpenedKeystore(root)).robot(robot)
     shown_file = "standard input" if str(file) == "-" else f"'{file}'"
     data = read_named(file, "confirmation", max_bytes=MAX_BYTES)
     received = receive(data, robot, shown_file, now=now())
@@ -600,7 +600,7 @@ def _status(
     """
     from sros_tool.checks.vulnerabilities import is_fixed_later, robot_findings
     from sros_tool.keystore.fleet_status import fleet_status
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.validity import parse_duration
 
     if as_json + prometheus + html > 1:
@@ -618,7 +618,7 @@ def _status(
         check_output(output, force=True)
     known = advisories_of(advisories)
     with progress("comparing"):
-        status = fleet_status(Keystore(root), robots)
+        status = fleet_status(OpenedKeystore(root), robots)
     status = status.with_overdue(moment, oldest)
     reported = {
         robot.robot: robot.dds

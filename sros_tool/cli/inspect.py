@@ -139,11 +139,11 @@ def inspect(
 def _enclave_of(root: Path, name: str) -> Path:
     """Return the folder of an enclave of a keystore."""
     from sros_tool.keystore.layout import check_keystore
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.selection import missing_enclave_error
 
     check_keystore(root)
-    keystore = Keystore(root)
+    keystore = OpenedKeystore(root)
     names = keystore.names
     if name not in names:
         raise missing_enclave_error(keystore, name, names)

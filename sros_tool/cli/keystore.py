@@ -382,20 +382,20 @@ def list_enclaves(
 
     check_keystore(root)
     if patterns or robots:
-        from sros_tool.keystore.reader import Keystore
+        from sros_tool.keystore.reader import OpenedKeystore
         from sros_tool.keystore.selection import select_enclaves
 
-        names = tuple(sorted(select_enclaves(Keystore(root), (), patterns, robots=robots)))
+        names = tuple(sorted(select_enclaves(OpenedKeystore(root), (), patterns, robots=robots)))
         hidden = hidden_enclaves(root)
     else:
         every = enclave_names(root, hidden=True)
         hidden = hidden_enclaves(root, every)
         names = tuple(name for name in every if "/." not in name)
     if as_json:
-        from sros_tool.keystore.reader import Keystore
+        from sros_tool.keystore.reader import OpenedKeystore
         from sros_tool.keystore.selection import EnclaveList, robots_of
 
-        print_json(EnclaveList(root, names, hidden, robots_of(Keystore(root), names)))
+        print_json(EnclaveList(root, names, hidden, robots_of(OpenedKeystore(root), names)))
         return
     for name in names:
         echo(name)
@@ -575,7 +575,7 @@ def _imported_cas(files: dict[str, Path | None]) -> dict[str, bytes]:
 def _new_keystore_lines(result: Creation, imported: frozenset[str] = frozenset()) -> Iterator[str]:
     """Yield the new keystore's domains, template, CAs, validity and CA fingerprints."""
     from sros_tool.keystore.layout import ROLES
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.pki.certificates import digest, validity_of
     from sros_tool.validity import iso, span_text
 
@@ -599,7 +599,7 @@ def _new_keystore_lines(result: Creation, imported: frozenset[str] = frozenset()
     # A robot's operator compares them with the CAs of an answer: see `sros import --ca`.
     for role in roles:
         name = f"{role} CA" if template.separate_authorities else "CA"
-        certificate = Keystore(root).ca_certificate(role)
+        certificate = OpenedKeystore(root).ca_certificate(role)
         yield f"  {name} SHA-256 {digest(certificate)}"
         if role in imported:
             yield f"    imported, valid until {iso(validity_of(certificate).not_after)}"
@@ -734,7 +734,7 @@ def update_keystore(
     from sros_tool.dds.domains import DomainSet
     from sros_tool.keystore.lifecycle.update import edited_settings
     from sros_tool.keystore.lifecycle.update import update_keystore as work
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.settings import present_settings
     from sros_tool.keystore.template import load_template, with_values
 
@@ -772,7 +772,7 @@ def update_keystore(
             "Copy sros.toml elsewhere, undo the edits with --discard-edits, and name the copy with "
             "--template.",
         )
-    present = present_settings(Keystore(root))
+    present = present_settings(OpenedKeystore(root))
     domains = None
     if template_name is not None:
         target = load_template(template_name)

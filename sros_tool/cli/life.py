@@ -223,13 +223,13 @@ def revoke(
       restart the processes of 2 enclaves for the change to take effect: ...
     """
     from sros_tool.keystore.lifecycle.revoke import revoke as work
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.selection import select_to_revoke
 
     root, given = split_root(arguments)
     check_chosen(given, patterns, robots, all_enclaves=all_enclaves)
     names, selection_notes = select_to_revoke(
-        Keystore(root), given, patterns, robots, all_enclaves=all_enclaves
+        OpenedKeystore(root), given, patterns, robots, all_enclaves=all_enclaves
     )
     words_of_rfc = reason.replace("-", "_").split("_")
     reason_text = words_of_rfc[0] + "".join(word.capitalize() for word in words_of_rfc[1:])
@@ -285,7 +285,7 @@ def crl(
 
     from sros_tool.keystore.layout import PUBLIC, list_enclaves
     from sros_tool.keystore.lifecycle.revoke import refresh_crl
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
 
     list_enclaves(root)
     result = None
@@ -304,7 +304,7 @@ def crl(
             print_plan(root, result.changes)
             return 0
         print_follow_up(result, restart=not dry_run)
-    keystore = Keystore(root)
+    keystore = OpenedKeystore(root)
     lists = keystore.revocation_lists
     if not (lists or (root / PUBLIC).is_dir()):
         raise UsageError(
@@ -342,7 +342,7 @@ def _read_given_list(path: Path | None) -> bytes:
     return read_bytes(path, "revocation list") if path else b""
 
 
-def _names(keystore: Keystore, lists: Sequence[RevocationList]) -> dict[str, str]:
+def _names(keystore: OpenedKeystore, lists: Sequence[RevocationList]) -> dict[str, str]:
     """Map the serial numbers in ``lists`` to their enclaves, as the ledger has them."""
     serials = {f"{entry.serial:x}" for crl in lists for entry in crl.revoked}
     ledger = keystore.ledger_file.with_values("serial", serials)
@@ -370,7 +370,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.issuing.keyring import Keyring
     from sros_tool.keystore.lifecycle.rotate import RotationStep
     from sros_tool.keystore.lifecycle.rotation import RotationStatus
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
 
 _DONE = {
     "distribute": "distributed the new CA next to the old one",
@@ -586,9 +586,9 @@ def _unconfirmed_robots(root: Path) -> tuple[str, ...] | str:
     """Return the robots that have not confirmed the stage of a rotation, or why that is unknown."""
     from sros_tool.keystore.lifecycle.rotate import robots_cut_off
     from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
 
-    keystore = Keystore(root)
+    keystore = OpenedKeystore(root)
     rotation = read_rotation(keystore)
     if rotation.stage is RotationStage.NONE:
         return ()

@@ -177,13 +177,13 @@ def _enclaves_by_identity(environment: Mapping[str, str]) -> dict[str, str]:
     """Return the enclaves by the identities of their participants, if the observer is secured."""
     from sros_tool.keystore.known_keys import enclaves_by_identity
     from sros_tool.keystore.layout import is_keystore
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.runtime.variables import ENABLE, KEYSTORE
 
     root = Path(environment.get(KEYSTORE, ""))
     if environment.get(ENABLE) != "true" or not is_keystore(root):
         return {}
-    return enclaves_by_identity(Keystore(root))
+    return enclaves_by_identity(OpenedKeystore(root))
 
 
 def _watch(

@@ -153,7 +153,7 @@ def zenoh(
     """
     from sros_tool.keystore.layout import ZENOH_FILES, check_keystore
     from sros_tool.keystore.lifecycle.update import set_zenoh
-    from sros_tool.keystore.reader import Keystore, read_consistently
+    from sros_tool.keystore.reader import OpenedKeystore, read_consistently
 
     if existing:
         _refuse_with_from(
@@ -166,7 +166,7 @@ def zenoh(
         raise UsageError("--output and --force are for --from only", "", "Leave them out.")
     root = root or keystore_from_environment()
     check_keystore(root)
-    settings = Keystore(root).template
+    settings = OpenedKeystore(root).template
     chosen = {
         "router": ",".join(name for name in routers if "=" not in name),
         "endpoints": ",".join(endpoints),

@@ -59,7 +59,7 @@ from sros_tool.keystore.layout import (
     ca_key,
     enclave_path,
 )
-from sros_tool.keystore.reader import Keystore, OpenedEnclave, open_keystore
+from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, open_keystore
 from sros_tool.keystore.template import Template
 from sros_tool.names import ACTION_SEPARATOR, NODE_SERVICES, dds_names, service_of
 from sros_tool.pki import smime
@@ -277,7 +277,7 @@ class _Enclaves(NamedTuple):
         return ""
 
 
-def _read_enclaves(keystore: Keystore, now: datetime, domain: int) -> _Enclaves:
+def _read_enclaves(keystore: OpenedKeystore, now: datetime, domain: int) -> _Enclaves:
     """Read the files of all enclaves; ``domain`` is the domain in which the enclaves meet."""
     rights: dict[str, Grant] = {}
     faulty: dict[str, str] = {}
@@ -328,7 +328,7 @@ def _read_enclaves(keystore: Keystore, now: datetime, domain: int) -> _Enclaves:
     )
 
 
-def _revoked_serials(keystore: Keystore) -> frozenset[int]:
+def _revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
     """Return the serial numbers that the ledger or the CRL lists as revoked."""
     entries = (entry for entry in keystore.ledger.entries if entry.what == "revocation")
     listed = keystore.revocation_list.revoked if keystore.revocation_list else ()
@@ -343,7 +343,7 @@ def _content(path: Path) -> bytes:
         return b""
 
 
-def _strange_authority(keystore: Keystore, state: OpenedEnclave) -> str:
+def _strange_authority(keystore: OpenedKeystore, state: OpenedEnclave) -> str:
     """Return the name of an enclave's CA file whose CA is none of the keystore's, or ""."""
     for file, role in ((IDENTITY_CA_FILE, IDENTITY), (PERMISSIONS_CA_FILE, PERMISSIONS)):
         known = {digest(certificate) for certificate in keystore.authority(role)}

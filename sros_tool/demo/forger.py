@@ -51,7 +51,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import EVERYTHING, Template
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate, pem, validity_of
@@ -115,7 +115,7 @@ class KeystoreCopy:
         """
         keyring = IN_KEYSTORE if root else self.keyring
         root = root or self.root
-        keystore = Keystore(root)
+        keystore = OpenedKeystore(root)
         return load_authorities(keystore, keystore.template, keyring, self.now)
 
     def put(self, part: str, name: str, data: bytes) -> None:
@@ -472,7 +472,7 @@ def _outdated_lists(copy: KeystoreCopy) -> dict[Path, bytes]:
     An enclave that did not get the last list will not get the next one, either.
     """
     newest = copy.root / CRL
-    revoked = any(entry.what == "revocation" for entry in Keystore(copy.root).ledger.entries)
+    revoked = any(entry.what == "revocation" for entry in OpenedKeystore(copy.root).ledger.entries)
     if not revoked and not newest.exists():
         return {}
     paths = [copy.folder(part) / CRL_FILE for part in copy.cast]

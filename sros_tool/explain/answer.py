@@ -34,7 +34,7 @@ from sros_tool.keystore.layout import (
     is_original_keystore,
 )
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, VendorParticipant
-from sros_tool.keystore.reader import Keystore, Problem
+from sros_tool.keystore.reader import OpenedKeystore, Problem
 from sros_tool.names import (
     ACTION_PARTS,
     ACTION_SEPARATOR,
@@ -582,7 +582,7 @@ _CREATED = {
 # ── the policy behind an answer ────────────────────────────────────────────────────────────
 
 
-def recorded_policy(keystore: Keystore, signed: bytes) -> str:
+def recorded_policy(keystore: OpenedKeystore, signed: bytes) -> str:
     """Return the SHA-256 (hexadecimal) of the policy from which permissions were made.
 
     The ledger of the keystore has it; without a ledger or an entry, the result is "".

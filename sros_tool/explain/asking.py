@@ -29,7 +29,7 @@ from sros_tool.keystore.participant import (
     deciding_enclave,
     loaded_enclave,
 )
-from sros_tool.keystore.reader import Keystore, open_enclave
+from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from sros_tool.values import Words, shows
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class AskingContext(NamedTuple):
         return JoinContext(domain, self.at, self.zone)
 
 
-def fleet_of(file: Path | None, keystore: Keystore | None) -> Fleet | None:
+def fleet_of(file: Path | None, keystore: OpenedKeystore | None) -> Fleet | None:
     """Return the fleet in a file, or else the fleet of the keystore."""
     from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.keystore.fleet import load_fleet
@@ -90,7 +90,7 @@ class AskedEnclave(NamedTuple):
         return rights
 
 
-def rights_naming(keystore: Keystore, name: str) -> Iterator[Right]:
+def rights_naming(keystore: OpenedKeystore, name: str) -> Iterator[Right]:
     """Yield the rights in those permissions of a keystore that contain a ROS name.
 
     Unreadable permissions are left out; permissions without the name are not parsed.
@@ -136,7 +136,7 @@ def open_to_ask(
         PolicyError: the policy does not have the enclave.
     """
     policy = own_enclave = stated = None
-    keystore = Keystore(root) if root else None
+    keystore = OpenedKeystore(root) if root else None
     if policy_file:
         stated, policy = policy_to_ask(policy_file, fleet_of(asking.fleet_file, keystore))
         own_enclave = policy.enclave(name)
@@ -178,7 +178,7 @@ def policy_to_ask(file: Path, fleet: Fleet | None) -> tuple[Policy, Policy]:
     return stated, FleetPolicy(stated, fleet).policy() if fleet else stated
 
 
-def _is_of_robot(keystore: Keystore, enclave: str) -> bool:
+def _is_of_robot(keystore: OpenedKeystore, enclave: str) -> bool:
     """Return whether the keystore's fleet has a robot with this enclave."""
     from sros_tool.fleet.robots import robot_of
 
@@ -199,7 +199,7 @@ def not_in_policy_error(policy: Policy, name: str, file: Path) -> PolicyError:
     )
 
 
-def note_on_lacking_keys(keystore: Keystore) -> Iterator[Note]:
+def note_on_lacking_keys(keystore: OpenedKeystore) -> Iterator[Note]:
     """Yield a note for a keystore or export in which no enclave has its key."""
     if is_keystore(keystore.root) and not keystore.has_keys:
         text = (
@@ -210,7 +210,7 @@ def note_on_lacking_keys(keystore: Keystore) -> Iterator[Note]:
 
 
 def signed_enclave(
-    keystore: Keystore | None, name: str, moment: datetime, *, planned: bool = False
+    keystore: OpenedKeystore | None, name: str, moment: datetime, *, planned: bool = False
 ) -> LoadedEnclave | None:
     """Load an enclave from a keystore, or from the folder ``name``.
 
@@ -247,7 +247,7 @@ def _load_enclave(folder: Path, moment: datetime) -> LoadedEnclave:
 
 
 def planned_enclave(
-    policy: Enclave, keystore: Keystore | None, asking: AskingContext
+    policy: Enclave, keystore: OpenedKeystore | None, asking: AskingContext
 ) -> LoadedEnclave:
     """Return the enclave as the policy would create it, with the keystore's governance.
 

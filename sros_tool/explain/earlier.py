@@ -12,13 +12,13 @@ from sros_tool.errors import Note
 from sros_tool.keystore.known_keys import revoked_serials
 from sros_tool.keystore.layout import LEDGER
 from sros_tool.keystore.ledger import Entry
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.validity import iso
 from sros_tool.wording import first_few
 
 
 def note_on_earlier_permissions(
-    keystore: Keystore, denied: Collection[str], now: datetime
+    keystore: OpenedKeystore, denied: Collection[str], now: datetime
 ) -> Iterator[Note]:
     """Yield a note on enclaves that are ``denied`` now, if earlier permissions may allow it.
 
@@ -46,7 +46,7 @@ def note_on_earlier_permissions(
         yield Note("explain.earlier-permissions", text)
 
 
-def _issued(keystore: Keystore, names: Collection[str]) -> Mapping[str, Sequence[Entry]]:
+def _issued(keystore: OpenedKeystore, names: Collection[str]) -> Mapping[str, Sequence[Entry]]:
     """Return what the ledger has of each of the enclaves, except for revoked certificates."""
     issued: defaultdict[str, list[Entry]] = defaultdict(list)
     if names and keystore.has(LEDGER):

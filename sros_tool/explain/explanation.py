@@ -235,21 +235,21 @@ def _is_own_copy(keystore: Path, enclave: str, file: str) -> bool:
 
 def _is_rotating(keystore: Path) -> bool:
     from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
 
     try:
-        return read_rotation(Keystore(keystore)).stage is not RotationStage.NONE
+        return read_rotation(OpenedKeystore(keystore)).stage is not RotationStage.NONE
     except SrosError:
         return False
 
 
 def _is_latest(keystore: Path, enclave: str) -> bool:
     """Return whether an enclave's permissions are those that were signed last, by the ledger."""
-    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.reader import OpenedKeystore
 
     try:
         signed = (enclave_path(keystore, enclave) / PERMISSIONS_FILE).read_bytes()
-        entries = reversed(Keystore(keystore).ledger_with("enclave", enclave).entries)
+        entries = reversed(OpenedKeystore(keystore).ledger_with("enclave", enclave).entries)
     except (SrosError, OSError):
         return True
     last = (entry for entry in entries if (entry.what, entry.enclave) == ("permissions", enclave))

@@ -30,7 +30,7 @@ from sros_tool.keystore.known_keys import enclaves_by_identity
 from sros_tool.keystore.layout import ROUTER_FILE, is_keystore, is_original_keystore
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.selection import likely_names as likely_enclaves
 from sros_tool.names import ACTION_SEPARATOR, SERVICE_ENDS, check_enclave_name, nodes_served
@@ -129,7 +129,7 @@ class SearchedKeystore:
     """An index of the enclaves of a keystore, by peers and nodes that a log names."""
 
     def __init__(self, root: Path) -> None:
-        self._keystore = Keystore(root)
+        self._keystore = OpenedKeystore(root)
 
     def peer(self, guid: str) -> str:
         """Return the enclave of the participant with a GUID, as a vendor prints it; or ""."""
@@ -202,7 +202,7 @@ def explain_log_of(
     Raises:
         UsageError: ``name`` is an enclave, and there is no keystore.
     """
-    keystore = Keystore(root) if root else None
+    keystore = OpenedKeystore(root) if root else None
     named: LoadedEnclave | None = None
     if name:
         named = signed_enclave(keystore, name, asking.at)

@@ -48,7 +48,7 @@ from sros_tool.keystore.participant import (
     deciding_enclave,
     load_enclave_of,
 )
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.names import is_expression
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import Right, policy_rights
@@ -362,7 +362,7 @@ def _zenoh_decision(
     return ZenohNextToDds(answer.in_brief)
 
 
-def _runs_on_zenoh(keystore: Keystore, name: str) -> bool:
+def _runs_on_zenoh(keystore: OpenedKeystore, name: str) -> bool:
     """Return whether an enclave has Zenoh files, or the keystore is set up for Zenoh.
 
     If the settings have no [zenoh] part, other enclaves are not examined: there may be thousands.
@@ -547,7 +547,7 @@ class VendorOfPolicy(NamedTuple):
 class VendorOfKeystore(NamedTuple):
     """The decisions of a vendor on the enclaves ``names`` of a keystore; without names, on all."""
 
-    keystore: Keystore
+    keystore: OpenedKeystore
     vendor: Vendor
     why: str
     asking: AskingContext

@@ -17,7 +17,7 @@ from sros_tool.explain.asking import taken_for_action
 from sros_tool.faults import REFUSE_STRANGERS
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.layout import enclave_names, is_original_keystore, remedy_in_keystore
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import RightsSource, rights_by_domains
 from sros_tool.keystore.selection import likely_names, missing_enclave_error
 from sros_tool.names import is_expression
@@ -293,7 +293,7 @@ def follow_reach(
         for domains, some in rights_by_domains(source).items()
         if domain is None or domains is None or domain in domains
     }
-    opened = tuple(unguarded(Keystore(source.path).governance)) if of_keystore else ()
+    opened = tuple(unguarded(OpenedKeystore(source.path).governance)) if of_keystore else ()
     network = Network(
         rights,
         excluded=without,
@@ -303,7 +303,7 @@ def follow_reach(
         links=source.links,
     )
     if names and enclave not in names:
-        raise missing_enclave_error(Keystore(source.path), enclave, names)
+        raise missing_enclave_error(OpenedKeystore(source.path), enclave, names)
     if enclave not in network.enclaves:
         meant = likely_names(enclave, network.enclaves)
         where = "" if domain is None else f", domain {domain}"
@@ -314,7 +314,7 @@ def follow_reach(
         )
     reach = network.reach(enclave)
     notes = [note for note in source.notes if note.id != "rights.domains"]  # they are followed
-    if of_keystore and _admits_strangers(Keystore(source.path).governance):
+    if of_keystore and _admits_strangers(OpenedKeystore(source.path).governance):
         refuse = remedy_in_keystore(source.path, f"Run {REFUSE_STRANGERS}.")
         text = (
             "processes without an identity may use some names, too, because the governance admits "

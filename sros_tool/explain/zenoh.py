@@ -56,7 +56,7 @@ from sros_tool.keystore.layout import (
     remedy_in_keystore,
 )
 from sros_tool.keystore.participant import JoinContext
-from sros_tool.keystore.reader import Keystore, Problem
+from sros_tool.keystore.reader import OpenedKeystore, Problem
 from sros_tool.keystore.rights import check_routers
 from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.keystore.zenoh_files import (
@@ -290,7 +290,7 @@ class ZenohEvaluator:
     """
 
     def __init__(
-        self, keystore: Keystore, *, moment: datetime, domain: int, joining: bool = False
+        self, keystore: OpenedKeystore, *, moment: datetime, domain: int, joining: bool = False
     ) -> None:
         """Read the routers.
 
@@ -861,7 +861,7 @@ _ROUTERS_KEY = Note(
 )
 
 
-def _domains(keystore: Keystore, now: datetime) -> DomainSet:
+def _domains(keystore: OpenedKeystore, now: datetime) -> DomainSet:
     """Return the ROS domains of a keystore; of an export, those of the governance of its enclaves.
 
     Without any governance it is domain 0.
@@ -909,7 +909,7 @@ class ZenohOfKeystore:
 
     def __init__(
         self,
-        keystore: Keystore,
+        keystore: OpenedKeystore,
         why: str,
         asking: AskingContext,
         names: Sequence[str] | None = None,

@@ -45,7 +45,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import GAP, RESTORED, SEALED, Entry
 from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
-from sros_tool.keystore.reader import FilesReadOnce, Keystore, OpenedEnclave, open_enclave
+from sros_tool.keystore.reader import FilesReadOnce, OpenedEnclave, OpenedKeystore, open_enclave
 from sros_tool.keystore.zenoh_files import OpenedZenoh, ZenohFault, open_zenoh
 from sros_tool.pki.certificates import (
     common_name_of,
@@ -610,7 +610,7 @@ def _describe_file(
 
 
 def _describe_keystore(root: Path, now: datetime) -> DescribedKeystore:
-    keystore = Keystore(root)
+    keystore = OpenedKeystore(root)
     settings = keystore.settings
     authorities: dict[str, AuthorityFile | UnreadableFile] = {}
     for role in ROLES:
@@ -654,7 +654,7 @@ def _describe_keystore(root: Path, now: datetime) -> DescribedKeystore:
 
 
 def _describe_governance(
-    keystore: Keystore, now: datetime
+    keystore: OpenedKeystore, now: datetime
 ) -> DescribedGovernance | UnreadableFile | None:
     """Describe the governance that the enclaves of a keystore share; None without a governance."""
     if not keystore.has(GOVERNANCE_P7S):
@@ -692,7 +692,7 @@ def _describe_zenoh(folder: Path, now: datetime) -> ZenohFiles | None:
     )
 
 
-def _describe_enclave(keystore: Keystore, name: str, now: datetime) -> KeystoreEnclave:
+def _describe_enclave(keystore: OpenedKeystore, name: str, now: datetime) -> KeystoreEnclave:
     """Describe an enclave of a keystore."""
     state = keystore.enclave(name, now=now)
     evaluation = evaluated(name, keystore.folder(name), state, moment=now)
@@ -1015,7 +1015,7 @@ def history(root: Path, *, now: datetime) -> History:
     """Return the entries of a keystore's ledger, with the current state of the recorded items."""
     issued, revoked_files = _files(root, _active_paths(root)), _files(root, _revoked_paths(root))
     retired = _files(root, _retired_paths(root))
-    keystore = Keystore(root)
+    keystore = OpenedKeystore(root)
     ledger = keystore.ledger
     entries = ledger.entries
     # A new CA starts with an empty revocation list, and lists drop expired certificates, so the

@@ -15,7 +15,7 @@ from cryptography import x509
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.layout import CERTIFICATE_FILE, remedy_in_keystore
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import Template
 from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
@@ -152,7 +152,7 @@ def parse_threshold(text: str) -> Threshold:
     return Threshold(elapsed=int(match[1]) / 100)
 
 
-def _lifetimes(keystore: Keystore) -> tuple[Lifetime, ...]:
+def _lifetimes(keystore: OpenedKeystore) -> tuple[Lifetime, ...]:
     """Return the lifetimes of a keystore's enclaves, sorted by name.
 
     Raises:
@@ -163,7 +163,7 @@ def _lifetimes(keystore: Keystore) -> tuple[Lifetime, ...]:
     return lifetimes
 
 
-def survey(keystore: Keystore) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, ...]]:
+def survey(keystore: OpenedKeystore) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, ...]]:
     """Return the lifetimes of the readable enclaves, and the unreadable enclaves, on all cores."""
     keystore.check()
 
@@ -200,7 +200,7 @@ class ExpiryCheck(NamedTuple):
 
 
 def due_enclaves(
-    keystore: Keystore, threshold: Threshold, moment: datetime, settings: Template
+    keystore: OpenedKeystore, threshold: Threshold, moment: datetime, settings: Template
 ) -> ExpiryCheck:
     """Return the enclaves of a keystore, by whether they are due for renewal."""
     lifetimes, unreadable = survey(keystore)
@@ -231,7 +231,7 @@ def refuse_unreadable(unreadable: tuple[UnreadableEnclave, ...], verb: str) -> N
         )
 
 
-def read_credentials(keystore: Keystore, name: str) -> Credentials:
+def read_credentials(keystore: OpenedKeystore, name: str) -> Credentials:
     """Return the certificate and the grant of an enclave, without verifying them.
 
     Raises:

@@ -28,7 +28,7 @@ from sros_tool.fleet.robots import (
 )
 from sros_tool.keystore.layout import FLEET, FLEET_ROOT, enclave_names, has_enclave
 from sros_tool.keystore.ledger import Entry, Ledger
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.policy.placeholders import has_placeholder
 from sros_tool.validity import iso
 from sros_tool.wording import first_few
@@ -48,7 +48,7 @@ FLEET_REMEDY = (
 _SHOWN = 5
 
 
-def load_fleet(keystore: Keystore) -> Fleet | None:
+def load_fleet(keystore: OpenedKeystore) -> Fleet | None:
     """Return the fleet of a keystore; None if the keystore has no fleet.
 
     Raises:
@@ -62,7 +62,7 @@ def load_fleet(keystore: Keystore) -> Fleet | None:
     return keystore.once("fleet", read)
 
 
-def stated_distributions(keystore: Keystore, enclave: str) -> tuple[str, ...]:
+def stated_distributions(keystore: OpenedKeystore, enclave: str) -> tuple[str, ...]:
     """Return the ROS 2 distributions that an enclave is for; () if nothing states any.
 
     They are the distribution of its robot in the fleet, or else those in the keystore's settings.
@@ -77,7 +77,7 @@ def stated_distributions(keystore: Keystore, enclave: str) -> tuple[str, ...]:
     return keystore.template.distributions
 
 
-def enclaves_of_several_distributions(keystore: Keystore) -> dict[tuple[str, ...], list[str]]:
+def enclaves_of_several_distributions(keystore: OpenedKeystore) -> dict[tuple[str, ...], list[str]]:
     """Map tuples of several ROS 2 distributions to the enclaves that are for all of them.
 
     Enclaves whose settings or fleet cannot be read are left out: another finding reports that.
@@ -90,7 +90,7 @@ def enclaves_of_several_distributions(keystore: Keystore) -> dict[tuple[str, ...
     return enclaves
 
 
-def checked_fleet(keystore: Keystore) -> Fleet | None:
+def checked_fleet(keystore: OpenedKeystore) -> Fleet | None:
     """Return the fleet as `load_fleet`, after checking that nobody edited its file.
 
     Verbs that issue or send files by the fleet use this.
@@ -107,7 +107,7 @@ def checked_fleet(keystore: Keystore) -> Fleet | None:
     return load_fleet(keystore)
 
 
-def edited_fleet(keystore: Keystore, ledger: Ledger) -> str:
+def edited_fleet(keystore: OpenedKeystore, ledger: Ledger) -> str:
     """Return a clause on how the fleet file differs from what sros wrote; "" if it does not."""
     return _edit_text(ledger, _read(keystore))
 
@@ -126,7 +126,7 @@ def _edit_text(ledger: Ledger, data: bytes | None) -> str:
     return "" if is_unedited else f"is not the file that sros wrote at {last.time}"
 
 
-def _read(keystore: Keystore) -> bytes | None:
+def _read(keystore: OpenedKeystore) -> bytes | None:
     path = keystore.root / FLEET
     if not os.path.lexists(path):
         return None
@@ -141,7 +141,7 @@ def _parse(root: Path, data: bytes) -> Fleet:
     return parse_fleet(data, f"the fleet file '{root / FLEET}'")
 
 
-def recorded_fleet(keystore: Keystore) -> Fleet:
+def recorded_fleet(keystore: OpenedKeystore) -> Fleet:
     """Return the fleet of a keystore, which has to have one.
 
     Raises:
@@ -250,7 +250,7 @@ def _routers(fleet: Fleet) -> dict[str, Robot]:
 
 def write_fleet(
     transaction: Transaction,
-    keystore: Keystore,
+    keystore: OpenedKeystore,
     fleet: Fleet,
     patterns: Collection[str],
     now: datetime,

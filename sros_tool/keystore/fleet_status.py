@@ -64,7 +64,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import RESTORED, Entry, behind_clause, clock_behind
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import digest
 from sros_tool.pki.crl import SUPERSEDED
@@ -508,7 +508,7 @@ class FleetStatus:
         return replace(self, robots=to_do, overdue=late, clock=clock, publication=publication)
 
 
-def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
+def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetStatus:
     """Return the deployment status of the named robots, or of the whole fleet.
 
     Raises:
@@ -750,7 +750,7 @@ class _Known:
     """Identification, by the ledger, of confirmed files that differ from the keystore."""
 
     def __init__(
-        self, keystore: Keystore, fleet: Fleet, compared_robots: Sequence[_ComparedRobot]
+        self, keystore: OpenedKeystore, fleet: Fleet, compared_robots: Sequence[_ComparedRobot]
     ) -> None:
         self._keystore = keystore
         self._root = keystore.root
@@ -1093,7 +1093,7 @@ class _Stages:
     BEFORE, COMPLETE, UNKNOWN = "before", "complete", "unknown"
     ORDER = (UNKNOWN, BEFORE, "distribute", "reissue", COMPLETE)
 
-    def __init__(self, keystore: Keystore) -> None:
+    def __init__(self, keystore: OpenedKeystore) -> None:
         rotation = read_rotation(keystore)
         is_complete = rotation.stage is RotationStage.NONE
         self.of_keystore = self.COMPLETE if is_complete else rotation.stage.value

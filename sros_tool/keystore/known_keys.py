@@ -28,7 +28,7 @@ from sros_tool.keystore.layout import (
     revoked_certificates,
 )
 from sros_tool.keystore.ledger import RESTORED, SAME_KEY, Entry
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import (
     common_name_of,
@@ -42,7 +42,7 @@ from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.pki.keys import PublicKey, load_key
 
 
-def revoked_serials(keystore: Keystore) -> frozenset[int]:
+def revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
     """Return the serial numbers of all revoked certificates, also of those that were replaced."""
     entries = keystore.ledger_with("what", "revocation").entries
     recorded = {int(entry.serial, 16) for entry in entries if entry.what == "revocation"}
@@ -50,7 +50,7 @@ def revoked_serials(keystore: Keystore) -> frozenset[int]:
     return frozenset(recorded | listed)
 
 
-def restored_at(keystore: Keystore) -> str:
+def restored_at(keystore: OpenedKeystore) -> str:
     """Return when a keystore was restored with an identity CA that it trusts; "" if never."""
     file = keystore.identity_file
     trusted = {digest(ca) for ca in (keystore.certificates_of(file) if file else ())}
@@ -72,7 +72,7 @@ are read.
 class KnownKeys:
     """The keys of a keystore, to compare with a key that is about to be certified."""
 
-    def __init__(self, keystore: Keystore) -> None:
+    def __init__(self, keystore: OpenedKeystore) -> None:
         self._keystore = keystore
 
     @cached_property
@@ -279,7 +279,7 @@ def _digest_of(certificate: x509.Certificate) -> str:
     return key_digest(certificate.public_key())  # type: ignore[arg-type]
 
 
-def _digests(keystore: Keystore, name: str) -> Iterator[str]:
+def _digests(keystore: OpenedKeystore, name: str) -> Iterator[str]:
     """Yield the digest of an enclave's key, read from its certificate, key file or request.
 
     Yield nothing if there is none of them, or the file is damaged.
@@ -301,7 +301,7 @@ def _digests(keystore: Keystore, name: str) -> Iterator[str]:
 # ── DDS participants ───────────────────────────────────────────────────────────────────────
 
 
-def enclaves_by_identity(keystore: Keystore) -> dict[str, str]:
+def enclaves_by_identity(keystore: OpenedKeystore) -> dict[str, str]:
     """Map the DDS identity of each enclave's certificate subject (`identity_of`) to the enclave.
 
     A secured participant shows this identity in its GUID.  An enclave whose certificate cannot be

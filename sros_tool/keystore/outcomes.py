@@ -14,7 +14,7 @@ from cryptography import x509
 from sros_tool.errors import Note, SrosError
 from sros_tool.keystore.expiry import read_credentials
 from sros_tool.keystore.layout import ROLES
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.pki.certificates import digest, subject_text, validity_of
 from sros_tool.values import FileChange, Words
@@ -72,7 +72,7 @@ class EnclaveResult(NamedTuple, Generic[Outcome]):
 
 
 def enclave_result(
-    keystore: Keystore, name: str, outcome: str, *, written: bool, folder: Path | None = None
+    keystore: OpenedKeystore, name: str, outcome: str, *, written: bool, folder: Path | None = None
 ) -> EnclaveResult[str]:
     """Return the outcome of a verb for an enclave, with facts about the enclave's certificate.
 

@@ -45,7 +45,7 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_FILE,
 )
 from sros_tool.keystore.loading import BEFORE_DDS, CRASHES, vendor_problems
-from sros_tool.keystore.reader import Keystore, OpenedEnclave, Problem, open_enclave
+from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, Problem, open_enclave
 from sros_tool.names import ROS_DISCOVERY_TOPIC
 from sros_tool.pki.certificates import (
     extension,
@@ -99,7 +99,7 @@ class LoadedEnclave(NamedTuple):
     state: OpenedEnclave | None = None
     at: datetime | None = None
     key_elsewhere: bool = False
-    keystore: Keystore | None = None
+    keystore: OpenedKeystore | None = None
     policy: Enclave | None = None
     policy_file: Path | None = None
     has_placeholders: bool = False
@@ -145,14 +145,14 @@ def load_enclave(name: str, folder: Path, *, moment: datetime) -> LoadedEnclave:
     return loaded_enclave(name, folder, open_enclave(folder, now=moment), moment=moment)
 
 
-def load_enclave_of(keystore: Keystore, name: str, *, moment: datetime) -> LoadedEnclave:
+def load_enclave_of(keystore: OpenedKeystore, name: str, *, moment: datetime) -> LoadedEnclave:
     """Return an enclave of a keystore as DDS would load it at the time ``moment``."""
     return loaded_enclave(
         name, keystore.folder(name), keystore.enclave(name, now=moment), moment=moment
     )
 
 
-def deciding_enclave(keystore: Keystore, name: str, *, moment: datetime) -> LoadedEnclave:
+def deciding_enclave(keystore: OpenedKeystore, name: str, *, moment: datetime) -> LoadedEnclave:
     """Return an enclave as `load_enclave_of` does, to decide what its documents allow.
 
     In a copy of a keystore without any keys, its key is not reported as missing.

@@ -180,25 +180,25 @@ def _identity(state: os.stat_result) -> tuple[int, int, int, int]:
 class _Part(Generic[_Parsed]):
     """A property of a keystore that is read when it is first used, and never again."""
 
-    def __init__(self, read: Callable[[Keystore], _Parsed]) -> None:
+    def __init__(self, read: Callable[[OpenedKeystore], _Parsed]) -> None:
         self._read = read
         self.__doc__ = read.__doc__
 
     @overload
     def __get__(self, keystore: None, owner: object) -> _Part[_Parsed]: ...
     @overload
-    def __get__(self, keystore: Keystore, owner: object) -> _Parsed: ...
-    def __get__(self, keystore: Keystore | None, owner: object) -> _Part[_Parsed] | _Parsed:
+    def __get__(self, keystore: OpenedKeystore, owner: object) -> _Parsed: ...
+    def __get__(self, keystore: OpenedKeystore | None, owner: object) -> _Part[_Parsed] | _Parsed:
         if keystore is None:
             return self
         return keystore.once(self, lambda: self._read(keystore))
 
 
-class Keystore:
+class OpenedKeystore:
     """A keystore, or an export for a robot, opened for reading.
 
     Every part is read when it is first used, and never again: to see a change, open a new
-    `Keystore`.  A part that exists and cannot be read raises the same `SrosError` each time.
+    `OpenedKeystore`.  A part that exists and cannot be read raises the same `SrosError` each time.
 
     Args:
         root: its folder.
@@ -212,7 +212,7 @@ class Keystore:
         self.forget()
 
     def __repr__(self) -> str:
-        return f"Keystore({str(self.root)!r})"
+        return f"OpenedKeystore({str(self.root)!r})"
 
     def forget(self) -> None:
         """Forget all parts that were read, so that a change of the keystore is seen."""
@@ -547,13 +547,13 @@ class _Failure(NamedTuple):
     error: SrosError | OSError
 
 
-def open_keystore(root: Path) -> Keystore:
+def open_keystore(root: Path) -> OpenedKeystore:
     """Return the keystore ``root``, opened for reading.
 
     Raises:
         KeystoreError: ``root`` is not a keystore.
     """
-    keystore = Keystore(root)
+    keystore = OpenedKeystore(root)
     keystore.check()
     return keystore
 
@@ -1092,7 +1092,7 @@ _MOST_READS = 5
 
 Result = TypeVar("Result")
 Arguments = ParamSpec("Arguments")
-Opened = TypeVar("Opened", Path, Keystore)
+Opened = TypeVar("Opened", Path, OpenedKeystore)
 
 
 def read_consistently(
@@ -1105,7 +1105,7 @@ def read_consistently(
 
     @wraps(read)
     def read_again(opened: Opened, *arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
-        root = opened.root if isinstance(opened, Keystore) else opened
+        root = opened.root if isinstance(opened, OpenedKeystore) else opened
         for _ in range(_MOST_READS - 1):
             before = _state(root)
             try:
@@ -1116,7 +1116,7 @@ def read_consistently(
             else:
                 if _state(root) == before:
                     return result
-            if isinstance(opened, Keystore):
+            if isinstance(opened, OpenedKeystore):
                 opened.forget()
         return read(opened, *arguments, **named)
 

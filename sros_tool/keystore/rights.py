@@ -44,7 +44,7 @@ from sros_tool.keystore.layout import (
     remedy_in_keystore,
 )
 from sros_tool.keystore.ledger import Entry, Ledger
-from sros_tool.keystore.reader import FilesReadOnce, Keystore
+from sros_tool.keystore.reader import FilesReadOnce, OpenedKeystore
 from sros_tool.names import is_expression
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
@@ -126,7 +126,7 @@ class RightsSource:
 
 
 def load_rights(
-    path: Path | Keystore,
+    path: Path | OpenedKeystore,
     fleet: Fleet | None = None,
     *,
     hidden: bool = False,
@@ -142,11 +142,11 @@ def load_rights(
     Raises:
         DocumentError: ``path`` is anything else, or malformed.
     """
-    if isinstance(path, Keystore):
+    if isinstance(path, OpenedKeystore):
         return _keystore_rights(path, hidden=hidden, only_enclaves=only_enclaves)
     if path.is_dir():
         if is_keystore(path):
-            return _keystore_rights(Keystore(path), hidden=hidden)
+            return _keystore_rights(OpenedKeystore(path), hidden=hidden)
         if (path / PERMISSIONS_FILE).exists():
             return _document_rights(path, "enclave", path / PERMISSIONS_FILE)
         refuse_earlier(path)
@@ -249,7 +249,7 @@ def _divide_by_rules(rights: Collection[Right], enclave: str, permissions: Permi
     yield None, [right for right in rights if right not in stated]
 
 
-def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSource:
+def load_zenoh_rights(keystore: OpenedKeystore, *, hidden: bool = False) -> RightsSource:
     """Return the rights that the Zenoh configurations of a keystore together give its enclaves.
 
     These are the configurations of routers, and of peers, which also connect without the router.
@@ -423,7 +423,7 @@ def _document_rights(path: Path, kind: str, file: Path) -> RightsSource:
 
 
 def _keystore_rights(
-    keystore: Keystore, *, hidden: bool, only_enclaves: Sequence[str] | None = None
+    keystore: OpenedKeystore, *, hidden: bool, only_enclaves: Sequence[str] | None = None
 ) -> RightsSource:
     root, reader = keystore.root, _Reader(keystore.files)
     rights: set[Right] = set()
@@ -705,7 +705,7 @@ def _governance_differs(first_source: RightsSource, second_source: RightsSource)
 
 def _governances(source: RightsSource) -> set[Governance]:
     """Return the distinct governance documents that enclaves load, without verifying them."""
-    keystore = Keystore(source.path)
+    keystore = OpenedKeystore(source.path)
     if source.kind == "enclave":
         places = {source.path / GOVERNANCE_FILE}
     else:
@@ -879,7 +879,7 @@ class _LedgerPermissions:
     after the lines without a hash chain, ``certain`` those with permissions after the last gap.
     """
 
-    def __init__(self, ledger: Ledger, keystore: Keystore) -> None:
+    def __init__(self, ledger: Ledger, keystore: OpenedKeystore) -> None:
         self.gaps = ledger.gaps
         self.unchained = ledger.unchained
         chained = ledger.entries[ledger.unchained :]
@@ -899,7 +899,7 @@ class RecordedRights:
     their rights signed again, with a new date.
     """
 
-    def __init__(self, keystore: Keystore, ledger: Ledger | None = None) -> None:
+    def __init__(self, keystore: OpenedKeystore, ledger: Ledger | None = None) -> None:
         self._keystore = keystore
         self._root = keystore.root
         self._whole = ledger

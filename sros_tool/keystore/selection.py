@@ -33,7 +33,7 @@ from sros_tool.keystore.layout import (
     has_enclave,
 )
 from sros_tool.keystore.ledger import Entry
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.names import check_enclave_name
 from sros_tool.values import NamedKeystore, shows
 from sros_tool.wording import counted, first_few
@@ -52,7 +52,7 @@ class EnclaveList(NamedTuple):
     """Robot of each enclave that belongs to a robot; null for a keystore without a fleet."""
 
 
-def robots_of(keystore: Keystore, names: Sequence[str]) -> dict[str, str] | None:
+def robots_of(keystore: OpenedKeystore, names: Sequence[str]) -> dict[str, str] | None:
     """Map each enclave in ``names`` that belongs to a robot to the robot; None without a fleet."""
     fleet = load_fleet(keystore)
     if fleet is None:
@@ -62,7 +62,7 @@ def robots_of(keystore: Keystore, names: Sequence[str]) -> dict[str, str] | None
 
 
 def select_enclaves(
-    keystore: Keystore,
+    keystore: OpenedKeystore,
     names: Sequence[str],
     patterns: Sequence[str] = (),
     *,
@@ -98,7 +98,7 @@ def select_enclaves(
 
 
 def select_to_revoke(
-    keystore: Keystore,
+    keystore: OpenedKeystore,
     names: Sequence[str],
     patterns: Sequence[str],
     robots: Sequence[str],
@@ -126,7 +126,9 @@ def select_to_revoke(
     return tuple(chosen), tuple(_unrecorded_notes(keystore.root, sorted(below), sorted(left)))
 
 
-def _possible_enclaves(keystore: Keystore, fleet: Fleet, robots: Sequence[str]) -> Sequence[str]:
+def _possible_enclaves(
+    keystore: OpenedKeystore, fleet: Fleet, robots: Sequence[str]
+) -> Sequence[str]:
     """Return all enclaves that may belong to ``robots``, and perhaps others.
 
     In a keystore with an index, these are the enclaves in the folders of the robots, and those that
@@ -163,7 +165,10 @@ def _names_text(names: list[str]) -> str:
 
 
 def _robots_enclaves(
-    keystore: Keystore, robots: Sequence[str], checked: bool, unrecorded: Mapping[str, Unrecorded]
+    keystore: OpenedKeystore,
+    robots: Sequence[str],
+    checked: bool,
+    unrecorded: Mapping[str, Unrecorded],
 ) -> list[str]:
     if not robots:
         return []
@@ -207,7 +212,7 @@ def _robots_enclaves(
     return enclaves
 
 
-def _enclaves_named_after(keystore: Keystore, robot: str) -> list[str]:
+def _enclaves_named_after(keystore: OpenedKeystore, robot: str) -> list[str]:
     """Return the enclaves with the name of a robot as a part of their paths."""
     return [name for name in keystore.names if robot in name.split("/")[1:]]
 
@@ -221,7 +226,11 @@ _WHOLE_ALIKE = 0.9
 
 
 def missing_enclave_error(
-    keystore: Keystore, name: str, existing_enclaves: Collection[str], *, may_create: bool = True
+    keystore: OpenedKeystore,
+    name: str,
+    existing_enclaves: Collection[str],
+    *,
+    may_create: bool = True,
 ) -> SrosError:
     """Return the error for the missing enclave ``name``, with similar ``existing_enclaves``.
 
@@ -270,7 +279,7 @@ def missing_enclave_error(
     return KeystoreError(missing, why, f"If it is not a typo, create it with {create}.")
 
 
-def _enclaves_of_node(keystore: Keystore, node: str, names: Sequence[str]) -> list[str]:
+def _enclaves_of_node(keystore: OpenedKeystore, node: str, names: Sequence[str]) -> list[str]:
     """Return the enclaves whose permissions let a node of this full name serve its parameters."""
     topic = f">rr{node}/get_parametersReply<".encode()
     enclaves = []
@@ -281,7 +290,7 @@ def _enclaves_of_node(keystore: Keystore, node: str, names: Sequence[str]) -> li
     return enclaves
 
 
-def revocation_of(keystore: Keystore, name: str) -> Entry | None:
+def revocation_of(keystore: OpenedKeystore, name: str) -> Entry | None:
     """Return the ledger entry of an enclave's revocation; None if it has a later certificate."""
     try:
         entries = keystore.ledger_with("enclave", name).entries

@@ -21,7 +21,7 @@ from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.keystore.layout import GOVERNANCE_P7S, GOVERNANCE_XML, SETTINGS
 from sros_tool.keystore.ledger import Entry, Ledger
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import Template, parse_template, render_template, settings_values
 from sros_tool.translate import governance_for, protection_for
 from sros_tool.validity import iso
@@ -125,7 +125,7 @@ class PresentSettings(NamedTuple):
         return self.settings
 
 
-def present_settings(keystore: Keystore) -> PresentSettings:
+def present_settings(keystore: OpenedKeystore) -> PresentSettings:
     """Return the settings that are in force in a keystore.
 
     Raises:
@@ -165,7 +165,7 @@ def present_settings(keystore: Keystore) -> PresentSettings:
 _SHOWN = 3
 
 
-def edit_notes(keystore: Keystore, governance: Governance) -> tuple[Note, ...]:
+def edit_notes(keystore: OpenedKeystore, governance: Governance) -> tuple[Note, ...]:
     """Return a note on files that were edited by hand, for a verb that does not apply the edits.
 
     ``governance`` is the signed governance of the keystore.
@@ -179,7 +179,7 @@ def edit_notes(keystore: Keystore, governance: Governance) -> tuple[Note, ...]:
     return (Note("keystore.edited", text),)
 
 
-def found_edits(keystore: Keystore, governance: Governance | None) -> HandEdits:
+def found_edits(keystore: OpenedKeystore, governance: Governance | None) -> HandEdits:
     """Return the edits by hand; ``governance`` is the signed governance, None if unreadable."""
     ledger = keystore.ledger_with("what", "settings")
     return hand_edits(keystore, ledger, keystore.settings, governance)
@@ -195,7 +195,7 @@ def edit_remedy(root: Path | str) -> str:
 
 
 def hand_edits(
-    keystore: Keystore,
+    keystore: OpenedKeystore,
     ledger: Ledger,
     present: Template | None,
     governance: Governance | None,
@@ -237,7 +237,7 @@ def _difference_clauses(old: Template, new: Template, origin: str) -> Iterator[s
             yield f"{key} in {SETTINGS} is {new_value}, but {old_value} was {origin}"
 
 
-def _governance_edit(keystore: Keystore) -> str:
+def _governance_edit(keystore: OpenedKeystore) -> str:
     """Return a clause if ``governance.xml`` differs from the signed governance; else ""."""
     if not all((keystore.root / file).is_file() for file in (GOVERNANCE_XML, GOVERNANCE_P7S)):
         return ""

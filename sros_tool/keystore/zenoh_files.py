@@ -33,7 +33,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
 )
 from sros_tool.keystore.ledger import Entry, Ledger
-from sros_tool.keystore.reader import FilesReadOnce, Keystore, OpenedEnclave
+from sros_tool.keystore.reader import FilesReadOnce, OpenedEnclave, OpenedKeystore
 from sros_tool.keystore.rights import RecordedRights, SignedRights
 from sros_tool.keystore.zenoh_permissions import (
     grant_for_all,
@@ -344,7 +344,7 @@ class Drifted:
 
 
 def drifted_configurations(
-    keystore: Keystore,
+    keystore: OpenedKeystore,
     wanted_documents: ZenohDocuments,
     authority: x509.Certificate,
     gone_enclaves: Collection[str] = (),
@@ -409,7 +409,7 @@ class ZenohDrift(NamedTuple):
 
 
 def zenoh_drift(
-    keystore: Keystore,
+    keystore: OpenedKeystore,
     network: ZenohNetwork,
     domains: DomainSet,
     authority: x509.Certificate,
@@ -436,7 +436,7 @@ def zenoh_drift(
 
 
 def zenoh_documents(
-    keystore: Keystore,
+    keystore: OpenedKeystore,
     network: ZenohNetwork,
     domains: DomainSet,
     authority: x509.Certificate,
@@ -665,7 +665,7 @@ It may be a wildcard, markup that splits or encodes a name, or a default that al
 _XML_DECLARATION = b'<?xml version="1.0" encoding="UTF-8"?>'
 
 
-def enclaves_with_rights(keystore: Keystore, names: Collection[str]) -> set[str]:
+def enclaves_with_rights(keystore: OpenedKeystore, names: Collection[str]) -> set[str]:
     """Return the enclaves whose permissions may have a right to one of ``names``, and maybe others.
 
     No signature is verified and no XML parsed: the bytes of the permissions are searched for the
@@ -710,7 +710,7 @@ class _RightsReader:
 
     def __init__(
         self,
-        keystore: Keystore,
+        keystore: OpenedKeystore,
         authority: x509.Certificate,
         domains: Sequence[int],
         network: ZenohNetwork,
@@ -984,7 +984,7 @@ def _examples(name: str) -> Iterable[str]:
 # ── files ──────────────────────────────────────────────────────────────────────────────────
 
 
-def _present_file(keystore: Keystore, path: str) -> bytes | None:
+def _present_file(keystore: OpenedKeystore, path: str) -> bytes | None:
     if not os.path.lexists(keystore.root / path):
         return None
     try:

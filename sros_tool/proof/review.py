@@ -33,7 +33,7 @@ from sros_tool.folders import Folder
 from sros_tool.keystore.expiry import ExpiryCheck, Threshold, due_enclaves
 from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.layout import FLEET, KEY_FILE, SETTINGS, is_keystore
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import RightsSource, SourcesDifference, compare_sources
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Profile
@@ -354,7 +354,7 @@ class _Review:
         keystores = yield from self._keystores(self.head)
         for path, keystore in keystores.items():
             with suppress(SrosError):  # what is wrong with it is a finding
-                self.robots[path] = load_fleet(Keystore(keystore))
+                self.robots[path] = load_fleet(OpenedKeystore(keystore))
         yield from self._requirements(of_head, head_fleet, base_fleet, keystores)
         if self.base:
             before = cache(partial(load_policies, of_base, _BASE, base_fleet))
@@ -879,9 +879,9 @@ class _Review:
         yield from self._step_result("expiry", path, lambda: self._expiry(before or folder, folder))
 
     def _expiry(self, settings_folder: Path, folder: Path) -> tuple[int, Content]:
-        settings = Keystore(settings_folder).template
+        settings = OpenedKeystore(settings_folder).template
         expiring = due_enclaves(
-            Keystore(folder), self.request.renew_within, self.request.at, settings
+            OpenedKeystore(folder), self.request.renew_within, self.request.at, settings
         )
         return _UNDECIDED if expiring.unreadable else _FOUND if expiring.due else _OK, expiring
 

@@ -40,7 +40,7 @@ from sros_tool.keystore.layout import (
     is_keystore,
     permissions_ca_for,
 )
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import RightsSource, load_rights, load_zenoh_rights
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.zenoh_files import is_signed
@@ -258,7 +258,7 @@ def _access_of_source(path: Path, source: RightsSource) -> AccessSource:
         )
     if source.kind != "keystore":
         return side
-    keystore = Keystore(path)
+    keystore = OpenedKeystore(path)
     folders = {name: enclave_path(path, name) for name in enclave_names(path, hidden=True)}
     trusting = {
         name: (folder / IDENTITY_CA_FILE, folder / CRL_FILE) for name, folder in folders.items()
@@ -338,7 +338,7 @@ def _common_governance(root: Path, folders: Iterable[Path]) -> Governance:
         DocumentError: an enclave has another governance, such as an earlier one with less
             protection.
     """
-    governance = Keystore(root).governance
+    governance = OpenedKeystore(root).governance
     wanted = _signed_text(read_bytes(root / GOVERNANCE_P7S, "governance document"))
     known: set[bytes] = set()
     for folder in folders:
@@ -413,7 +413,7 @@ def _expiries(root: Path) -> dict[int, str]:
     if not (root / CRL).exists():
         return {}
     expiries: dict[int, str] = {}
-    for entry in Keystore(root).ledger_with("what", "certificate").entries:
+    for entry in OpenedKeystore(root).ledger_with("what", "certificate").entries:
         with suppress(ValueError):
             serial = int(entry.serial, 16)
             expiries[serial] = max(expiries.get(serial, ""), entry.not_after or _NEVER)

@@ -38,7 +38,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, deciding_enclave
 from sros_tool.keystore.protection import with_stated
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, Template, load_template
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
@@ -113,7 +113,7 @@ def load_system(
     fleet: Fleet | None = None,
     only_enclaves: Collection[str] = (),
     template: Template | None = None,
-    keystore: Keystore | None = None,
+    keystore: OpenedKeystore | None = None,
 ) -> System:
     """Return the worlds of policies, or of a keystore with its signed documents.
 
@@ -142,7 +142,9 @@ def load_system(
                 "A template is for a policy that is not signed yet.",
                 "Leave --template out, or check the policy.",
             )
-        return _keystore_system(keystore or Keystore(paths[0]), moment, zone, domain, only_enclaves)
+        return _keystore_system(
+            keystore or OpenedKeystore(paths[0]), moment, zone, domain, only_enclaves
+        )
     files = [file for path in paths for file in files_of_policies(path)]
     if not files:
         raise PolicyError(
@@ -365,7 +367,7 @@ _MOST_GOVERNANCES = 4
 
 
 def _keystore_system(
-    keystore: Keystore,
+    keystore: OpenedKeystore,
     at: datetime,
     zone: tzinfo,
     domain: int | None,
@@ -530,7 +532,7 @@ def _later_moments(name: str, grants: Iterable[Grant], moment: datetime) -> tupl
 
 
 def _zenoh_worlds(
-    keystore: Keystore, domain: int | None, stated_access: Mapping[str, TopicAccess]
+    keystore: OpenedKeystore, domain: int | None, stated_access: Mapping[str, TopicAccess]
 ) -> Iterator[World]:
     """Yield the worlds of Zenoh, one for each domain.
 

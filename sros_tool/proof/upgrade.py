@@ -66,7 +66,7 @@ from sros_tool.keystore.participant import (
     plan_enclave,
 )
 from sros_tool.keystore.protection import with_stated
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
 from sros_tool.names import has_type_descriptions, is_expression
@@ -99,7 +99,7 @@ class DecidedFiles:
     at: datetime
     zone: tzinfo = UTC
     domain: int | None = None
-    keystore: Keystore | None = None
+    keystore: OpenedKeystore | None = None
     unique_subjects: bool = False
     chosen: frozenset[str] | None = None
 
@@ -141,7 +141,7 @@ class DecidedFiles:
 
 
 def signed_files(
-    keystore: Keystore, *, moment: datetime, zone: tzinfo = UTC, domain: int | None = None
+    keystore: OpenedKeystore, *, moment: datetime, zone: tzinfo = UTC, domain: int | None = None
 ) -> DecidedFiles:
     """Return the enclaves of a keystore with their signed files.
 
@@ -335,7 +335,7 @@ def _rights_needed_after(
 
 
 def check_distributions(
-    keystore: Keystore, *, moment: datetime, zone: tzinfo = UTC, domain: int | None = None
+    keystore: OpenedKeystore, *, moment: datetime, zone: tzinfo = UTC, domain: int | None = None
 ) -> list[Finding]:
     """Return findings on enclaves whose distributions decide differently.
 

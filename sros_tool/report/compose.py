@@ -19,7 +19,7 @@ from sros_tool.dds.decision.vendors import TESTED
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule
 from sros_tool.keystore.layout import is_original_keystore
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import compared_enclaves
 from sros_tool.names import ACTION_SEPARATOR, dds_names, is_expression
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Qualifier, StatedProtection
@@ -88,7 +88,7 @@ class PictureSource:
     scope: frozenset[str] | None = None
     protections: tuple[StatedProtection, ...] = ()
     policy: Policy | None = None
-    keystore: Keystore | None = None
+    keystore: OpenedKeystore | None = None
     unread: tuple[UnreadUnits, ...] = ()
     in_domains: DomainRights = field(default_factory=dict)
 

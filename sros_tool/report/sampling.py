@@ -17,7 +17,7 @@ from typing import NamedTuple
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import Robot
 from sros_tool.keystore.layout import PERMISSIONS_FILE
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import load_rights
 from sros_tool.policy.rights import Right
 from sros_tool.report.folding import DrawnUnit, UnitNames, name_order, units_of
@@ -35,7 +35,7 @@ _MARKS = "\x01\x02"
 class SampledKeystore(NamedTuple):
     """The enclaves of a keystore to read in full, and the units of all others."""
 
-    keystore: Keystore
+    keystore: OpenedKeystore
     enclaves: tuple[str, ...]
     unread: tuple[UnreadUnits, ...] = ()
     names: UnitNames = UnitNames((), ())
@@ -51,7 +51,7 @@ class SampledKeystore(NamedTuple):
 
 
 def sample_of(
-    keystore: Keystore, robots: Mapping[str, Robot], wanted_names: Collection[str] = ()
+    keystore: OpenedKeystore, robots: Mapping[str, Robot], wanted_names: Collection[str] = ()
 ) -> SampledKeystore:
     """Return the enclaves of a keystore to read in full: all of them, or a sample of equal units.
 
@@ -125,7 +125,7 @@ _UNIQUE = re.compile(",OU=[0-9a-f]{16}(?=</subject_name>)")
 
 
 def _digest_of(
-    keystore: Keystore, enclaves: Sequence[str], unit: DrawnUnit, names: UnitNames
+    keystore: OpenedKeystore, enclaves: Sequence[str], unit: DrawnUnit, names: UnitNames
 ) -> str:
     """Return a digest of a unit's permissions with the unit's name masked.
 
@@ -167,14 +167,14 @@ def _with_mark(text: str, word: str, mark: str) -> str:
     return "".join(parts)[:-1]
 
 
-def _named_units(keystore: Keystore, enclaves: Iterable[str], names: UnitNames) -> set[int]:
+def _named_units(keystore: OpenedKeystore, enclaves: Iterable[str], names: UnitNames) -> set[int]:
     """Return the units whose names are in the permissions of enclaves."""
     texts = (_signed_text(keystore, path) or "" for path in enclaves)
     lines = {line for text in texts for line in text.splitlines()}
     return {unit for line in lines for unit in names.text(line).units}
 
 
-def _signed_text(keystore: Keystore, path: str) -> str | None:
+def _signed_text(keystore: OpenedKeystore, path: str) -> str | None:
     """Return the signed text of an enclave's permissions without dates; None for another form."""
     try:
         data = read_bytes(keystore.folder(path) / PERMISSIONS_FILE, "permissions document")

@@ -29,8 +29,8 @@ from sros_tool.keystore.layout import PUBLIC, ROUTER_FILE, is_keystore
 from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.protection import with_stated
 from sros_tool.keystore.reader import (
-    Keystore,
     OpenedEnclave,
+    OpenedKeystore,
     open_enclave,
 )
 from sros_tool.keystore.rights import RightsSource, is_zenoh, load_rights, rights_by_domains
@@ -179,7 +179,7 @@ def _rights_differ_by_domain(source: PictureSource) -> bool:
     return sum(map(len, enclaves)) > len(set[str]().union(*enclaves))
 
 
-def _routers(keystore: Keystore | None) -> int:
+def _routers(keystore: OpenedKeystore | None) -> int:
     """Return the number of Zenoh routers whose files a keystore has."""
     if keystore is None:
         return 0
@@ -249,7 +249,7 @@ def _sample(path: Path, drawing: Drawing) -> SampledKeystore | None:
         if drawing.robots:
             raise UsageError("--robot is for a keystore only", "", "Leave it out.")
         return None
-    keystore = Keystore(path)
+    keystore = OpenedKeystore(path)
     fleet = load_fleet(keystore)
     robots = _robots_of(fleet, keystore.names) if fleet else {}
     known = {unit.name for unit in units_of(keystore.names, robots)}
@@ -363,7 +363,7 @@ def _robots_of(fleet: Fleet, enclaves: Iterable[str]) -> dict[str, Robot]:
 
 
 def _with_requirements(
-    picture: Picture, file: Path, drawing: Drawing, keystore: Keystore | None
+    picture: Picture, file: Path, drawing: Drawing, keystore: OpenedKeystore | None
 ) -> Picture:
     """Return the picture with the rights that break requirements, as ``sros check`` decides.
 
@@ -443,7 +443,7 @@ def read_source(
     if data.lstrip()[:1] == b"{" and not is_zenoh(data, path):
         return _observation(path)
     if sample is None and path.is_dir() and is_keystore(path):
-        keystore = Keystore(path)
+        keystore = OpenedKeystore(path)
         sample = SampledKeystore(keystore, keystore.names)
     if sample:
         read = load_rights(sample.keystore, only_enclaves=sample.enclaves)
@@ -647,7 +647,7 @@ def _certificate(certificate: x509.Certificate, kind: str, title: str, name: str
     return Validity(iso(window.not_after), iso(window.not_before), kind, title, name)
 
 
-def _authorities(keystore: Keystore) -> Iterator[Validity]:
+def _authorities(keystore: OpenedKeystore) -> Iterator[Validity]:
     """Yield the validity of all CA certificates and revocation lists."""
     roles: dict[x509.Certificate, list[str]] = defaultdict(list)
     for path in sorted((keystore.root / PUBLIC).glob(_AUTHORITY_FILES)):

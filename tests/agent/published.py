@@ -19,7 +19,7 @@ from sros_tool.keystore.delivery.repository import load_signer
 from sros_tool.keystore.issuing.authority import Authority, load_authority
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import PERMISSIONS
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from tests.support.harness import Ended, copy_of, sros
 
 DAY = timedelta(days=1)
@@ -64,7 +64,7 @@ class Home:
 
     def permissions_ca(self) -> Authority:
         """Return the permissions CA of the keystore, with its key."""
-        keystore = Keystore(self.root)
+        keystore = OpenedKeystore(self.root)
         return load_authority(keystore, PERMISSIONS, keystore.template, IN_KEYSTORE, self.now)
 
     def kept(self, name: str) -> Path:

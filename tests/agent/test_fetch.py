@@ -31,7 +31,7 @@ from sros_tool.keystore.delivery.release import (
     seal_releases,
 )
 from sros_tool.keystore.issuing.authority import Authority
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.certificates import common_name, issue_ca
 from sros_tool.pki.keys import generate_key
 from sros_tool.validity import window
@@ -47,7 +47,9 @@ def test_a_release_has_all_files_of_a_robot_and_no_key(publisher: Home) -> None:
     assert {*release.enclaves()["/r2/base"]} == there
     for path, data in release.files.items():
         assert (publisher.root / path).read_bytes() == data
-    assert seal_problem(release, [Keystore(publisher.root).ca_certificate("permissions")]) == ""
+    assert (
+        seal_problem(release, [OpenedKeystore(publisher.root).ca_certificate("permissions")]) == ""
+    )
     assert read_release(pack_release(release)) == release
 
 
@@ -210,7 +212,7 @@ def test_the_release_of_another_robot(publisher: Home) -> None:
 
 def test_all_keys_of_publishing_install_nothing(publisher: Home) -> None:
     """Who has them leads a robot to any archive, but the permissions CA has not sealed it."""
-    trusted = [Keystore(publisher.root).ca_certificate("permissions")]
+    trusted = [OpenedKeystore(publisher.root).ca_certificate("permissions")]
     original = publisher.robot().gets()
     assert seal_problem(original, trusted) == ""
     thief = Thief(publisher, publisher.pub, *ROLES)

@@ -40,7 +40,7 @@ from sros_tool.keystore.delivery.repository import Composer, Roots, load_signer,
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.ledger import Entry, clock_behind
 from sros_tool.keystore.lifecycle.change import KeystoreChange
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.transaction import transaction
 from sros_tool.pki.crl import load_crl
 from sros_tool.validity import iso
@@ -247,7 +247,9 @@ def test_next_steps_name_publishing_where_the_keystore_publishes(publisher: Home
 
 
 def test_the_ledger_has_what_was_published(publisher: Home) -> None:
-    entries = [each for each in Keystore(publisher.root).ledger.entries if each.what == "release"]
+    entries = [
+        each for each in OpenedKeystore(publisher.root).ledger.entries if each.what == "release"
+    ]
     lines = sorted(
         f"{hashlib.sha256(data).hexdigest()}  {robot}\n"
         for robot, data in archives(publisher).items()
@@ -311,7 +313,7 @@ def test_a_kill_after_the_keystore_changed_keeps_the_number(
         patched.setattr(publishing._Run, "write", _raise_killed)
         with pytest.raises(_Killed):
             publisher.publish()
-    number = read_published(Keystore(publisher.root)).robots["r1"].release.number
+    number = read_published(OpenedKeystore(publisher.root)).robots["r1"].release.number
     assert not publisher.publish().names("published")
     assert publisher.robot().gets().number == number
 
@@ -368,7 +370,7 @@ def test_many_files_that_nothing_names(publisher: Home, monkeypatch: pytest.Monk
         there = [name for name in names if (publisher.pub / name).exists()]
         assert there == names or run > 1
         publisher.publish(after=3 * DAY)
-        assert len(read_published(Keystore(publisher.root)).superseded) <= 2
+        assert len(read_published(OpenedKeystore(publisher.root)).superseded) <= 2
     assert not there
 
 
@@ -515,7 +517,7 @@ def test_a_keystore_that_was_restored(publisher: Home) -> None:
     publisher.publish()
     robot = publisher.robot()
     latest = robot.gets().number
-    listed = Keystore(publisher.root).revocation_list
+    listed = OpenedKeystore(publisher.root).revocation_list
     assert listed
     shutil.rmtree(publisher.root)
     backup.rename(publisher.root)
@@ -524,7 +526,7 @@ def test_a_keystore_that_was_restored(publisher: Home) -> None:
     robot.gets()
     # What a timer renews meanwhile has the numbers of what came after the backup.
     publisher.run("renew", "ks", "--all")
-    assert Keystore(publisher.root).ledger.next_number() > latest
+    assert OpenedKeystore(publisher.root).ledger.next_number() > latest
     with pytest.raises(KeystoreError, match="restored from a backup"):
         publisher.publish()
     archives = publisher.folder / "archives"
@@ -559,7 +561,7 @@ def test_revoking_after_a_restore_covers_certificates_of_after_the_backup(
     backup = copy_of(publisher.root, publisher.folder / "backup")
     publisher.run("renew", "ks", "--all")
     publisher.publish()
-    stolen = Keystore(publisher.root).certificate_of("/r5/base")
+    stolen = OpenedKeystore(publisher.root).certificate_of("/r5/base")
     shutil.rmtree(publisher.root)
     backup.rename(publisher.root)
     revoke = ("revoke", "ks", "--robot", "r5")
@@ -603,7 +605,7 @@ def test_a_key_that_was_replaced_after_the_backup_is_not_certified_again(
         publisher.pub.rename(publisher.folder / "server")
         publisher.run("renew", "ks", "--all")
         (publisher.folder / "server").rename(publisher.pub)
-    stolen = Keystore(publisher.root).certificate_of("/r2/base")
+    stolen = OpenedKeystore(publisher.root).certificate_of("/r2/base")
     for dry_run in (True, False, False):
         if renewed_first or dry_run:
             what = "`sros renew .* /r2/base --new-key --revoke-old`"
@@ -611,7 +613,7 @@ def test_a_key_that_was_replaced_after_the_backup_is_not_certified_again(
             what = "`sros renew [^ ]* /r1/base` and `sros renew [^ ]* /r2/base --new-key --revoke"
         with pytest.raises(KeystoreError, match=what):
             publisher.publish(restored=True, dry_run=dry_run)
-    crl = Keystore(publisher.root).revocation_list
+    crl = OpenedKeystore(publisher.root).revocation_list
     assert crl and crl.revokes(stolen.serial_number)
     assert "key of enclave /r2/base was revoked" in sros("renew", publisher.root, "/r2/base").err
     publisher.run("renew", "ks", "/r1/base")
@@ -637,9 +639,9 @@ def test_a_publishing_folder_teaches_nothing_that_the_cas_did_not_sign(publisher
         data = pack_release(Release("r2", 999, files, seal))
         (folder / f"{hashlib.sha256(data).hexdigest()}.r2.tar.gz").write_bytes(data)
         (folder / f"{number:064x}.r5.tar.gz").write_bytes(b"x")
-    before = len(Keystore(publisher.root).ledger.entries)
+    before = len(OpenedKeystore(publisher.root).ledger.entries)
     publisher.publish(restored=True)
-    added = Keystore(publisher.root).ledger.entries[before:]
+    added = OpenedKeystore(publisher.root).ledger.entries[before:]
     assert [(entry.what, entry.enclave) for entry in added] == [
         ("restored", ""),
         ("certificate", "/r1/base"),
@@ -740,7 +742,7 @@ def test_a_number_in_the_list_of_what_is_published_that_was_never_given(
 ) -> None:
     path = publisher.root / "published.json"
     kept = path.read_text()
-    known = str(read_published(Keystore(publisher.root)).number)
+    known = str(read_published(OpenedKeystore(publisher.root)).number)
     path.write_text(kept.replace(f'"number": {known}', f'"number": {number}', 1))
     before = snapshot(publisher.folder)
     with pytest.raises(DocumentError, match=r"published\.json' is damaged"):
@@ -819,7 +821,9 @@ def test_keystore_and_folder_that_were_lost(publisher: Home) -> None:
         assert release.number > latest.number + 1000 * (not again), "in one step"
         latest = release
         publisher.robot("r5").refuses(FetchProblem.NOT_FOR_ROBOT)
-        assert [e.what for e in Keystore(publisher.root).ledger.entries].count("restored") == 1
+        assert [e.what for e in OpenedKeystore(publisher.root).ledger.entries].count(
+            "restored"
+        ) == 1
         shutil.rmtree(publisher.pub)
 
 
@@ -896,7 +900,7 @@ def test_a_clock_that_was_set_back(publisher: Home) -> None:
         change.record()
         change.finish()
     assert "h 59 min behind" in clock_behind(publisher.root, wrong)
-    status = fleet_status(Keystore(publisher.root))
+    status = fleet_status(OpenedKeystore(publisher.root))
     assert not status.with_overdue(publisher.now + timedelta(days=30, minutes=30)).clock
     behind = status.with_overdue(publisher.now)
     assert "30 d behind" in behind.clock and not behind.complete
@@ -963,7 +967,7 @@ def test_bins_grow_with_the_fleet(publisher: Home) -> None:
     """Robots accept the lists of ten times as many robots, and names of earlier bins stay."""
     robot = publisher.robot()
     robot.gets()
-    keystore = Keystore(publisher.root)
+    keystore = OpenedKeystore(publisher.root)
     roots = Roots(json.loads((publisher.root / "fleet_root.json").read_text())["roots"])
     private = publisher.root / "private"
     signers = {

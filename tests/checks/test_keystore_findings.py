@@ -16,7 +16,7 @@ from sros_tool.checks.kind import NOTE, Finding
 from sros_tool.dds.decision.vendors import FAST_DDS, joined_titles
 from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.lifecycle.create import create_keystore
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import load_key
@@ -36,7 +36,7 @@ as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can act as sev
 
 def ids(bench: Bench) -> set[str]:
     options = {"now": bench.now, **bench.options}
-    return {each.id for each in keystore_findings(Keystore(bench.checked), **options)}
+    return {each.id for each in keystore_findings(OpenedKeystore(bench.checked), **options)}
 
 
 def test_nothing_in_a_sound_keystore(bench: Bench) -> None:
@@ -74,7 +74,7 @@ def test_a_remedy_that_needs_ca_keys_is_for_the_original_keystore(bench: Bench) 
 
     def remedy() -> str:
         options = {"now": bench.now, **bench.options}
-        found = keystore_findings(Keystore(bench.checked), **options)
+        found = keystore_findings(OpenedKeystore(bench.checked), **options)
         return next(each.remedy for each in found if each.id == "enclave.stale-permissions")
 
     assert f"`sros generate_artifacts -k {bench.root} -p POLICY_FILE`" in remedy()
@@ -162,7 +162,7 @@ def test_a_ca_key_elsewhere_that_others_can_read(mode: int, found: bool, tmp_pat
     root = tmp_path / "ks"
     create_keystore(root, template=template, now=NOW, keyring=Keyring(places=places))
     (tmp_path / "permissions.pem").chmod(mode)
-    shown = {(each.id, each.file) for each in keystore_findings(Keystore(root), now=NOW)}
+    shown = {(each.id, each.file) for each in keystore_findings(OpenedKeystore(root), now=NOW)}
     wanted = {("keystore.key-readable", str(tmp_path / "permissions.pem"))}
     assert shown == (wanted if found else set())
 
@@ -207,7 +207,7 @@ def test_what_strangers_reach_is_said(
 ) -> None:
     bench.governance(("participants>false", "participants>true"))
     bench.sign("enclaves/governance.p7s", lambda text: _present(text, changes))
-    found = keystore_findings(Keystore(bench.checked), now=bench.now)
+    found = keystore_findings(OpenedKeystore(bench.checked), now=bench.now)
     assert words in next(each.text for each in found if each.id == "governance.unauthenticated")
 
 
@@ -231,7 +231,9 @@ def test_the_remedy_for_few_rounds_runs(elsewhere: bool, bench: Bench, tmp_path:
             )
         )
     (found,) = (
-        each for each in keystore_findings(Keystore(bench.root), now=bench.now) if each.id == kind
+        each
+        for each in keystore_findings(OpenedKeystore(bench.root), now=bench.now)
+        if each.id == kind
     )
     command = found.remedy.removeprefix("Run `").removesuffix("`.")
     secrets = "pkcs8 -passin env:SECRET -passout env:SECRET"
@@ -267,13 +269,15 @@ def test_a_secret_that_kubernetes_mounts_hides_no_enclave(bench: Bench, tmp_path
     mounted.chmod(0o700)
     (mounted / "key.pem").chmod(0o600)
     assert [
-        each for each in keystore_findings(Keystore(robot), now=NOW) if each.severity is not NOTE
+        each
+        for each in keystore_findings(OpenedKeystore(robot), now=NOW)
+        if each.severity is not NOTE
     ] == []
     (enclave / "..2025_11_23_10_00_00.123").mkdir()
     (enclave / "..2025_11_23_10_00_00.123/cert.pem").write_bytes(b"")
     listed = sros("list_enclaves", robot).ok()
     assert "/base/..2025_11_23_10_00_00.123" in listed.err
-    found = keystore_findings(Keystore(robot), now=NOW)
+    found = keystore_findings(OpenedKeystore(robot), now=NOW)
     hidden = [each.subject for each in found if each.id == "keystore.hidden-enclave"]
     assert hidden == ["/base/..2025_11_23_10_00_00.123"]
 

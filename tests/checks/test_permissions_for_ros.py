@@ -10,7 +10,7 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.keystores.topic_names import ros_name_problem
 from sros_tool.checks.kind import NOTE, Finding
 from sros_tool.dds.decision.vendors import TESTED, Vendor
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from tests.checks.bench import Bench, name_of
 from tests.checks.keystore_cases import (
     ALLOW,
@@ -37,7 +37,9 @@ UNCONTROLLED = (
 
 def found_in(bench: Bench, vendor: str = "") -> list[Finding]:
     """The findings about the changed permissions, but not that sros did not sign them."""
-    found = keystore_findings(Keystore(bench.checked), now=bench.now, vendors=vendor and (vendor,))
+    found = keystore_findings(
+        OpenedKeystore(bench.checked), now=bench.now, vendors=vendor and (vendor,)
+    )
     return [each for each in found if each.id != "keystore.not-in-ledger"]
 
 

@@ -22,7 +22,7 @@ from sros_tool.checks.kind import Finding
 from sros_tool.checks.policies import policy_file_findings
 from sros_tool.checks.registry import all_kinds
 from sros_tool.checks.runtime import RuntimeState, runtime_findings
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from tests.checks import policy_cases, runtime_cases
 from tests.checks.bench import DAY, SECRET, Bench
 from tests.checks.keystore_cases import CASES
@@ -97,7 +97,9 @@ def test_no_remedy_names_a_command_that_refuses(
     CASES[kind](bench)
     options = {"now": bench.now, **bench.options}
     found = [
-        each for each in keystore_findings(Keystore(bench.checked), **options) if each.id == kind
+        each
+        for each in keystore_findings(OpenedKeystore(bench.checked), **options)
+        if each.id == kind
     ]
     assert found
     at(options["now"], monkeypatch)

@@ -20,7 +20,7 @@ from sros_tool.dds.decision.vendors import TESTED, Signers, joined_titles
 from sros_tool.errors import PkiError
 from sros_tool.faults import ORIGINAL_KEYSTORE, Fault
 from sros_tool.keystore.delivery.robot import RequestAnswer, check_answer, seal
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import load_key
@@ -201,7 +201,7 @@ def worst(bench: Bench, **options: object) -> list[Finding]:
     """The errors, or else the warnings, about what DDS loads, which the keystore did not issue."""
     found = [
         each
-        for each in keystore_findings(Keystore(bench.checked), now=bench.now, **options)  # type: ignore[arg-type]
+        for each in keystore_findings(OpenedKeystore(bench.checked), now=bench.now, **options)  # type: ignore[arg-type]
         if each.severity >= WARNING
         and not each.id.startswith("keystore.")
         and each.id != "governance.not-as-settings"

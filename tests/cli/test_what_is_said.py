@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.keystore.layout import enclave_path
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.certificates import validity_of
 from tests.support.harness import (
     Ended,
@@ -55,7 +55,7 @@ def test_what_still_works_after_taking_a_right_away(verb: str, root: Path) -> No
     # What it names as the remedy runs, and ends it.
     (command,) = commands(line)
     sros(*command, cwd=root.parent).ok()
-    crl = Keystore(root).revocation_list
+    crl = OpenedKeystore(root).revocation_list
     assert crl
     assert before.serial_number in {each.serial for each in crl.revoked}
     assert certificate(folder / "cert.pem").subject != before.subject
@@ -73,7 +73,7 @@ def test_taking_a_right_away_at_once(verb: str, root: Path) -> None:
     ended = sros(*words, cwd=root.parent).ok()
     assert "work until" not in ended.err
     assert "restart the processes of 2 enclaves" in ended.err
-    crl = Keystore(root).revocation_list
+    crl = OpenedKeystore(root).revocation_list
     assert crl
     assert [each.serial for each in crl.revoked] == [before.serial_number]
     assert "rt/secret" not in topics_of(folder)

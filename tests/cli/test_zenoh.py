@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from sros_tool.keystore import zenoh_files
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
 from sros_tool.pki.crl import Revoked, sign_crl
 from sros_tool.pki.keys import load_key
@@ -59,7 +59,7 @@ def test_files_are_signed_whole_and_the_same_again(folder: Path) -> None:
         "wrote ks/enclaves/b/session.json5",
     ]
     assert "restart the processes of 3 enclaves" in ended.err
-    authority = Keystore(folder / "ks").ca_certificate("permissions")
+    authority = OpenedKeystore(folder / "ks").ca_certificate("permissions")
     for path, signed in SIGNED.items():
         document = (folder / "ks" / path).read_bytes()
         message = smime.parse((folder / "ks" / signed).read_bytes())
@@ -266,7 +266,7 @@ def test_a_revocation_that_is_in_the_list_alone_counts(folder: Path) -> None:
     sros("zenoh", "ks", "--mode", "peer", cwd=folder).ok()
     sros("revoke", "ks", "/b", cwd=folder).ok()
     home = folder / "ks"
-    authority = Keystore(home).ca_certificate("identity")
+    authority = OpenedKeystore(home).ca_certificate("identity")
     key = load_key((home / "private/identity_ca.key.pem").read_bytes(), "key")
     now = datetime.now(UTC)
     more = (Revoked(99, now + timedelta(minutes=1)),)

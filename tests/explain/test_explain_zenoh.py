@@ -13,7 +13,7 @@ import pytest
 from sros_tool.cli.common import now
 from sros_tool.explain.answer import ask
 from sros_tool.explain.zenoh import ZenohEvaluator
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import Rules, policy_rights, unfolded
 from tests.explain.zenoh_policies import NAMES, OTHER_END, WORD, drawn_policy
@@ -179,7 +179,7 @@ def test_a_part_of_an_action_that_no_enclave_names_is_noted(tmp_path: Path) -> N
 
 def test_who_may_says_what_each_enclave_is_told(made: Path) -> None:
     """What the router drops is decided without the enclave's own files, with the same answer."""
-    evaluator = ZenohEvaluator(Keystore(made / "client"), moment=now(), domain=0)
+    evaluator = ZenohEvaluator(OpenedKeystore(made / "client"), moment=now(), domain=0)
     outcomes = set()
     for enclave, words in product(evaluator.names, ("publish /chatter", "call /add", "join")):
         question = ask(*words.split())
@@ -428,7 +428,7 @@ def test_random_policies_are_answered_as_their_permissions_say(
     sros("generate_artifacts", "-k", root, "-p", policy).ok()
     sros("zenoh", root, "--mode", mode).ok()
     rules = Rules(unfolded(policy_rights(read_policy(policy))))
-    evaluator = ZenohEvaluator(Keystore(root), moment=now(), domain=0)
+    evaluator = ZenohEvaluator(OpenedKeystore(root), moment=now(), domain=0)
     enclaves = [each for each in evaluator.names if each != "/router"]
     allowed = denied = 0
     for enclave, (right, other), name in product(enclaves, OTHER_END.items(), NAMES):
@@ -446,7 +446,7 @@ def test_random_policies_are_answered_as_their_permissions_say(
 
 def asked_in(root: Path) -> dict[tuple[str, str, str], tuple[tuple[Any, ...], Any]]:
     """Return the answer to each question in a keystore, and the files that are out of date."""
-    evaluator = ZenohEvaluator(Keystore(root), moment=now(), domain=0)
+    evaluator = ZenohEvaluator(OpenedKeystore(root), moment=now(), domain=0)
     found = {}
     for enclave, right, name in product(evaluator.names, OTHER_END, NAMES[: None if LONG else 2]):
         answer = evaluator.answer(enclave, ask(WORD[right], name))

@@ -18,7 +18,7 @@ from sros_tool.explain.log import LogFinding, explain_log
 from sros_tool.files import policies_dir
 from sros_tool.keystore.ledger import Ledger, LedgerFile
 from sros_tool.keystore.participant import LoadedEnclave, load_enclave_of
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.names import PARAMETER_SERVICES
 from sros_tool.pki.certificates import identity_of, load_certificate
 from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
@@ -946,7 +946,7 @@ def test_how_often_files_are_read_is_not_for_the_log_to_choose(
     (tmp_path / "log").write_text("".join(lines))
     read: list[str] = []
 
-    def opened(opening: Keystore, name: str, *, moment: datetime) -> LoadedEnclave:
+    def opened(opening: OpenedKeystore, name: str, *, moment: datetime) -> LoadedEnclave:
         read.append(name)
         return load_enclave_of(opening, name, moment=moment)
 

@@ -40,7 +40,7 @@ from sros_tool.keystore.delivery.published import read_published
 from sros_tool.keystore.fleet import recorded_fleet
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import PUBLISHED, key_on_robot
-from sros_tool.keystore.reader import Keystore, read_certificate
+from sros_tool.keystore.reader import OpenedKeystore, read_certificate
 from sros_tool.keystore.transaction import transaction
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, key_digest, make_request, validity_of
@@ -133,7 +133,7 @@ class Home:
         return last.message.sequence if last and last.message else None
 
     def certificate(self, enclave: str) -> x509.Certificate:
-        return Keystore(self.root).certificate_of(enclave)
+        return OpenedKeystore(self.root).certificate_of(enclave)
 
 
 @pytest.fixture(scope="module")
@@ -427,7 +427,7 @@ def test_what_only_robots_know_to_be_revoked_is_revoked_again(home: Home) -> Non
         assert "r1 has a revocation list" in note.text and "/r2/base" in note.text
         requests = {of.enclave: of.outcome for robot in inbox.robots for of in robot.requests}
         assert requests == {"/r1/base": "renewed", "/r2/base": "refused", "/r2/arm": "refused"}
-    lost, now = load_crl(crl.encode(), "r1"), Keystore(home.root).revocation_list
+    lost, now = load_crl(crl.encode(), "r1"), OpenedKeystore(home.root).revocation_list
     assert now and now.number > lost.number
     assert {of[:1] + of[2:] for of in now.revoked} == {of[:1] + of[2:] for of in lost.revoked}
     assert len(now.revoked) == 2 and not (home.root / "enclaves/r2/base").exists()
@@ -457,7 +457,7 @@ def test_what_the_ca_signed_counts_in_a_message_that_does_not(home: Home) -> Non
         assert [note.id for note in found.notes] == notes
     assert not (home.root / "enclaves/r2/base").exists()
     assert "restored from a backup" in sros("revoke", "ks", "/r1/base", cwd=home.folder).err
-    crl_at_home = Keystore(home.root).revocation_list
+    crl_at_home = OpenedKeystore(home.root).revocation_list
     assert crl_at_home and crl_at_home.revokes(later.serial_number)
 
 
@@ -471,7 +471,7 @@ def test_a_certificate_of_a_revoked_robot_is_revoked_when_it_becomes_known(home:
     home.run("revoke", "ks", "--robot", "r2")
     home.send("r2")
     assert home.of("r2").outcome == "revoked"
-    crl = Keystore(home.root).revocation_list
+    crl = OpenedKeystore(home.root).revocation_list
     assert crl and crl.revokes(later.serial_number)
     assert home.of("r2").outcome == "revoked" and not home.collect().notes
 
@@ -503,7 +503,7 @@ def test_a_certificate_that_was_replaced_after_the_backup(home: Home) -> None:
     assert "was revoked" in sros("renew", home.root, "/r2/base").err
     home.run("renew", "ks", "/r1/base")
     home.run("renew", "ks", "/r2/base", "--new-key", "--revoke-old")
-    crl_at_home = Keystore(home.root).revocation_list
+    crl_at_home = OpenedKeystore(home.root).revocation_list
     assert crl_at_home and not crl_at_home.revokes(home.certificate("/r1/base").serial_number)
     assert not home.collect().notes
 
@@ -528,7 +528,7 @@ def test_a_list_of_another_keystore_revokes_nothing(home: Home) -> None:
     assert found.robots[0].outcome == "kept" and not found.notes
     home.send("r1", crl=foreign.replace("\n-----END", "\nAAAA\n-----END"))
     assert home.of("r1").outcome == "kept"
-    assert Keystore(home.root).revocation_list is None
+    assert OpenedKeystore(home.root).revocation_list is None
 
 
 def test_a_list_is_not_lost_while_the_ca_cannot_sign(home: Home) -> None:
@@ -660,7 +660,7 @@ def test_renewals_are_signed_in_one_change(home: Home) -> None:
     outcomes = [[request.outcome for request in robot.requests] for robot in found.robots]
     assert outcomes == [["renewed", "renewed"], ["renewed"], ["not_allowed"]]
     assert not found.complete and 'renewal = "allowed"' in found.robots[2].requests[0].why
-    issued = [entry for entry in Keystore(home.root).ledger.entries if entry.time > iso(NOW)]
+    issued = [entry for entry in OpenedKeystore(home.root).ledger.entries if entry.time > iso(NOW)]
     assert len({entry.time for entry in issued}) == 1
     assert sorted(entry.enclave for entry in issued if entry.what == "certificate") == sorted(
         before
@@ -687,14 +687,14 @@ def test_renewals_are_signed_in_one_change(home: Home) -> None:
 
 def test_the_ledger_tells_when_a_life_began(home: Home) -> None:
     """Also of a certificate of another CA, whose validity began when it was made."""
-    keystore = Keystore(home.root)
+    keystore = OpenedKeystore(home.root)
     made = [*collecting._Renewals(keystore, recorded_fleet(keystore), NOW)._issued("/r1/base")]
     for validity, when in made:
         assert when and when == validity.not_before + BACKDATE
     assert len(made) == 2
     forgetful = home.root / "ledger.jsonl"
     forgetful.write_text("")
-    keystore = Keystore(home.root)
+    keystore = OpenedKeystore(home.root)
     made = [*collecting._Renewals(keystore, recorded_fleet(keystore), NOW)._issued("/r1/base")]
     assert [when for _, when in made] == [None, None]
 
@@ -813,7 +813,7 @@ def test_what_was_renewed_is_published_at_once(home: Home) -> None:
     ended = sros("fleet", "collect", "ks", "inbox", "--publish", "pub", "--json", cwd=home.folder)
     said = json.loads(ended.out)["published"]
     assert ended.status == 0 and said == {"folder": "pub", "robots": [*ROBOTS], "refused": []}
-    number = read_published(Keystore(home.root)).robots["r1"].release.number
+    number = read_published(OpenedKeystore(home.root)).robots["r1"].release.number
     home.send("r1", datetime.now(UTC), release=number - 1)
     ended = sros("fleet", "collect", "ks", "inbox", "--publish", "pub", cwd=home.folder).ok()
     assert "unchanged: 3 robots" in ended.out
@@ -836,7 +836,7 @@ def test_what_was_published_expires(home: Home) -> None:
     """Robots then refuse it: a fleet whose files are all current is not in order."""
     status = ("fleet", "status", "ks")
     home.run("fleet", "publish", "ks", "pub", "--root-validity", "2d", "--timestamp-validity", "3d")
-    number = read_published(Keystore(home.root)).number
+    number = read_published(OpenedKeystore(home.root)).number
     for robot in ROBOTS:
         home.send(robot, datetime.now(UTC), release=number)
     home.run("fleet", "collect", "ks", "inbox")

@@ -16,7 +16,7 @@ from sros_tool.dds.permissions import Permissions, parse_permissions
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.layout import enclave_names
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
 from sros_tool.policy.document import read_policy
 from tests.support.children import LONG
@@ -116,7 +116,7 @@ def test_the_rights_of_each_robot_are_those_written_by_hand(made: Path) -> None:
         "rq/r7_resetRequest",
         "rr/r7_resetReply",
     }
-    fleet = load_fleet(Keystore(made / "ks"))
+    fleet = load_fleet(OpenedKeystore(made / "ks"))
     assert fleet
     policy = read_policy(made / "robot.xml", placeholders=True)
     assert dict(FleetPolicy(policy, fleet)) == {each.path: each for each in hand.enclaves}
@@ -278,7 +278,7 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
     assert "r7" not in ended.err.replace("/r7", "")
     assert "/hall/r9/base/cmd" not in str(permissions(folder / "ks", "/dispatcher"))
     assert "/hall/r11/base/cmd" in str(permissions(folder / "ks", "/dispatcher"))
-    fleet = load_fleet(Keystore(folder / "ks"))
+    fleet = load_fleet(OpenedKeystore(folder / "ks"))
     assert fleet and "r9" not in fleet.robots and len(fleet.robots) == len(ROBOTS) - 2
     words = ("--include", "keystore.left-enclaves", "--severity", "note", "--json")
     found = json.loads(sros("check", "ks", *words, cwd=folder).out)["findings"]

@@ -27,7 +27,7 @@ from sros_tool.keystore.confirmation import (
 )
 from sros_tool.keystore.fleet_status import FleetStatus, State, fleet_metrics, fleet_status
 from sros_tool.keystore.layout import ENCLAVES, REFUSED
-from sros_tool.keystore.reader import Keystore, read_certificate
+from sros_tool.keystore.reader import OpenedKeystore, read_certificate
 from sros_tool.keystore.template import Template
 from sros_tool.pki.certificates import digest
 from sros_tool.validity import iso, parse_iso
@@ -118,7 +118,7 @@ class Field:
 
     def issued(self, what: str, enclave: str) -> list[str]:
         """Return when what an enclave has was issued."""
-        entries = Keystore(self.root).ledger.entries
+        entries = OpenedKeystore(self.root).ledger.entries
         return [each.time for each in entries if (each.what, each.enclave) == (what, enclave)]
 
 
@@ -581,7 +581,7 @@ def test_expiry_on_robots_is_that_of_the_files_that_they_have(field: Field) -> N
         return {name: robot["expiry"] for name, robot in field.status()["robots"].items()}
 
     before = expiry()
-    ledger = {entry.sha256: entry.not_after for entry in Keystore(field.root).ledger.entries}
+    ledger = {entry.sha256: entry.not_after for entry in OpenedKeystore(field.root).ledger.entries}
     first = digest(read_certificate(field.folder / "r1/enclaves/r1/base/cert.pem"))
     assert before["r1"] == before["r2"] and before["r1"]["certificate"] == ledger[first]
     field.run("update_keystore", "ks", "--set", "certificates.validity=30d")
@@ -600,7 +600,7 @@ def test_expiry_on_robots_is_that_of_the_files_that_they_have(field: Field) -> N
 def test_robots_with_files_that_expire_soon_are_named(
     field: Field, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    status = fleet_status(Keystore(field.root))
+    status = fleet_status(OpenedKeystore(field.root))
     kind, end = min(status.robots[0].expiry.items(), key=lambda item: item[1])
     lines = {
         days: [*_facts(ComparedFleet(end - timedelta(days=days), status, [], []))]
@@ -621,12 +621,12 @@ def test_robots_with_files_that_expire_soon_are_named(
         Template, "longest_validity", lambda _, name: timedelta(1) if name != "/r2/base" else None
     )
     named = "`sros renew ks /r1/base /r3/base --all-expiring 30d`, then deliver"
-    assert command(fleet_status(Keystore(field.root))).replace(str(field.root), "ks") == named
+    assert command(fleet_status(OpenedKeystore(field.root))).replace(str(field.root), "ks") == named
 
 
 def test_a_robot_whose_files_have_expired_is_not_in_order(field: Field) -> None:
     """Whether or not the keystore has renewed them."""
-    status = fleet_status(Keystore(field.root))
+    status = fleet_status(OpenedKeystore(field.root))
     kind, end = min(status.robots[0].expiry.items(), key=lambda item: item[1])
     before = status.with_overdue(end - timedelta(seconds=1))
     assert before.complete and before.counts == {State.CURRENT: 3}
@@ -638,7 +638,7 @@ def test_a_robot_whose_files_have_expired_is_not_in_order(field: Field) -> None:
     assert lines[0] == "3 robots: 3 expired" and lines[1].startswith("expired on a robot since: ")
     assert f"{kind} expired 17 min ago" in lines[-1]
     field.run("renew", "ks", "--robot", "r1")
-    renewed = fleet_status(Keystore(field.root), ["r1"]).with_overdue(late)
+    renewed = fleet_status(OpenedKeystore(field.root), ["r1"]).with_overdue(late)
     assert [(robot.state, robot.to_do) for robot in renewed.robots] == [("expired", "deliver")]
 
 
@@ -1017,7 +1017,7 @@ def test_the_alerts_of_the_page_name_metrics_that_are_written(field: Field) -> N
     (rules,) = re.findall(r"```yaml\n(groups:.*?)```", page, re.DOTALL)
     alerts = [rule["expr"] for rule in yaml.safe_load(rules)["groups"][0]["rules"]]
     named = {name for alert in alerts for name in re.findall(r"sros_\w+", alert)}
-    metrics = fleet_metrics(fleet_status(Keystore(field.root)), now=datetime.now(UTC))
+    metrics = fleet_metrics(fleet_status(OpenedKeystore(field.root)), now=datetime.now(UTC))
     assert len(named) == len(alerts) == 10 and named <= {metric.name for metric in metrics}
 
 

@@ -33,7 +33,7 @@ from sros_tool.keystore.issuing.authority import check_imported
 from sros_tool.keystore.ledger import certificate_entry
 from sros_tool.keystore.lifecycle.rotation import read_rotation, rotation_status
 from sros_tool.keystore.participant import JoinContext
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.template import parse_template, read_template, render_template
 from sros_tool.names import check_enclave_name
@@ -235,7 +235,7 @@ def _log(data: bytes, _place: Place) -> None:
 
 def _ledger(data: bytes, place: Place) -> None:
     place.replace("ledger.jsonl", data)
-    _ = Keystore(place.keystore).ledger
+    _ = OpenedKeystore(place.keystore).ledger
     history(place.keystore, now=NOW)
 
 
@@ -248,7 +248,7 @@ def _zenoh(data: bytes, place: Place) -> None:
 
 def _rotation(data: bytes, place: Place) -> None:
     place.replace("rotation.json", data)
-    read_rotation(Keystore(place.keystore))
+    read_rotation(OpenedKeystore(place.keystore))
     rotation_status(place.keystore, now=NOW)
 
 
@@ -264,7 +264,7 @@ def _confirmation(data: bytes, place: Place) -> None:
         keep_confirmation(place.keystore, received)
     kept = last_confirmation(place.keystore, "r7")
     assert kept and kept.confirmation == received.confirmation
-    found = fleet_status(Keystore(place.keystore)).with_overdue(NOW, timedelta(days=1))
+    found = fleet_status(OpenedKeystore(place.keystore)).with_overdue(NOW, timedelta(days=1))
     assert [each.robot for each in found.robots] == ["r7"]
     assert "r7" in render_metrics(fleet_metrics(found, now=NOW))
 

@@ -19,7 +19,7 @@ from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
-from sros_tool.keystore.reader import Keystore, open_enclave
+from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from tests.integration.kills import Moments, Server, server
 from tests.support.harness import check_whole, copy_of, remains
 from tests.support.long_form import ONLY_LONG, few_steps, some
@@ -57,7 +57,7 @@ def see(root: Path) -> Seen:
         loadable.append((name, (folder / "cert.pem").read_bytes()))
         lists.add((folder / "crl.pem").read_bytes() if (folder / "crl.pem").exists() else b"")
     assert len(lists) == 1, "some refuse the revoked, others do not"
-    crl = Keystore(root).revocation_list
+    crl = OpenedKeystore(root).revocation_list
     assert lists == {(root / "public/identity_ca.crl.pem").read_bytes() if crl else b""}
     return Seen(tuple(loadable), crl.number if crl else 0)
 

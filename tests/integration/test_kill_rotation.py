@@ -18,7 +18,7 @@ from sros_tool.keystore.lifecycle.rotation import (
     read_rotation,
     rotation_status,
 )
-from sros_tool.keystore.reader import Keystore, open_enclave
+from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from sros_tool.keystore.template import load_template
 from tests.integration.kills import Moments, Server, server
 from tests.integration.test_kill_life import DIED, copy, in_child
@@ -56,9 +56,9 @@ def see(root: Path) -> State:
     for path in (*root.glob("private/*.pem"), *root.glob("retired/*.key.pem")):
         # One that is on its way out may be a broken link for a moment.
         assert not path.exists() or path.stat().st_mode & 0o777 == 0o600, path
-    lists = tuple(len(each.revoked) for each in Keystore(root).revocation_lists)
+    lists = tuple(len(each.revoked) for each in OpenedKeystore(root).revocation_lists)
     on = tuple((each.state, each.enclaves) for each in rotation_status(root, now=LATER).authorities)
-    return tuple(names), str(read_rotation(Keystore(root)).stage), on, lists
+    return tuple(names), str(read_rotation(OpenedKeystore(root)).stage), on, lists
 
 
 def settled(root: Path) -> State:

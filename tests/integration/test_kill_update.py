@@ -13,7 +13,7 @@ from sros_tool.keystore.describe import history
 from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.update import update_keystore
-from sros_tool.keystore.reader import Keystore, open_enclave
+from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from sros_tool.keystore.settings import present_settings
 from sros_tool.keystore.template import load_template
 from tests.integration.kills import Moments, Server, server
@@ -49,7 +49,7 @@ def see(root: Path) -> State:
         assert state.grant
         days = (state.grant.validity.not_after - LATER).days + 1
         enclaves.append((len(state.certificate.subject.rdns), days))
-    present, crl = present_settings(Keystore(root)), Keystore(root).revocation_list
+    present, crl = present_settings(OpenedKeystore(root)), OpenedKeystore(root).revocation_list
     assert present.written
     rtps = present.governance.domain_access_rules[0].rtps_protection_kind
     return present.written.name, rtps, tuple(enclaves), crl.number if crl else 0
@@ -60,10 +60,10 @@ def settled(root: Path) -> State:
     assert not remains(root.parent)
     check_whole(root)
     assert not history(root, now=LATER).unexplained
-    assert not present_settings(Keystore(root)).edits
+    assert not present_settings(OpenedKeystore(root)).edits
     now = see(root)
     one = ("ca",) if now[0] == "sros2" else ("identity_ca", "permissions_ca")
-    assert tuple(sorted(Keystore(root).authority_files)) == one
+    assert tuple(sorted(OpenedKeystore(root).authority_files)) == one
     return now
 
 

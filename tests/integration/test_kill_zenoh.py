@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.keystore.lifecycle.create import create_permission
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
 from sros_tool.policy.document import read_policy
 from tests.integration.test_kill_life import DIED, copy, in_child
@@ -20,7 +20,7 @@ LATER = datetime.now(UTC) + timedelta(hours=1)
 
 def see(root: Path) -> bool:
     """Whether /a may publish /z; the same for DDS, its session and the router, all of it signed."""
-    authority = Keystore(root).ca_certificate("permissions")
+    authority = OpenedKeystore(root).ca_certificate("permissions")
     said = set()
     for folder, name in (("a", "permissions"), ("a", "session"), ("router", "router")):
         signed = smime.parse((root / f"enclaves/{folder}/{name}.p7s").read_bytes())

@@ -16,7 +16,7 @@ from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.lifecycle.update import update_keystore
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.settings import present_settings
 from sros_tool.keystore.template import NamedValues, load_template, with_values
 from sros_tool.pki import smime
@@ -93,10 +93,10 @@ def test_which_governance_disturbs(ask: Ask, tmp_path: Path) -> None:
     questions = {}
     for number, (values, rules, domain, topic, expected) in enumerate(CHANGES.values()):
         other = copy(root, f"other{number}")
-        target = with_values(present_settings(Keystore(root)).settings, values, rules)
+        target = with_values(present_settings(OpenedKeystore(root)).settings, values, rules)
         domains = DomainSet.of((DOMAIN, DOMAIN), (domain, domain)) if domain else None
         update_keystore(other, target, domains, now=datetime.now(UTC), allow_looser=True)
-        found = mismatch(Keystore(root).governance, Keystore(other).governance)
+        found = mismatch(OpenedKeystore(root).governance, OpenedKeystore(other).governance)
         disturbed = found.everything or f"topic {topic}" in found.names
         assert disturbed == (expected == SILENT)
         one, two = (root, other) if number % 2 else (other, root)

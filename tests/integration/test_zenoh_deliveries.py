@@ -11,7 +11,7 @@ import pytest
 from sros_tool.cli.common import now
 from sros_tool.explain.answer import ask
 from sros_tool.explain.zenoh import ZenohEvaluator
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.zenoh.configuration import Mode
 from tests.explain.zenoh_policies import NAMES, OTHER_END, WORD, drawn_policy
 from tests.support.children import LONG
@@ -74,7 +74,7 @@ def test_what_explain_answers_is_what_happens(tmp_path: Path, mode: str, seed: i
     """Each enclave of a random policy tries every name in every direction, also with no rules."""
     policy = drawn_policy(random.Random(f"live {seed}"))
     keystore = make_keystore(tmp_path, policy, mode)
-    evaluator = ZenohEvaluator(Keystore(keystore), moment=now(), domain=0)
+    evaluator = ZenohEvaluator(OpenedKeystore(keystore), moment=now(), domain=0)
     answers = {
         enclave: {
             right: [

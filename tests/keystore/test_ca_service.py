@@ -28,7 +28,7 @@ from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotate import renew_identity_ca, rotate_ca
 from sros_tool.keystore.lifecycle.update import update_keystore
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import (
     common_name,
@@ -282,7 +282,7 @@ def test_the_service_signs_the_revocation_list(site: Path) -> None:
     with pytest.raises(KeystoreError, match="no node could start in /listener"):
         refresh_crl(site, now=now(), crl=listed(serial, mine, number=6))
     refresh_crl(site, now=now(), crl=listed(serial, number=6))
-    present = Keystore(site).revocation_list
+    present = OpenedKeystore(site).revocation_list
     assert present and present.number == 6
     (ends,) = (found for found in check(site) if found.id == "keystore.revocation-list-ends")
     assert f"sros crl {site} --refresh --crl FILE" in ends.remedy
@@ -349,7 +349,7 @@ def test_what_a_service_cannot_do_is_refused(site: Path, tmp_path: Path) -> None
         rotate_ca(site, now=now())
     assert snapshot(site) == before
     rotate_ca(site, now=now(), roles=["permissions"], finish=True)
-    assert not Keystore(site).ledger.gaps
+    assert not OpenedKeystore(site).ledger.gaps
     for template, imported, words in (
         (TEMPLATE, {}, "with --identity-ca FILE"),
         (replace(TEMPLATE, separate_authorities=False), {"identity": pem(CA)}, "layout separate"),

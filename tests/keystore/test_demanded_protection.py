@@ -10,7 +10,7 @@ import pytest
 from sros_tool.dds.governance import parse_governance
 from sros_tool.files import templates_dir
 from sros_tool.keystore.protection import less_protected
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Level, stated_protections
@@ -45,7 +45,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def missing(root: Path, policy: Path) -> list[str]:
     message = (root / "enclaves/governance.p7s").read_bytes()
     governance = parse_governance(smime.parse(message).document)
-    settings = Keystore(root).template
+    settings = OpenedKeystore(root).template
     assert governance == governance_for(settings.protection, governance.domains().closed())
     stated = stated_protections(read_policy(policy).enclaves)
     return [str(each) for each, _ in less_protected(governance, stated)]
@@ -70,7 +70,7 @@ def test_an_existing_keystore_gets_a_governance_that_keeps_to_it(folder: Path) -
         assert "export them again" in ended.err
     check_whole(ks)
     assert missing(ks, policy) == []
-    named = {str(each): each.protection for each in Keystore(ks).template.protection.named}
+    named = {str(each): each.protection for each in OpenedKeystore(ks).template.protection.named}
     assert named["topic /image"].metadata is Level.SIGN
     assert named["topic /cmd_vel"].data is Level.ENCRYPT
     assert sros("check", ks, "--policy", policy, "--include", "governance.less*").status == 0
@@ -100,7 +100,7 @@ def test_a_new_keystore_is_made_with_it(folder: Path) -> None:
 def test_a_template_that_protects_more_stays(folder: Path) -> None:
     words = ("-p", "p.xml", "--template", "production")
     sros("generate_artifacts", "-k", "strict", *words, cwd=folder).ok()
-    assert Keystore(folder / "strict").template.protection.named == ()
+    assert OpenedKeystore(folder / "strict").template.protection.named == ()
     assert missing(folder / "strict", folder / "p.xml") == []
 
 

@@ -24,7 +24,7 @@ from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from tests.support.harness import copy_of, policy_text, publish, snapshot, sros
@@ -283,7 +283,7 @@ def test_keys_of_revoked_enclaves_are_kept_at_home(fleet: Path) -> None:
     (said,) = verify_arrival(fleet, now=NOW).findings
     assert "revoked/" in said.text
     assert "elete" not in said.remedy
-    kinds = {each.id for each in keystore_findings(Keystore(fleet), now=NOW)}
+    kinds = {each.id for each in keystore_findings(OpenedKeystore(fleet), now=NOW)}
     assert not kinds & {"keystore.home-or-robot", "keystore.ca-key-on-robot"}
 
 
@@ -299,7 +299,7 @@ def test_an_export_that_looks_like_home_is_found_with_its_ca_key(
             copy = shutil.copytree if source.is_dir() else shutil.copy
             copy(source, robot / name)
     verified = {each.id for each in verify_arrival(robot, now=NOW).findings}
-    checked = {each.id: each.remedy for each in keystore_findings(Keystore(robot), now=NOW)}
+    checked = {each.id: each.remedy for each in keystore_findings(OpenedKeystore(robot), now=NOW)}
     assert "keystore.home-or-robot" in verified & set(checked)
     assert "keep them" in checked["keystore.home-or-robot"]
 

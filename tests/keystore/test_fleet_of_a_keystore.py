@@ -14,7 +14,7 @@ from sros_tool.fleet import robots
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.keystore.fleet import left_enclave_notes, recorded_fleet
 from sros_tool.keystore.layout import list_enclaves
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from tests.support.harness import Ended, copy_of, policy_text, publish, snapshot, sros
 
 FLEET = "[robots]\na = {}\na_arm = {}\n"
@@ -124,7 +124,7 @@ def of_robot(root: Path, robot: str) -> dict[str, Any]:
 
 
 def test_what_an_earlier_change_left_is_named_when_a_robot_leaves(unknown: Path) -> None:
-    before = recorded_fleet(Keystore(unknown / "ks"))
+    before = recorded_fleet(OpenedKeystore(unknown / "ks"))
     after = Fleet.of([Robot("r30", "/r30")], enclaves=before.enclaves)
     (note,) = left_enclave_notes(unknown / "ks", before, after)
     assert "is no longer in the fleet: /r3, /r3/a, /r3/deep/er stay valid" in note.text

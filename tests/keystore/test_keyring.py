@@ -16,7 +16,7 @@ from sros_tool.errors import KeystoreError, UsageError
 from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.layout import list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from tests.support.harness import sros
 
@@ -69,7 +69,7 @@ def test_keys_away_from_the_keystore(tmp_path: Path) -> None:
     create_keystore(root, template=template, now=NOW, keyring=Keyring(places=places))
     assert not (root / "private").exists()
     assert {key.stat().st_mode & 0o777 for key in away.iterdir()} == {0o600}
-    assert Keystore(root).template.identity_key == places["identity"]
+    assert OpenedKeystore(root).template.identity_key == places["identity"]
     create_enclaves(root, ["/a"], now=NOW)  # finds the keys by the settings
     away.rename(tmp_path / "drawer")
     with pytest.raises(KeystoreError, match="SROS_IDENTITY_KEY"):

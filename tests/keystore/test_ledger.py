@@ -22,7 +22,7 @@ from sros_tool.keystore.lifecycle.create import (
 )
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.policy.document import read_policy
@@ -38,7 +38,7 @@ def made(root: Path, *names: str, template: str = "production") -> Path:
 
 
 def told(root: Path) -> list[tuple[str, str]]:
-    return [(entry.what, entry.enclave) for entry in Keystore(root).ledger.entries]
+    return [(entry.what, entry.enclave) for entry in OpenedKeystore(root).ledger.entries]
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_every_command_records_what_it_issues(
 
 def test_entries_describe_the_files_in_the_keystore(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
-    by_kind = {entry.what: entry for entry in Keystore(root).ledger.entries}
+    by_kind = {entry.what: entry for entry in OpenedKeystore(root).ledger.entries}
     issued = certificate(root / "enclaves/a/cert.pem")
     entry = by_kind["certificate"]
     assert entry.sha256 == issued.fingerprint(hashes.SHA256()).hex()
@@ -88,7 +88,7 @@ def test_a_renewal_keeps_the_digest_of_the_policy(tmp_path: Path) -> None:
     renew(root, ["/a"], now=NOW)
     renew(root, ["/a", "/b"], now=NOW, new_key=True)
     digests = [
-        entry.policy for entry in Keystore(root).ledger.entries if entry.what == "permissions"
+        entry.policy for entry in OpenedKeystore(root).ledger.entries if entry.what == "permissions"
     ]
     default, own = digests[0], read.enclaves[0].digest
     assert default
@@ -131,7 +131,7 @@ def test_a_damaged_ledger_is_reported_and_kept(line: str, tmp_path: Path) -> Non
     with (root / LEDGER).open("a", encoding="latin-1") as file:
         file.write(line + "\n")
     before = snapshot(root)
-    assert Keystore(root).ledger.gaps[0] == "line 7 is not an entry"
+    assert OpenedKeystore(root).ledger.gaps[0] == "line 7 is not an entry"
     ended = sros("inspect", root, "--history")
     assert (ended.status, ended.err) == (1, ""), ended
     assert "LEDGER DAMAGED  line 7 is not an entry" in ended.out
@@ -142,16 +142,16 @@ def test_a_missing_newline_at_the_end_is_added(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
     ledger = root / LEDGER
     ledger.write_bytes(ledger.read_bytes().removesuffix(b"\n"))
-    before = Keystore(root).ledger.entries
+    before = OpenedKeystore(root).ledger.entries
     renew(root, ["/a"], now=NOW)
-    assert Keystore(root).ledger.entries[: len(before)] == before
-    assert len(Keystore(root).ledger.entries) == len(before) + 2
+    assert OpenedKeystore(root).ledger.entries[: len(before)] == before
+    assert len(OpenedKeystore(root).ledger.entries) == len(before) + 2
 
 
 def test_a_keystore_without_a_ledger_gets_one(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
     (root / LEDGER).unlink()
-    assert Keystore(root).ledger.entries == ()
+    assert OpenedKeystore(root).ledger.entries == ()
     assert len(history(root, now=NOW).unexplained) == 5
     with pytest.raises(KeystoreError, match="not certain that"):
         renew(root, ["/a"], now=NOW)
@@ -228,7 +228,7 @@ def test_history_as_text_and_json(tmp_path: Path) -> None:
     sros("create_enclave", root, "/a", "/b").ok()
     sros("revoke", root, "/b", "--reason", "key_compromise").ok()
     lines = sros("inspect", root, "--history").ok().out.splitlines()
-    assert len(lines) == len(Keystore(root).ledger.entries) == 10
+    assert len(lines) == len(OpenedKeystore(root).ledger.entries) == 10
     assert [line.split()[1:3] for line in lines[:5]] == [
         ["ca", "current"],
         ["ca", "current"],

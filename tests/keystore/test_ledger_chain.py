@@ -19,7 +19,7 @@ from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotate import renew_identity_ca, rotate_ca
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate, make_request
@@ -55,7 +55,7 @@ def put(root: Path, lines: list[bytes]) -> None:
 
 
 def revoked(root: Path) -> set[int]:
-    found = Keystore(root).revocation_list
+    found = OpenedKeystore(root).revocation_list
     return {each.serial for each in found.revoked} if found else set()
 
 
@@ -106,19 +106,19 @@ TAMPERED: dict[str, Callable[[list[bytes]], list[bytes]]] = {
 
 @pytest.mark.parametrize("case", TAMPERED)
 def test_a_changed_ledger_is_noticed_and_revoking_goes_on(case: str, root: Path) -> None:
-    ledger = Keystore(root).ledger
+    ledger = OpenedKeystore(root).ledger
     assert (ledger.gaps, ledger.unchained, len(ledger.certain)) == ((), 0, ledger.lines)
     put(root, TAMPERED[case](lines_of(root)))
-    gaps = Keystore(root).ledger.gaps
+    gaps = OpenedKeystore(root).ledger.gaps
     assert gaps
     present = certificate(root / "enclaves/a/cert.pem").serial_number
     done = revoke(root, ["/a"], now=NOW)
     assert present in revoked(root)
     assert any(gaps[0] in remark.text and "stay valid" in remark.text for remark in done.remarks)
     # What the new head signs hides nothing of it.
-    assert gaps[0] in Keystore(root).ledger.gaps
+    assert gaps[0] in OpenedKeystore(root).ledger.gaps
     renew(root, ["/b"], now=NOW, new_key=True) if "/b" in certain(root) else None
-    assert gaps[0] in Keystore(root).ledger.gaps
+    assert gaps[0] in OpenedKeystore(root).ledger.gaps
 
 
 def test_who_certifies_a_key_is_told_that_the_ledger_may_lack_revocations(root: Path) -> None:
@@ -133,7 +133,9 @@ def test_who_certifies_a_key_is_told_that_the_ledger_may_lack_revocations(root: 
 
 
 def certain(root: Path) -> set[str]:
-    return {each.enclave for each in Keystore(root).ledger.certain if each.what == "permissions"}
+    return {
+        each.enclave for each in OpenedKeystore(root).ledger.certain if each.what == "permissions"
+    }
 
 
 def test_what_sros_says_of_a_changed_ledger(root: Path) -> None:
@@ -150,7 +152,7 @@ def test_what_sros_says_of_a_changed_ledger(root: Path) -> None:
 
 
 def test_a_whole_ledger_revokes_everything_and_says_nothing(root: Path) -> None:
-    issued = [each for each in Keystore(root).ledger.entries if each.what == "certificate"]
+    issued = [each for each in OpenedKeystore(root).ledger.entries if each.what == "certificate"]
     wanted = {int(each.serial, 16) for each in issued if each.enclave == "/a"}
     assert len(wanted) == 2
     assert revoke(root, ["/a"], now=NOW).remarks == ()
@@ -167,48 +169,48 @@ def test_the_head_is_signed_by_a_ca(root: Path, tmp_path: Path) -> None:
     key = load_key((folder / "key.pem").read_bytes(), "")
     document = smime.parse((root / LEDGER_HEAD).read_bytes()).document
     (root / LEDGER_HEAD).write_bytes(smime.sign(document, own, key))
-    assert "no CA of this keystore signed it" in Keystore(root).ledger.gaps[0]
+    assert "no CA of this keystore signed it" in OpenedKeystore(root).ledger.gaps[0]
     shutil.copy(root / "enclaves/governance.p7s", root / LEDGER_HEAD)
-    assert "is not the signed end" in Keystore(root).ledger.gaps[0]
+    assert "is not the signed end" in OpenedKeystore(root).ledger.gaps[0]
     (root / LEDGER_HEAD).unlink()
-    assert "is missing" in Keystore(root).ledger.gaps[0]
+    assert "is missing" in OpenedKeystore(root).ledger.gaps[0]
 
 
 def test_a_ledger_without_a_chain_is_read_and_chained_from_then_on(root: Path) -> None:
-    before = [each.sha256 for each in Keystore(root).ledger.entries]
+    before = [each.sha256 for each in OpenedKeystore(root).ledger.entries]
     without_chain(root)
-    ledger = Keystore(root).ledger
+    ledger = OpenedKeystore(root).ledger
     assert [each.sha256 for each in ledger.entries] == before
     assert (ledger.gaps, ledger.unchained) == ((), len(before))
     create_enclaves(root, ["/new"], now=NOW)
-    ledger = Keystore(root).ledger
+    ledger = OpenedKeystore(root).ledger
     assert (ledger.gaps, ledger.unchained) == ((), len(before))
     (remark,) = revoke(root, ["/a"], now=NOW).remarks
     assert f"whether one of its first {len(before)} lines was removed" in remark.text
     put(root, lines_of(root)[1:])
-    assert Keystore(root).ledger.gaps
+    assert OpenedKeystore(root).ledger.gaps
 
 
 def test_a_reader_during_a_commit_and_a_link_in_the_way(root: Path, tmp_path: Path) -> None:
     """While a transaction ends the file is a link; a writer, which holds the lock, follows none."""
     (root / LEDGER).rename(tmp_path / "moved")
     (root / LEDGER).symlink_to(tmp_path / "moved")
-    assert Keystore(root).ledger.gaps == ()
+    assert OpenedKeystore(root).ledger.gaps == ()
     with pytest.raises(KeystoreError, match="cannot be read"):
         renew(root, ["/a"], now=NOW)
 
 
 def test_new_cas_leave_the_gaps_behind(root: Path) -> None:
     put(root, _edit(lines_of(root)))
-    assert Keystore(root).ledger.gaps
+    assert OpenedKeystore(root).ledger.gaps
     renew_identity_ca(root, now=NOW)  # with the same key, what was issued before stays valid
-    assert Keystore(root).ledger.gaps
+    assert OpenedKeystore(root).ledger.gaps
     rotate_ca(root, now=NOW, finish=True)
-    ledger = Keystore(root).ledger
+    ledger = OpenedKeystore(root).ledger
     assert ledger.gaps == ()
     assert {each.enclave for each in ledger.certain if each.what == "certificate"} == {"/a", "/b"}
     put(root, lines_of(root)[:-1])
-    assert Keystore(root).ledger.gaps
+    assert OpenedKeystore(root).ledger.gaps
 
 
 @pytest.mark.parametrize("put_back", [True, False], ids=["older", "none"])
@@ -245,11 +247,11 @@ def test_a_huge_ledger_and_a_pipe_are_refused(tmp_path: Path) -> None:
     (tmp_path / LEDGER).touch()
     os.truncate(tmp_path / LEDGER, 1 << 40)
     with pytest.raises(KeystoreError, match="too large"):
-        _ = Keystore(tmp_path).ledger
+        _ = OpenedKeystore(tmp_path).ledger
     (tmp_path / LEDGER).unlink()
     os.mkfifo(tmp_path / LEDGER)
     with pytest.raises(KeystoreError, match="not a regular file"):
-        _ = Keystore(tmp_path).ledger
+        _ = OpenedKeystore(tmp_path).ledger
 
 
 @pytest.mark.parametrize("case", TAMPERED)
@@ -257,7 +259,7 @@ def test_reading_some_entries_proves_the_chain_of_all(case: str, root: Path) -> 
     wanted = ("enclave", "/b")
 
     def some() -> None:
-        every, found = Keystore(root).ledger, Keystore(root).ledger_with(*wanted)
+        every, found = OpenedKeystore(root).ledger, OpenedKeystore(root).ledger_with(*wanted)
         for entries, those in ((every.entries, found.entries), (every.certain, found.certain)):
             expected = [each for each in entries if each.enclave == "/b"]
             assert [each for each in those if each.enclave == "/b"] == expected
@@ -268,7 +270,9 @@ def test_reading_some_entries_proves_the_chain_of_all(case: str, root: Path) -> 
         )
 
     some()
-    assert len(Keystore(root).ledger_with(*wanted).entries) < len(Keystore(root).ledger.entries)
+    assert len(OpenedKeystore(root).ledger_with(*wanted).entries) < len(
+        OpenedKeystore(root).ledger.entries
+    )
     put(root, TAMPERED[case](lines_of(root)))
     some()
     revoke(root, ["/a"], now=NOW)  # which records what is wrong
@@ -277,20 +281,22 @@ def test_reading_some_entries_proves_the_chain_of_all(case: str, root: Path) -> 
 
 def test_a_line_in_another_form_is_read_as_ever(root: Path) -> None:
     """A line that was written by hand, or by an earlier version, need not have the form of ours."""
-    before = Keystore(root).ledger.entries
+    before = OpenedKeystore(root).ledger.entries
     spaced = [json.dumps(json.loads(line)).encode() for line in lines_of(root)]
     put(root, [re.sub(rb', "previous": "[0-9a-f]+"', b"", line) for line in spaced])
     (root / LEDGER_HEAD).unlink()
-    assert [each._replace(previous="") for each in before] == list(Keystore(root).ledger.entries)
+    assert [each._replace(previous="") for each in before] == list(
+        OpenedKeystore(root).ledger.entries
+    )
     put(root, [*lines_of(root)[:4], b'{"time":"x","what":"certificate","serial":"000"}'])
-    assert len(Keystore(root).ledger.entries) == 4
+    assert len(OpenedKeystore(root).ledger.entries) == 4
 
 
 def test_a_ledger_of_many_lines_that_are_none(root: Path) -> None:
     """They are one fault, not as many as lines."""
     lines = lines_of(root)
     put(root, [*lines[:3], *([b""] * 5000), *lines[3:], b"nonsense"])
-    ledger = Keystore(root).ledger
+    ledger = OpenedKeystore(root).ledger
     assert len(ledger.entries) == len(lines)
     assert ledger.gaps[0] == "lines 4 to 5003 are not entries"
     assert f"line {len(lines) + 5001} is not an entry" in ledger.gaps
@@ -302,15 +308,15 @@ def test_a_ledger_over_the_limit_says_how_to_go_on(
     limit: str, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     size = {
-        "_MOST_LINES": Keystore(root).ledger.lines,
+        "_MOST_LINES": OpenedKeystore(root).ledger.lines,
         "_MOST_BYTES": (root / LEDGER).stat().st_size,
     }
     with monkeypatch.context() as patch:
         patch.setattr(f"sros_tool.keystore.ledger.{limit}", size[limit])
-        assert not Keystore(root).ledger.gaps
+        assert not OpenedKeystore(root).ledger.gaps
         patch.setattr(f"sros_tool.keystore.ledger.{limit}", size[limit] - 1)
         for work in (
-            lambda: Keystore(root).ledger,
+            lambda: OpenedKeystore(root).ledger,
             lambda: create_enclaves(root, ["/new"], now=NOW),
         ):
             with pytest.raises(KeystoreError, match="too large") as refused:
@@ -326,5 +332,5 @@ def test_a_ledger_over_the_limit_says_how_to_go_on(
     for _ in range(3):  # distribute, switch, retire
         sros("rotate_ca", root, "--next").ok()
     assert load_certificate((root / "public/identity_ca.cert.pem").read_bytes(), "") != before
-    assert Keystore(root).ledger.gaps == ()
+    assert OpenedKeystore(root).ledger.gaps == ()
     revoke(root, ["/a"], now=NOW)

@@ -23,7 +23,7 @@ from sros_tool.keystore.ledger_index import IndexUpdate
 from sros_tool.keystore.lifecycle.create import create_enclaves
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.certificates import make_request
 from sros_tool.pki.crl import load_crl
 from sros_tool.pki.keys import generate_key, load_key
@@ -43,20 +43,20 @@ def root(keystore: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def is_indexed(root: Path) -> bool:
-    return Keystore(root).ledger_file.is_indexed
+    return OpenedKeystore(root).ledger_file.is_indexed
 
 
 def check_answers(root: Path) -> None:
     """Compare what the index finds with the whole ledger."""
-    whole = Keystore(root).ledger
+    whole = OpenedKeystore(root).ledger
     serials = [entry.serial for entry in whole.entries if entry.serial]
     for name, value in [*QUESTIONS, *(("serial", serial) for serial in serials)]:
-        some = Keystore(root).ledger_with(name, value)
+        some = OpenedKeystore(root).ledger_with(name, value)
         assert [e for e in some.entries if getattr(e, name) == value] == [
             e for e in whole.entries if getattr(e, name) == value
         ]
         assert (some.gaps, some.lines) == (whole.gaps, whole.lines)
-    assert Keystore(root).ledger_file.next_number() == whole.next_number()
+    assert OpenedKeystore(root).ledger_file.next_number() == whole.next_number()
 
 
 def test_an_index_answers_as_the_whole_ledger_does(root: Path) -> None:
@@ -224,7 +224,7 @@ def test_a_kill_between_keystore_and_index_is_noticed(
     renew(root, ["/b"], now=NOW)
     assert is_indexed(root)
     check_answers(root)
-    assert Keystore(root).ledger.gaps == ()
+    assert OpenedKeystore(root).ledger.gaps == ()
     assert remains(root) == [LEDGER_INDEX]
 
 
@@ -234,9 +234,9 @@ def test_a_ledger_with_another_end_is_read_whole(end: bytes, root: Path) -> None
     lines = ledger.read_bytes().splitlines(keepends=True)
     ledger.write_bytes(b"".join(lines[: None if end else -1]) + end)
     assert not is_indexed(root)
-    assert Keystore(root).ledger_with("enclave", "/a").gaps
+    assert OpenedKeystore(root).ledger_with("enclave", "/a").gaps
     create_enclaves(root, ["/new"], now=NOW)
-    assert any(entry.what == "gap" for entry in Keystore(root).ledger.entries)
+    assert any(entry.what == "gap" for entry in OpenedKeystore(root).ledger.entries)
     assert not is_indexed(root)
 
 
@@ -246,8 +246,8 @@ def test_a_changed_line_is_not_believed(root: Path) -> None:
     first = data.index(b'"enclave":"/a"')
     ledger.write_bytes(data[:first] + b'"enclave":"/x"' + data[first + 14 :])
     assert is_indexed(root)
-    assert Keystore(root).ledger_with("enclave", "/a").gaps
-    assert Keystore(root).ledger.gaps
+    assert OpenedKeystore(root).ledger_with("enclave", "/a").gaps
+    assert OpenedKeystore(root).ledger.gaps
 
 
 def test_a_short_ledger_has_no_index(keystore: Path) -> None:

@@ -17,7 +17,7 @@ import pytest
 from sros_tool.keystore.describe import HistoryStatus, history
 from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.rotation import rotation_status
-from sros_tool.keystore.reader import Keystore, open_enclave
+from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from tests.support.harness import certificate, check_enclave_whole, remains, snapshot, sros
 from tests.support.long_form import some
 from tests.support.made_by_ros2 import make
@@ -190,14 +190,14 @@ def test_revoking(root: Path, tmp_path: Path) -> None:
     stolen = Path(shutil.copytree(enclave_path(root, "/d"), tmp_path / "stolen"))
     sros("revoke", root, "/d", "--reason", "key_compromise").ok()
     check(root, "/a", "/b/c")
-    (crl,) = Keystore(root).revocation_lists
+    (crl,) = OpenedKeystore(root).revocation_lists
     assert [each.serial for each in crl.revoked] == [certificate(stolen / "cert.pem").serial_number]
     shutil.copy(root / "public/identity_ca.crl.pem", stolen / "crl.pem")
     found = [str(each) for each in open_enclave(stolen, now=datetime.now(UTC)).problems]
     assert found == ["cert.pem: it is revoked by crl.pem"]
     sros("crl", root, "--refresh").ok()
     check(root, "/a", "/b/c")
-    assert len(Keystore(root).revocation_lists[0].revoked) == 1
+    assert len(OpenedKeystore(root).revocation_lists[0].revoked) == 1
     revoked = {each.entry.what for each in history(root, now=NOW).entries if each.entry.serial}
     assert revoked == {"revocation", "certificate", "ca"}
 
@@ -236,9 +236,9 @@ def test_no_list_is_distributed_that_may_be_taken_for_another(root: Path) -> Non
     sros("create_enclave", root, "/e").ok()
     sros("revoke", root, "/e").ok()
     assert b"X509 CRL" not in (root / "public/ca.cert.pem").read_bytes()
-    assert len(Keystore(root).revocation_lists) == 1
+    assert len(OpenedKeystore(root).revocation_lists) == 1
     sros("rotate_ca", root, "--to", "reissue").ok()
-    new, old = Keystore(root).revocation_lists
+    new, old = OpenedKeystore(root).revocation_lists
     assert not new.revoked
     assert len(old.revoked) == 2  # whoever trusts the old CA still asks this one
 

@@ -14,7 +14,7 @@ from sros_tool.keystore.layout import LEDGER, enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from tests.support.harness import certificate
 
@@ -23,7 +23,7 @@ DAY = timedelta(days=1)
 
 
 def listed(root: Path) -> set[int]:
-    crl = Keystore(root).revocation_list
+    crl = OpenedKeystore(root).revocation_list
     assert crl
     return {each.serial for each in crl.revoked}
 
@@ -70,7 +70,7 @@ def test_revoking_another_drops_it_too_and_the_ledger_keeps_it(tmp_path: Path) -
     assert serial not in listed(root)
     assert other in listed(root)
     assert f"{serial:x}" in {
-        each.serial for each in Keystore(root).ledger.entries if each.what == "revocation"
+        each.serial for each in OpenedKeystore(root).ledger.entries if each.what == "revocation"
     }
     (found,) = [
         item

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.keystore.layout import list_enclaves
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.selection import likely_names, missing_enclave_error
 from sros_tool.pki.certificates import load_certificate
 from tests.support.harness import sros
@@ -37,7 +37,7 @@ def test_who_may_be_meant(name: str, meant: tuple[str, ...]) -> None:
 
 
 def test_the_error_names_who_may_be_meant_and_does_not_say_to_make_it() -> None:
-    text = str(missing_enclave_error(Keystore(Path("robot")), "/telop", THERE))
+    text = str(missing_enclave_error(OpenedKeystore(Path("robot")), "/telop", THERE))
     assert text == (
         "enclave /telop does not exist in keystore 'robot'. Perhaps you mean /mobile_robot/teleop."
     )
@@ -45,13 +45,15 @@ def test_the_error_names_who_may_be_meant_and_does_not_say_to_make_it() -> None:
 
 def test_where_nobody_is_meant_the_error_says_who_is_there(tmp_path: Path) -> None:
     (tmp_path / "ks/public").mkdir(parents=True)
-    text = str(missing_enclave_error(Keystore(tmp_path / "ks"), "/camera", [*THERE, "/x", "/y"]))
+    text = str(
+        missing_enclave_error(OpenedKeystore(tmp_path / "ks"), "/camera", [*THERE, "/x", "/y"])
+    )
     assert "/x and 1 more. If it is not a typo, create it with `sros create_enclave " in text
 
 
 def test_a_namespace_is_not_taken_for_an_enclave_that_is_missing() -> None:
     text = str(
-        missing_enclave_error(Keystore(Path("robot")), "/r1", ["/r1/base", "/r1/arm", "/r10"])
+        missing_enclave_error(OpenedKeystore(Path("robot")), "/r1", ["/r1/base", "/r1/arm", "/r10"])
     )
     assert text == (
         "enclave /r1 does not exist in keystore 'robot'. It is the namespace of 2 enclaves, such "
@@ -60,12 +62,12 @@ def test_a_namespace_is_not_taken_for_an_enclave_that_is_missing() -> None:
 
 
 def test_an_export_gets_it_from_its_keystore(tmp_path: Path) -> None:
-    text = str(missing_enclave_error(Keystore(tmp_path), "/camera", THERE))
+    text = str(missing_enclave_error(OpenedKeystore(tmp_path), "/camera", THERE))
     assert f"export it with `sros distribute_key KEYSTORE /camera {tmp_path}`." in text
 
 
 def test_a_name_that_could_not_be_made_is_told_so() -> None:
-    error = missing_enclave_error(Keystore(Path("robot")), "camera", THERE)
+    error = missing_enclave_error(OpenedKeystore(Path("robot")), "camera", THERE)
     assert "does not start with '/'" in str(error)
 
 
@@ -73,7 +75,7 @@ def test_of_a_revoked_enclave_it_says_since_when(tmp_path: Path) -> None:
     root = tmp_path / "ks"
     sros("create_keystore", root).ok()
     sros("create_enclave", root, "/camera", "/camera2").ok()
-    before = str(missing_enclave_error(Keystore(root), "/camera3", list_enclaves(root)))
+    before = str(missing_enclave_error(OpenedKeystore(root), "/camera3", list_enclaves(root)))
     assert "Perhaps" in before and "was revoked" not in before
     first = _serial(root, "/camera")
     sros("renew", root, "/camera").ok()
@@ -81,14 +83,16 @@ def test_of_a_revoked_enclave_it_says_since_when(tmp_path: Path) -> None:
     assert serial != first
     sros("revoke", root, "/camera", "--reason", "keyCompromise").ok()
     (entry, *_) = (
-        e for e in Keystore(root).ledger.entries if e.what == "revocation" and e.serial == serial
+        e
+        for e in OpenedKeystore(root).ledger.entries
+        if e.what == "revocation" and e.serial == serial
     )
     said = (
         f"enclave /camera of keystore '{root}' was revoked at {entry.time} (keyCompromise). Its "
         f"files are in '{root}/revoked/{serial}'. To use it again, with another key: "
         f"`sros generate_artifacts -k {root} -e /camera -p POLICY_FILE`."
     )
-    assert str(missing_enclave_error(Keystore(root), "/camera", list_enclaves(root))) == said
+    assert str(missing_enclave_error(OpenedKeystore(root), "/camera", list_enclaves(root))) == said
     for words in (("/camera", "publish", "/x"), ("--reach", "/camera")):
         found = sros("explain", root, *words)
         assert (found.status, found.out) == (2, "")
@@ -96,13 +100,15 @@ def test_of_a_revoked_enclave_it_says_since_when(tmp_path: Path) -> None:
     # Made anew it is there; and if its files are lost then, that is no revocation.
     sros("create_enclave", root, "/camera").ok()
     assert sros("explain", root, "/camera", "publish", "/x").ok().out.startswith("yes")
-    assert "was revoked" not in str(missing_enclave_error(Keystore(root), "/camera", ["/camera2"]))
+    assert "was revoked" not in str(
+        missing_enclave_error(OpenedKeystore(root), "/camera", ["/camera2"])
+    )
 
 
 def test_a_broken_ledger_does_not_hide_that_the_enclave_is_missing(tmp_path: Path) -> None:
     (tmp_path / "ledger.jsonl").write_text("no entry\n")
     assert "/camera does not exist" in str(
-        missing_enclave_error(Keystore(tmp_path), "/camera", THERE)
+        missing_enclave_error(OpenedKeystore(tmp_path), "/camera", THERE)
     )
 
 

@@ -22,7 +22,7 @@ from sros_tool.keystore.layout import PERMISSIONS, SEAL
 from sros_tool.keystore.lifecycle.create import create_keystore
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.lifecycle.rotation import RotationStage
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import digest
 from tests.support.children import run
@@ -81,7 +81,7 @@ def test_the_identity_ca_does_not_vouch_for_the_permissions(robot: Path, tmp_pat
     subject = certificate(home / FOLDER / "cert.pem").subject.rfc4514_string()
     files = resigned(evil, files, subject)
     authority = load_authority(
-        Keystore(evil), PERMISSIONS, Keystore(evil).template, IN_KEYSTORE, NOW
+        OpenedKeystore(evil), PERMISSIONS, OpenedKeystore(evil).template, IN_KEYSTORE, NOW
     )
     archive = pack({SEAL: seal(files, 1, authority), **files})
     before = snapshot(robot)

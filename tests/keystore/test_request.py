@@ -28,7 +28,7 @@ from sros_tool.keystore.layout import SEAL, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, create_permission
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import (
     common_name,
@@ -186,7 +186,7 @@ def test_signing_records_everything_but_the_key(home: Path, robot: Path) -> None
     subject = issued.subject
     assert len(subject.get_attributes_for_oid(NameOID.ORGANIZATIONAL_UNIT_NAME)) == 1
     assert key_digest(issued.public_key()) == signed.keys[NAME]  # type: ignore[arg-type]
-    entries = [entry for entry in Keystore(home).ledger.entries if entry.enclave == NAME]
+    entries = [entry for entry in OpenedKeystore(home).ledger.entries if entry.enclave == NAME]
     assert [entry.what for entry in entries] == ["certificate", "permissions", "answer"]
     assert not history(home, now=NOW).unexplained
     with tarfile.open(fileobj=io.BytesIO(signed.archive)) as tar:
@@ -213,7 +213,9 @@ def test_the_rights_are_those_of_the_policy_and_a_renewal_keeps_them(
     second = certificate(home / FOLDER / "cert.pem")
     assert validity_of(second).not_after - validity_of(first).not_after == timedelta(days=30)
     assert second.public_key() == first.public_key()
-    entries = [entry for entry in Keystore(home).ledger.entries if entry.what == "permissions"]
+    entries = [
+        entry for entry in OpenedKeystore(home).ledger.entries if entry.what == "permissions"
+    ]
     assert entries[-1].policy == entries[-2].policy != ""
 
 

@@ -21,7 +21,7 @@ from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
-from sros_tool.keystore.reader import Keystore, open_enclave
+from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import validity_of
 from sros_tool.pki.crl import REASONS, SUPERSEDED, RevocationList
@@ -56,7 +56,7 @@ def serial(root: Path, name: str) -> int:
 
 
 def crl_of(root: Path) -> RevocationList:
-    found = Keystore(root).revocation_list
+    found = OpenedKeystore(root).revocation_list
     assert found
     return found
 
@@ -124,7 +124,9 @@ def test_earlier_certificates_are_revoked_too(tmp_path: Path) -> None:
     assert {each.serial for each in crl_of(root).revoked} == set(serials)
     assert not crl_of(root).revokes(other)
     told = [
-        int(each.serial, 16) for each in Keystore(root).ledger.entries if each.what == "revocation"
+        int(each.serial, 16)
+        for each in OpenedKeystore(root).ledger.entries
+        if each.what == "revocation"
     ]
     assert sorted(told) == sorted(serials)
 

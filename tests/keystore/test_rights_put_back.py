@@ -20,7 +20,7 @@ from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, SEAL
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, create_permission
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
@@ -169,7 +169,9 @@ def without_number(root: Path, archive: bytes) -> bytes:
     files = {path: data for path, data in unpack(archive).items() if path != SEAL}
     digests = sorted(f"{hashlib.sha256(data).hexdigest()}  {path}" for path, data in files.items())
     listed = "\n".join(["sros answer 1", *digests, ""]).encode()
-    signer = load_authorities(Keystore(root), Keystore(root).template, IN_KEYSTORE, NOW).permissions
+    signer = load_authorities(
+        OpenedKeystore(root), OpenedKeystore(root).template, IN_KEYSTORE, NOW
+    ).permissions
     return pack({SEAL: signer.sign(listed, "the list"), **files})
 
 

@@ -25,7 +25,7 @@ from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotate import RotationStep, renew_identity_ca, rotate_ca
 from sros_tool.keystore.lifecycle.rotation import RotationStage, retired_key, rotation_status
 from sros_tool.keystore.lifecycle.update import update_keystore
-from sros_tool.keystore.reader import Keystore, open_enclave
+from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import common_name, digest, pem, validity_of
 from sros_tool.pki.keys import generate_key, key_pem
@@ -111,7 +111,7 @@ def states(root: Path) -> list[tuple[str, str, int]]:
 
 def test_every_stage_is_whole(root: Path) -> None:
     files = sorted({path.resolve().name[: -len(".cert.pem")] for path in root.glob("public/*")})
-    old = {file: Keystore(root).certificates_of(file) for file in files}
+    old = {file: OpenedKeystore(root).certificates_of(file) for file in files}
     rights = {name: (enclave_path(root, name) / "permissions.xml").read_bytes() for name in NAMES}
     roles = ["identity", "permissions"] if len(files) == 2 else ["identity"]
     assert states(root) == [(role, "issuing", 3) for role in roles]
@@ -122,7 +122,7 @@ def test_every_stage_is_whole(root: Path) -> None:
     assert states(root) == [
         state for role in roles for state in ((role, "issuing", 3), (role, "next", 0))
     ]
-    both = {file: Keystore(root).certificates_of(file) for file in files}
+    both = {file: OpenedKeystore(root).certificates_of(file) for file in files}
     assert all(both[file][0] == old[file][0] for file in files)
 
     rotate_ca(root, now=NOW)
@@ -130,13 +130,13 @@ def test_every_stage_is_whole(root: Path) -> None:
     assert states(root) == [
         state for role in roles for state in ((role, "issuing", 3), (role, "old", 0))
     ]
-    assert all(Keystore(root).certificates_of(file) == both[file][::-1] for file in files)
+    assert all(OpenedKeystore(root).certificates_of(file) == both[file][::-1] for file in files)
     assert len(list(root.glob("retired/*.key.pem"))) == len(files)
 
     rotate_ca(root, now=NOW)
     check(root)
     assert states(root) == [(role, "issuing", 3) for role in roles]
-    assert all(Keystore(root).certificates_of(file) == both[file][1:] for file in files)
+    assert all(OpenedKeystore(root).certificates_of(file) == both[file][1:] for file in files)
     assert not (root / ROTATION).exists()
     assert sorted(path.name.split(".")[1] for path in root.glob("retired/*")) == sorted(
         ["cert", "key"] * len(files)
@@ -157,11 +157,11 @@ def test_the_keystore_can_be_used_at_every_stage(root: Path) -> None:
 def test_the_ledger_has_everything(separate: Path) -> None:
     for _ in STAGES:
         rotate_ca(separate, now=NOW)
-    entries = Keystore(separate).ledger.entries
+    entries = OpenedKeystore(separate).ledger.entries
     assert [e.what for e in entries].count("ca") == 4
     known = {entry.sha256 for entry in entries}
     for file in ("identity_ca", "permissions_ca"):
-        assert digest(Keystore(separate).certificates_of(file)[0]) in known
+        assert digest(OpenedKeystore(separate).certificates_of(file)[0]) in known
     last = {e.enclave: e for e in entries if e.what == "permissions"}
     first = {e.enclave: e for e in reversed(entries) if e.what == "permissions"}
     assert all(last[name].policy == first[name].policy != "" for name in NAMES)
@@ -172,20 +172,20 @@ def test_the_ledger_has_everything(separate: Path) -> None:
 def test_one_ca_alone(role: str, separate: Path) -> None:
     other = {"identity": "permissions", "permissions": "identity"}[role]
     (separate / f"private/{other}_ca.key.pem").unlink()  # it is not needed
-    before = Keystore(separate).certificates_of(f"{other}_ca")
+    before = OpenedKeystore(separate).certificates_of(f"{other}_ca")
     for _ in STAGES:
         rotate_ca(separate, roles=[role], now=NOW)
         check(separate)
-    assert Keystore(separate).certificates_of(f"{other}_ca") == before
+    assert OpenedKeystore(separate).certificates_of(f"{other}_ca") == before
 
 
 def test_names_of_new_cas(separate: Path) -> None:
     """Fast DDS compares the name of the permissions CA with that of the peer."""
     rotate_ca(separate, now=NOW)
-    old, new = Keystore(separate).certificates_of("permissions_ca")
+    old, new = OpenedKeystore(separate).certificates_of("permissions_ca")
     assert old.subject == new.subject
     assert old.public_key() != new.public_key()
-    old, new = Keystore(separate).certificates_of("identity_ca")
+    old, new = OpenedKeystore(separate).certificates_of("identity_ca")
     assert old.subject != new.subject
 
 
@@ -198,9 +198,9 @@ def test_all_at_once_from_every_stage(root: Path, tmp_path: Path) -> None:
         assert step.stage is RotationStage.RETIRE
         check(copy)
         assert {standing for _, standing, _ in states(copy)} == {"issuing"}
-        assert Keystore(copy).certificates_of(step.files[0]) != Keystore(root).certificates_of(
-            step.files[0]
-        )
+        assert OpenedKeystore(copy).certificates_of(step.files[0]) != OpenedKeystore(
+            root
+        ).certificates_of(step.files[0])
         assert not (copy / ROTATION).exists()
         assert not list(copy.glob("private/next_*"))
 
@@ -265,9 +265,9 @@ def foreign_ca(kind: str) -> bytes:
 def test_same_key(separate: Path) -> None:
     later = NOW + timedelta(hours=12)
     before = snapshot(separate / "enclaves")
-    (old,) = Keystore(separate).certificates_of("identity_ca")
+    (old,) = OpenedKeystore(separate).certificates_of("identity_ca")
     renew_identity_ca(separate, now=later)
-    (new,) = Keystore(separate).certificates_of("identity_ca")
+    (new,) = OpenedKeystore(separate).certificates_of("identity_ca")
     assert (new.subject, new.public_key()) == (old.subject, old.public_key())
     assert validity_of(new).not_after > validity_of(old).not_after
     assert snapshot(separate / "enclaves") == before
@@ -355,7 +355,7 @@ def test_revocation_lists_go_along(separate: Path) -> None:
     for stage in STAGES:
         rotate_ca(separate, stage, now=NOW)
         check(separate)
-        crl = Keystore(separate).revocation_list
+        crl = OpenedKeystore(separate).revocation_list
         assert crl
         numbers.append(crl.number)
         text = (separate / "public/identity_ca.cert.pem").read_text()
@@ -371,7 +371,7 @@ def lists_of(root: Path) -> list[tuple[str, set[int]]]:
     """The subject of each issuer of a list that DDS reads, and the serial numbers on the list."""
     return [
         (each.list.issuer.rfc4514_string(), {one.serial for one in each.revoked})
-        for each in Keystore(root).revocation_lists
+        for each in OpenedKeystore(root).revocation_lists
     ]
 
 
@@ -412,10 +412,13 @@ def test_a_revocation_in_between(earlier: bool, root: Path, tmp_path: Path) -> N
     (_, first), (_, second) = lists_of(root)
     assert serials["/c"] in first
     assert not second  # the new CA has issued nothing yet
-    numbers = [each.number for each in Keystore(root).revocation_lists]
+    numbers = [each.number for each in OpenedKeystore(root).revocation_lists]
     assert rotate_ca(root, now=NOW).stage is RotationStage.REISSUE  # all is there that it needs
     check(root)
-    assert [each.number for each in Keystore(root).revocation_lists] == [numbers[1] + 1, numbers[0]]
+    assert [each.number for each in OpenedKeystore(root).revocation_lists] == [
+        numbers[1] + 1,
+        numbers[0],
+    ]
     new = Path(shutil.copy(enclave_path(root, "/d") / "cert.pem", tmp_path / "new"))
     assert not revoke(root, ["/d"], now=NOW).remarks
     check(root)
@@ -433,8 +436,8 @@ def test_a_revocation_in_between(earlier: bool, root: Path, tmp_path: Path) -> N
 
 
 def _subject(root: Path, index: int = 0) -> str:
-    file = next(iter(Keystore(root).authority_files))
-    return Keystore(root).certificates_of(file)[index].subject.rfc4514_string()
+    file = next(iter(OpenedKeystore(root).authority_files))
+    return OpenedKeystore(root).certificates_of(file)[index].subject.rfc4514_string()
 
 
 def serial_of(path: Path) -> int:
@@ -451,7 +454,7 @@ def test_without_the_old_key_revoking_waits_for_the_end(
     rotate_ca(separate, RotationStage.DISTRIBUTE, now=NOW)
     rotate_ca(separate, RotationStage.REISSUE, now=NOW, delete_old_key=how == "deleted")
     if how != "deleted":
-        kept = separate / retired_key(Keystore(separate).certificates_of("identity_ca")[1])
+        kept = separate / retired_key(OpenedKeystore(separate).certificates_of("identity_ca")[1])
         assert kept.exists()
         kept.write_bytes(key_pem(generate_key()))
         if how == "elsewhere":
@@ -522,7 +525,12 @@ def shape(root: Path) -> tuple[object, ...]:
     """What a keystore is, apart from keys and signatures, which are never the same."""
     files = {path for path in snapshot(root) if not path.startswith("retired/")}
     kept = sorted(path.name.split(".", 1)[1] for path in root.glob("retired/*"))
-    return frozenset(files), tuple(kept), tuple(states(root)), len(Keystore(root).ledger.entries)
+    return (
+        frozenset(files),
+        tuple(kept),
+        tuple(states(root)),
+        len(OpenedKeystore(root).ledger.entries),
+    )
 
 
 @pytest.mark.parametrize("stage", some([*STAGES, None], 1))

@@ -15,7 +15,7 @@ from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotate import renew_identity_ca, rotate_ca
 from sros_tool.keystore.lifecycle.rotation import RotationStage
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import common_name_of, digest
 from tests.support.harness import sros
@@ -44,12 +44,15 @@ def standing(root: Path) -> dict[str, tuple[HistoryStatus, str]]:
 
 def test_the_history_knows_both_cas_and_their_lists(root: Path) -> None:
     revoke(root, ["/c"], now=NOW)
-    old = {file: Keystore(root).certificates_of(file)[0] for file in Keystore(root).authority_files}
+    old = {
+        file: OpenedKeystore(root).certificates_of(file)[0]
+        for file in OpenedKeystore(root).authority_files
+    }
     for stage in STAGES:
         rotate_ca(root, stage, now=NOW)
         for file, first in old.items():
             path = f"public/{file}.cert.pem"
-            new = next(each for each in Keystore(root).certificates_of(file) if each != first)
+            new = next(each for each in OpenedKeystore(root).certificates_of(file) if each != first)
             assert standing(root)[digest(new)] == (HistoryStatus.CURRENT, path)
             expected = (HistoryStatus.CURRENT, path)
             if stage is RotationStage.RETIRE:
@@ -66,14 +69,18 @@ def test_the_history_knows_both_cas_and_their_lists(root: Path) -> None:
 def test_the_old_and_the_new_ca_are_told_apart(root: Path) -> None:
     """A new permissions CA has the name of the old one, because Fast DDS compares names."""
     file = next(
-        file for file, roles in Keystore(root).authority_files.items() if "permissions" in roles
+        file
+        for file, roles in OpenedKeystore(root).authority_files.items()
+        if "permissions" in roles
     )
-    (old,) = (digest(each)[:8] for each in Keystore(root).certificates_of(file))
+    (old,) = (digest(each)[:8] for each in OpenedKeystore(root).certificates_of(file))
     signed = root / "enclaves/a/permissions.p7s"
     for stage, issuing in zip(STAGES, (0, 1, 1), strict=True):
         rotate_ca(root, stage, now=NOW)
         new = next(
-            mark for c in Keystore(root).certificates_of(file) if (mark := digest(c)[:8]) != old
+            mark
+            for c in OpenedKeystore(root).certificates_of(file)
+            if (mark := digest(c)[:8]) != old
         )
         both = (old, new)
         there = both if stage is not RotationStage.RETIRE else (new,)
@@ -84,7 +91,7 @@ def test_the_old_and_the_new_ca_are_told_apart(root: Path) -> None:
             sros("inspect", root / "enclaves/a").ok().out
         )
         assert f"(SHA-256 {both[issuing]}), sha256" in sros("inspect", signed).ok().out
-        if len(Keystore(root).authority_files) == 1:
+        if len(OpenedKeystore(root).authority_files) == 1:
             single = sros("check", root, "--strict").out
             assert f"(SHA-256 {both[issuing]}) is identity CA and permissions CA" in single
         told = json.loads(sros("inspect", signed, "--json").ok().out)
@@ -94,7 +101,7 @@ def test_the_old_and_the_new_ca_are_told_apart(root: Path) -> None:
 
 
 def _name(root: Path, file: str) -> str:
-    return common_name_of(Keystore(root).certificates_of(file)[0].subject)
+    return common_name_of(OpenedKeystore(root).certificates_of(file)[0].subject)
 
 
 @pytest.mark.parametrize("kept", ["cert.pem", "identity_ca.cert.pem"])
@@ -107,7 +114,7 @@ def test_a_certificate_of_the_other_ca_is_said_to_be_of_another_one(kept: str, r
     (folder / kept).write_bytes(old)
     text = sros("inspect", folder).out
     same = "public/ca.cert.pem" in {
-        f"public/{each}.cert.pem" for each in Keystore(root).authority_files
+        f"public/{each}.cert.pem" for each in OpenedKeystore(root).authority_files
     }
     assert ("but by another CA named CN=" in text) is same, text
     if kept == "cert.pem":
@@ -121,13 +128,13 @@ def test_a_ca_file_that_leads_to_no_file_of_its_folder_is_refused(target: str, r
     path.unlink()
     path.symlink_to(target)
     with pytest.raises(KeystoreError, match=r"has no identity CA.*identity_ca\.cert\.pem"):
-        _ = Keystore(root).authority_files
+        _ = OpenedKeystore(root).authority_files
 
 
 def test_a_stranger_in_the_file_of_a_ca_is_named(root: Path, tmp_path: Path) -> None:
     """Fast DDS would trust it: the first certificate of a file does not vouch for the next."""
     create_keystore(tmp_path / "other", template=load_template("production"), now=NOW)
-    file = f"public/{next(iter(Keystore(root).authority_files))}.cert.pem"
+    file = f"public/{next(iter(OpenedKeystore(root).authority_files))}.cert.pem"
     assert not history(root, now=NOW).unexplained
     with (root / file).open("ab") as stream:
         stream.write((tmp_path / "other/public/identity_ca.cert.pem").read_bytes())
@@ -139,7 +146,7 @@ def test_a_ca_of_the_same_key_is_followed(tmp_path: Path) -> None:
     root = tmp_path / "ks"
     create_keystore(root, template=load_template("production"), now=NOW)
     create_enclaves(root, ["/a"], now=NOW)
-    old = Keystore(root).certificates_of("identity_ca")[0]
+    old = OpenedKeystore(root).certificates_of("identity_ca")[0]
     renew_identity_ca(root, now=NOW)
     assert standing(root)[digest(old)][0] is HistoryStatus.RETIRED
 
@@ -147,8 +154,8 @@ def test_a_ca_of_the_same_key_is_followed(tmp_path: Path) -> None:
 def test_inspect_shows_all_that_a_ca_file_holds(root: Path) -> None:
     revoke(root, ["/c"], now=NOW)
     rotate_ca(root, now=NOW)
-    file = next(iter(Keystore(root).authority_files))
-    old, new = Keystore(root).certificates_of(file)
+    file = next(iter(OpenedKeystore(root).authority_files))
+    old, new = OpenedKeystore(root).certificates_of(file)
     path = root / f"public/{file}.cert.pem"
     said = sros("inspect", path).ok().out
     for each in (old, new):

@@ -16,7 +16,7 @@ import pytest
 from benchmarks.inputs import fleet_file, fleet_policy
 from sros_tool.keystore.describe import HistoryStatus, history
 from sros_tool.keystore.layout import enclave_names
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.validity import parse_iso
 from tests.support.children import LONG
 from tests.support.harness import sros
@@ -67,7 +67,7 @@ def test_all_of_them_are_there_and_sound(root: Path) -> None:
     names = enclave_names(root)
     assert len(names) == MANY
     assert sros("list_enclaves", root).ok().out.splitlines() == list(names)
-    ledger = Keystore(root).ledger
+    ledger = OpenedKeystore(root).ledger
     assert (ledger.gaps, ledger.unchained) == ((), 0)
     assert ledger.lines >= 2 * MANY
     bare = ("--exclude", "enclave.node-cannot-start")  # the policy leaves out the common part
@@ -103,13 +103,13 @@ def test_revoking_a_robot_and_renewing_the_others(root: Path) -> None:
     rest = enclave_names(root)
     assert [name for name in before if name not in rest] == [n for n in before if "/r1/" in n]
     assert all((root / f"enclaves{name}/crl.pem").is_symlink() for name in rest)
-    found = Keystore(root).revocation_list
+    found = OpenedKeystore(root).revocation_list
     assert found
     assert len(found.revoked) == EACH
     done = sros("renew", root, "--all-expiring", "100y").ok()
     assert f"renewed {len(rest)} enclaves: " in done.out
     assert all((root / f"enclaves{name}/cert.pem").read_bytes() != before[name] for name in rest)
-    made = history(root, now=parse_iso(Keystore(root).ledger.entries[-1].time))
+    made = history(root, now=parse_iso(OpenedKeystore(root).ledger.entries[-1].time))
     assert (made.gaps, made.unexplained) == ((), ())
     current = [e for e in made.entries if e.status is HistoryStatus.CURRENT and e.entry.enclave]
     assert len(current) == 2 * len(rest)

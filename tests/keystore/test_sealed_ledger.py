@@ -25,7 +25,7 @@ from sros_tool.keystore.ledger import LedgerFile
 from sros_tool.keystore.lifecycle.create import create_enclaves
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.certificates import make_request
 from sros_tool.pki.keys import generate_key, load_key
 from tests.keystore.test_ledger_index import check_answers, is_indexed
@@ -119,7 +119,7 @@ def test_parts_are_sealed_and_read_as_one_ledger(root: Path) -> None:
     revoke(root, ["/b"], now=NOW)
     assert is_indexed(root)
     check_answers(root)
-    whole = Keystore(root).ledger
+    whole = OpenedKeystore(root).ledger
     assert (whole.gaps, whole.unchained, whole.certain) == ((), 0, whole.entries)
     assert len(whole.entries) == whole.lines
     assert [entry.number for entry in whole.entries if entry.what == "sealed"] == [1, 2]
@@ -160,7 +160,7 @@ def test_without_its_sealed_parts_changes_go_on(
     sign_request(root, make_request(generate_key(), "/other"), now=NOW)
     assert is_indexed(root)
     check_answers(root)
-    assert Keystore(root).ledger.gaps == ()
+    assert OpenedKeystore(root).ledger.gaps == ()
 
 
 @pytest.mark.parametrize(
@@ -187,7 +187,7 @@ def test_a_part_that_was_not_sealed_is_noticed(case: str, number: int, root: Pat
         (root / name).write_bytes(sound[name])
     renew(root, ["/a"], now=NOW)
     check_answers(root)
-    assert Keystore(root).ledger.gaps == ()
+    assert OpenedKeystore(root).ledger.gaps == ()
 
 
 def test_death_at_every_step_of_sealing(
@@ -199,7 +199,7 @@ def test_death_at_every_step_of_sealing(
         renew(keystore, ["/a"], now=NOW)
 
     work = tmp_path / "work"
-    lines = Keystore(root).ledger.lines
+    lines = OpenedKeystore(root).ledger.lines
     (root / LEDGER_INDEX).unlink()  # it is made again first; then saved with the new lines
     copy_of(root, work)
     status, steps = in_child(lambda: change(work))
@@ -210,7 +210,7 @@ def test_death_at_every_step_of_sealing(
         shutil.rmtree(work)
         copy_of(root, work)
         assert in_child(lambda: change(work), step)[0] in (DIED, 0)
-        ledger = Keystore(work).ledger
+        ledger = OpenedKeystore(work).ledger
         assert ledger.gaps == (), step
         assert ledger.lines in (lines, lines + 3), step
         done.add(ledger.lines)
@@ -218,7 +218,7 @@ def test_death_at_every_step_of_sealing(
         check_whole(work)
         assert remains(work) == [LEDGER_INDEX]
         check_answers(work)
-        assert Keystore(work).ledger.gaps == ()
+        assert OpenedKeystore(work).ledger.gaps == ()
     assert len(done) == 2
 
 
@@ -268,12 +268,12 @@ def test_a_copy_without_the_link_goes_on(root: Path, tmp_path: Path) -> None:
     renew(copied, ["/a"], now=NOW)
     assert not (copied / LEDGER).is_symlink()
     check_answers(copied)
-    assert Keystore(copied).ledger.gaps == ()
+    assert OpenedKeystore(copied).ledger.gaps == ()
     # The copy is put back as it was, next to the part that it became.
     (copied / LEDGER).replace(copied / ledger_part(3))
     shutil.copy(root / ledger_part(3), copied / LEDGER)
     (copied / LEDGER_HEAD).write_bytes(before)
-    assert f"{ledger_part(3)} is a later part" in str(Keystore(copied).ledger.gaps)
+    assert f"{ledger_part(3)} is a later part" in str(OpenedKeystore(copied).ledger.gaps)
 
 
 def test_a_link_elsewhere_is_not_followed(root: Path, tmp_path: Path) -> None:
@@ -294,7 +294,7 @@ def test_a_last_part_with_another_name_loses_no_line(root: Path) -> None:
     (root / LEDGER).symlink_to(ledger_part(9))
     revoke(root, ["/b"], now=NOW)
     assert os.readlink(root / LEDGER) == ledger_part(3)
-    ledger = Keystore(root).ledger
+    ledger = OpenedKeystore(root).ledger
     assert ledger.gaps == ()
     assert [entry.enclave for entry in ledger.entries if entry.what == "revocation"][:1] == ["/b"]
     check_answers(root)
@@ -352,7 +352,7 @@ def test_an_index_of_another_version_is_made_again_first(
 ) -> None:
     """The head states a root that this version never makes; the chain proves the lines."""
     whole = count_whole(monkeypatch)
-    assert Keystore(root).ledger.gaps == ()
+    assert OpenedKeystore(root).ledger.gaps == ()
     assert whole == ["all"]
     monkeypatch.setattr(ledger_module._Head, "index_root", property(lambda _: "0" * 64))
     create_enclaves(root, ["/spare"], now=NOW)
@@ -365,7 +365,7 @@ def test_an_index_of_another_version_is_made_again_first(
     (root / LEDGER_INDEX).unlink()
     create_enclaves(root, ["/more"], now=NOW)
     assert not is_indexed(root)
-    assert any("changed" in gap for gap in Keystore(root).ledger.gaps)
+    assert any("changed" in gap for gap in OpenedKeystore(root).ledger.gaps)
 
 
 def test_an_index_is_proven_by_the_reading_that_it_was_made_of(
@@ -388,4 +388,4 @@ def test_an_index_is_proven_by_the_reading_that_it_was_made_of(
     monkeypatch.undo()
     assert readings > 1
     assert is_indexed(root)
-    assert Keystore(root).ledger_file.recorded_enclaves() == ["/a", "/b", "/spare"]
+    assert OpenedKeystore(root).ledger_file.recorded_enclaves() == ["/a", "/b", "/spare"]

@@ -12,7 +12,7 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.files import policies_dir
 from sros_tool.keystore.expiry import survey
 from sros_tool.keystore.lifecycle.create import generate_artifacts
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.policy.document import read_policy
 from sros_tool.validity import BACKDATE
 from tests.support.harness import sros
@@ -62,7 +62,7 @@ def test_an_enclave_lives_for_a_day_and_others_for_longer(
     root = tmp_path / "ks"
     sros("create_keystore", root, "--template", "production").ok()
     issue(root)
-    lifetimes, unreadable = survey(Keystore(root))
+    lifetimes, unreadable = survey(OpenedKeystore(root))
     assert unreadable == ()
     for each in lifetimes:
         for window in (each.certificate, each.permissions):
@@ -86,7 +86,7 @@ def test_its_expiry_is_accepted_and_that_of_others_is_found(days: float, tmp_pat
     at = datetime.now(UTC) + days * DAY
 
     def ids(*, accepted: bool) -> set[str]:
-        found = keystore_findings(Keystore(root), now=at)
+        found = keystore_findings(OpenedKeystore(root), now=at)
         return {each.id for each in found if bool(each.accepted) is accepted}
 
     late = ids(accepted=True)
@@ -111,7 +111,7 @@ def test_permissions_of_an_older_certificate_are_short_too(tmp_path: Path) -> No
     sros("create_enclave", root, SHORT).ok()
     settings.write_text(text)
     sros("create_permission", root, SHORT, POLICY).ok()
-    ((found,), _) = survey(Keystore(root))
+    ((found,), _) = survey(OpenedKeystore(root))
     assert found.permissions.not_after - found.permissions.not_before - BACKDATE == DAY
     assert found.certificate.not_after - found.permissions.not_after > 300 * DAY
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from tests.support.harness import copy_of, policy_text, publish, sros
 from tests.support.long_form import some
 from tests.support.made_by_ros2 import RELEASES, make
@@ -78,10 +78,10 @@ def test_the_first_write_takes_it_over_and_says_so(words: tuple[str, ...], tmp_p
     assert "adopt" in str(json.loads(sros(*words, "--dry-run", "--json").ok().out)["changes"])
     ended = sros(*words).ok()
     assert "which ros2/sros2 made" in ended.err and "are trusted" in ended.err
-    assert Keystore(root).template.name == "sros2"
+    assert OpenedKeystore(root).template.name == "sros2"
     found = {each["id"] for each in json.loads(sros("check", root, "--json").out)["findings"]}
     assert not found & {"keystore.settings-missing", "keystore.not-in-ledger"}
-    assert not Keystore(root).ledger.gaps
+    assert not OpenedKeystore(root).ledger.gaps
     assert "accepted without proof" not in sros("renew", root, "/b/c").ok().err
 
 

@@ -25,7 +25,7 @@ from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
-from sros_tool.keystore.reader import Keystore, open_enclave
+from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import issued_by, validity_of
@@ -108,9 +108,9 @@ class Verified:
             self._known.clear()
             self._common, self._common_life = common, _lives(first)
         found = [f"{life}" for life in self._common_life if not life.contains(now)]
-        crl = Keystore(self._root).revocation_list
+        crl = OpenedKeystore(self._root).revocation_list
         if crl:
-            (authority, *_) = Keystore(self._root).certificates_of("identity_ca")
+            (authority, *_) = OpenedKeystore(self._root).certificates_of("identity_ca")
             assert signed_by(crl.list, authority)
             if not Window(crl.this_update, crl.next_update).contains(now):
                 found.append("crl.pem")
@@ -199,11 +199,13 @@ class Thief:
 
 def refusal(root: Path, thief: Thief, now: datetime) -> str:
     """Why whoever trusts all CAs of the keystore, as Fast DDS does, refuses a thief; or ""."""
-    trusted = Keystore(root).certificates_of("identity_ca")
+    trusted = OpenedKeystore(root).certificates_of("identity_ca")
     issuers = [each for each in trusted if issued_by(thief.certificate, each)]
     if not issuers:
         return "not trusted"
-    lists = [each for each in Keystore(root).revocation_lists if signed_by(each.list, issuers[0])]
+    lists = [
+        each for each in OpenedKeystore(root).revocation_lists if signed_by(each.list, issuers[0])
+    ]
     if any(each.revokes(thief.certificate.serial_number) for each in lists):
         return "revoked"
     return "" if validity_of(thief.certificate).contains(now) else "ended"
@@ -299,18 +301,18 @@ def test_years(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             assert not told.remarks
             create_enclaves(root, [gone], now=now)  # made anew, with what a node needs and no more
             rights.pop(gone, None)
-        if min(each.next_update for each in Keystore(root).revocation_lists) - now < timedelta(
-            days=70
-        ):
+        if min(
+            each.next_update for each in OpenedKeystore(root).revocation_lists
+        ) - now < timedelta(days=70):
             refresh_crl(root, now=now)
         assert not verified.problems(names, now), now
         check_history(root, now)
-        stage = read_rotation(Keystore(root)).stage
+        stage = read_rotation(OpenedKeystore(root)).stage
         for thief in thieves:
             why = refusal(root, thief, now)
             assert why, (thief, now)
             refused[stage, why] += 1
-        crl = Keystore(root).revocation_list
+        crl = OpenedKeystore(root).revocation_list
         assert crl
         longest = max(longest, len(crl.revoked))
         if month % 12 == 0 or month in ROTATION or month - 2 in ROTATION:
@@ -333,7 +335,9 @@ def test_years(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert counts["expired"] > ENCLAVES * 2 * YEARS
     assert renewed > ENCLAVES * YEARS
     # The list lost what had ended; the ledger has it all.
-    known = {each.serial for each in Keystore(root).ledger.entries if each.what == "revocation"}
+    known = {
+        each.serial for each in OpenedKeystore(root).ledger.entries if each.what == "revocation"
+    }
     assert {f"{thief.certificate.serial_number:x}" for thief in thieves} <= known
     assert longest < len(known) / 2
     assert verified.in_full > ENCLAVES * YEARS, verified.in_full
@@ -358,7 +362,7 @@ def test_without_renewal_the_checks_of_years_would_fail(tmp_path: Path) -> None:
         assert not early.problems(["/a"], BEGIN)
         assert bool(early.problems(["/a"], now)) == bool(expected), days
         assert sorted({problem.file for problem in found}) == expected, days
-        (life,) = _lifetimes(Keystore(root))
+        (life,) = _lifetimes(OpenedKeystore(root))
         assert life.due(Threshold(remaining=timedelta(0)), now) == (days > 270)
     late = BEGIN + timedelta(days=400)
     with pytest.raises(AssertionError):

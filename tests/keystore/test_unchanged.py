@@ -21,7 +21,7 @@ from sros_tool.keystore.lifecycle.create import (
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from tests.support.harness import (
@@ -213,17 +213,20 @@ def test_missing_files_come_back_without_a_signature(folder: Path) -> None:
 def test_permissions_that_expire_soon_are_signed_again(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    validity = read_credentials(Keystore(folder / "ks"), "/a").lifetime().permissions
+    validity = read_credentials(OpenedKeystore(folder / "ks"), "/a").lifetime().permissions
     length = validity.not_after - NOW
     assert state(folder, NOW + length * 0.6).kept == NAMES
     late = NOW + length * 0.7
     assert state(folder, late).changed == NAMES
-    assert read_credentials(Keystore(folder / "ks"), "/a").lifetime().expires() > validity.not_after
+    assert (
+        read_credentials(OpenedKeystore(folder / "ks"), "/a").lifetime().expires()
+        > validity.not_after
+    )
     assert state(folder, late).kept == NAMES
     # A longer validity would not make them last longer than their certificate.
-    end = read_credentials(Keystore(folder / "ks"), "/a").lifetime().certificate.not_after
+    end = read_credentials(OpenedKeystore(folder / "ks"), "/a").lifetime().certificate.not_after
     assert state(folder, end - 20 * DAY).changed == NAMES
-    assert read_credentials(Keystore(folder / "ks"), "/a").lifetime().expires() == end
+    assert read_credentials(OpenedKeystore(folder / "ks"), "/a").lifetime().expires() == end
     assert state(folder, end - DAY).kept == NAMES
     with pytest.raises(KeystoreError, match="3 enclaves are not valid now: /a, /b, /c") as late_for:
         state(folder, end + DAY)
@@ -245,7 +248,9 @@ def test_a_chosen_validity_takes_effect(folder: Path) -> None:
     after = after.replace('"180d"', '"30d"', 1)
     settings.write_text(f"{before}[permissions]{after}")
     assert state(folder).changed == NAMES
-    assert read_credentials(Keystore(folder / "ks"), "/a").lifetime().expires() == NOW + 30 * DAY
+    assert (
+        read_credentials(OpenedKeystore(folder / "ks"), "/a").lifetime().expires() == NOW + 30 * DAY
+    )
     assert state(folder, NOW + DAY).kept == NAMES
 
 

@@ -32,7 +32,7 @@ from sros_tool.keystore.lifecycle.update import (
     edited_settings,
     update_keystore,
 )
-from sros_tool.keystore.reader import Keystore, open_enclave
+from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from sros_tool.keystore.settings import present_settings
 from sros_tool.keystore.template import (
     NamedValues,
@@ -88,7 +88,7 @@ def root(made: Path, tmp_path: Path) -> Path:
 
 def change(root: Path, *values: tuple[str, str], **options: object) -> KeystoreUpdate:
     """Change single settings, with everything allowed."""
-    target = with_values(present_settings(Keystore(root)).settings, values)
+    target = with_values(present_settings(OpenedKeystore(root)).settings, values)
     return to(root, target, **options)
 
 
@@ -117,7 +117,7 @@ def told(update: KeystoreUpdate) -> str:
 
 
 def found(root: Path) -> set[str]:
-    every = keystore_findings(Keystore(root), now=LATER)
+    every = keystore_findings(OpenedKeystore(root), now=LATER)
     return {each.id for each in every if each.kind.severity > NOTE} - {"enclave.node-cannot-start"}
 
 
@@ -143,8 +143,8 @@ def test_from_development_to_production(root: Path) -> None:
     assert done.names("renewed") == ("/free", "/robot")
     assert not done.looser
     template = load_template("production")
-    assert Keystore(root).governance == governance_for(template.protection, ZERO)
-    assert Keystore(root).template == template
+    assert OpenedKeystore(root).governance == governance_for(template.protection, ZERO)
+    assert OpenedKeystore(root).template == template
     for name, key in keys.items():
         folder = enclave_path(root, name)
         assert (folder / "key.pem").read_bytes() == key
@@ -167,7 +167,7 @@ def test_and_back(tmp_path: Path) -> None:
         to(root, "development", allow_looser=False)
     assert snapshot(root) == before
     done = to(root, "development")
-    assert Keystore(root).template == load_template("development")
+    assert OpenedKeystore(root).template == load_template("development")
     assert len(certificate(enclave_path(root, "/robot") / "cert.pem").subject.rdns) == 1
     assert until(root, "/robot") == (5 * 365, 5 * 365)  # with the CAs, at the latest
     assert any("/free gains" in each for each in done.looser)
@@ -209,7 +209,7 @@ def test_only_what_follows_from_a_setting_changes(
 
 
 def test_short_lived_enclaves_are_issued_again_alone(root: Path) -> None:
-    settings = present_settings(Keystore(root)).settings
+    settings = present_settings(OpenedKeystore(root)).settings
     short = (ShortLived("/free", timedelta(days=2)),)
     done = to(root, replace(settings, short_lived=short))
     assert (done.names("renewed"), done.names("signed")) == (("/free",), ())
@@ -220,32 +220,34 @@ def test_short_lived_enclaves_are_issued_again_alone(root: Path) -> None:
 
 def test_domains(root: Path) -> None:
     with pytest.raises(UsageError, match="may also join domain 7"):
-        to(root, present_settings(Keystore(root)).settings, 0, 7, allow_looser=False)
-    done = to(root, present_settings(Keystore(root)).settings, 0, 7)
+        to(root, present_settings(OpenedKeystore(root)).settings, 0, 7, allow_looser=False)
+    done = to(root, present_settings(OpenedKeystore(root)).settings, 0, 7)
     assert done.names("signed") == ("/free", "/robot")
     for name in list_enclaves(root):
         folder = enclave_path(root, name)
         assert not open_enclave(folder, now=LATER, domain=7).problems
-    to(root, present_settings(Keystore(root)).settings, 7, allow_looser=False)
+    to(root, present_settings(OpenedKeystore(root)).settings, 7, allow_looser=False)
     assert open_enclave(enclave_path(root, "/robot"), now=LATER, domain=0).problems
     assert found(root) <= {"keystore.allow-everything", "enclave.long-permissions"}
 
 
 def test_rules_for_names(root: Path) -> None:
     camera = NamedValues("topic", "/camera/*", (("data", "NONE"), ("metadata", "SIGN")))
-    target = with_values(present_settings(Keystore(root)).settings, rules=[camera])
+    target = with_values(present_settings(OpenedKeystore(root)).settings, rules=[camera])
     done = to(root, target)
     assert "on topic /camera/*" in told(done)
     expressions = [
         each.topic_expression
-        for each in Keystore(root).governance.domain_access_rules[0].topic_access_rules
+        for each in OpenedKeystore(root).governance.domain_access_rules[0].topic_access_rules
     ]
     assert expressions == ["rt/camera/*", "*"]
     to(
         root,
-        with_values(present_settings(Keystore(root)).settings, dropped=[("topic", "/camera/*")]),
+        with_values(
+            present_settings(OpenedKeystore(root)).settings, dropped=[("topic", "/camera/*")]
+        ),
     )
-    assert Keystore(root).template == load_template("development")
+    assert OpenedKeystore(root).template == load_template("development")
 
 
 SIGNED = ("data=NONE", "metadata=SIGN")
@@ -264,13 +266,16 @@ def test_a_rule_replaces_the_one_for_the_same_names(
 ) -> None:
     for name, values in ((first, SIGNED), (second, ("data=ENCRYPT",))):
         sros("update_keystore", root, "--rule", " ".join((name, *values)), "--allow-looser").ok()
-    for settings in (Keystore(root).template, present_settings(Keystore(root)).settings):
+    for settings in (
+        OpenedKeystore(root).template,
+        present_settings(OpenedKeystore(root)).settings,
+    ):
         (rule,) = settings.protection.named
         assert (str(rule), rule.protection.data) == (named, "ENCRYPT")
     assert "governance.unreachable-rule" not in found(root)
     kind, _, name = first.partition(" ")
     sros("update_keystore", root, "--drop-rule", f"{kind} {name}").ok()
-    assert Keystore(root).template.protection.named == ()
+    assert OpenedKeystore(root).template.protection.named == ()
 
 
 def test_a_rule_that_would_never_apply_is_refused(root: Path, tmp_path: Path) -> None:
@@ -288,7 +293,7 @@ def test_a_rule_that_would_never_apply_is_refused(root: Path, tmp_path: Path) ->
     sros("create_keystore", other := tmp_path / "other", "--template", template).ok()
     (finding,) = [
         each
-        for each in keystore_findings(Keystore(other), now=LATER)
+        for each in keystore_findings(OpenedKeystore(other), now=LATER)
         if each.id == "governance.unreachable-rule"
     ]
     assert not finding.accepted
@@ -345,11 +350,11 @@ def test_rights_that_were_put_back_are_not_signed_again(root: Path) -> None:
 
 def test_the_stages(root: Path) -> None:
     target = load_template("production")
-    governance = Keystore(root).governance
+    governance = OpenedKeystore(root).governance
     first = to(root, target, next_stage=True)
     assert (first.done, first.left) == ((UpdateStage.CREDENTIALS,), (UpdateStage.GOVERNANCE,))
-    assert Keystore(root).governance == governance
-    assert Keystore(root).template.name == "development"
+    assert OpenedKeystore(root).governance == governance
+    assert OpenedKeystore(root).template.name == "development"
     assert "one by one" in first.remarks[0].text
     assert found(root) == set()
     # What is created between the stages follows the new settings already.
@@ -359,7 +364,7 @@ def test_the_stages(root: Path) -> None:
     assert (second.done, second.left) == ((UpdateStage.GOVERNANCE,), ())
     assert (second.names("renewed"), second.names("signed")) == ((), ())
     assert "together" in second.remarks[0].text
-    assert Keystore(root).template == target
+    assert OpenedKeystore(root).template == target
     third = to(root, target, next_stage=True)
     assert (third.done, third.changes) == ((), ())
 
@@ -378,8 +383,8 @@ def test_the_command_of_the_second_stage(root: Path) -> None:
     assert (forgotten.status, "Repeat the options of the first stage" in forgotten.err) == (2, True)
     second = sros(*printed(first.err)).ok()
     assert "renewed" not in second.out
-    assert Keystore(root).template == load_template("production")
-    crl = Keystore(root).revocation_list
+    assert OpenedKeystore(root).template == load_template("production")
+    crl = OpenedKeystore(root).revocation_list
     assert crl
     assert len(crl.revoked) == 2
     sound(root)
@@ -392,7 +397,7 @@ def test_another_domain_revokes_in_both_stages(root: Path) -> None:
     again = printed(first.err)
     assert {"topic /a data=NONE", "0,7", "--allow-looser", "--revoke-old"} <= set(again)
     assert "renewed /free, /robot" in sros(*again).ok().out
-    assert str(present_settings(Keystore(root)).domains) == "0,7"
+    assert str(present_settings(OpenedKeystore(root)).domains) == "0,7"
 
 
 def test_revoking_the_old(root: Path) -> None:
@@ -400,7 +405,7 @@ def test_revoking_the_old(root: Path) -> None:
     done = change(root, ("permissions.validity", "30d"), revoke_old=True)
     assert done.revoked == 2
     assert done.works_until is None
-    crl = Keystore(root).revocation_list
+    crl = OpenedKeystore(root).revocation_list
     assert crl
     assert {each.serial for each in crl.revoked} == set(serials.values())
     assert "restart all processes together" in told(done)
@@ -430,17 +435,17 @@ def test_one_ca_becomes_two(by_ros2: bool, tmp_path: Path) -> None:
         root = make(tmp_path, "sros2")
     done = to(root, "production", allow_looser=False)
     assert "rotate_ca" in told(done)
-    assert set(Keystore(root).authority_files) == {"identity_ca", "permissions_ca"}
+    assert set(OpenedKeystore(root).authority_files) == {"identity_ca", "permissions_ca"}
     assert not list(root.glob("*/ca.*"))
     # The two files still hold one CA, and that is found until the permissions CA is replaced.
     assert found(root) - {"keystore.folder-open"} == {"keystore.one-authority"}
-    before = present_settings(Keystore(root)).settings
+    before = present_settings(OpenedKeystore(root)).settings
     command = done.remarks[-1].text.partition("`sros ")[2].partition("`")[0].split()
     sros(*command).ok()
     for _ in range(2):
         rotate_ca(root, now=LATER)
         sound(root)
-    assert present_settings(Keystore(root)).settings == before
+    assert present_settings(OpenedKeystore(root)).settings == before
     assert found(root) <= {"keystore.folder-open"}
 
 
@@ -453,7 +458,7 @@ def test_what_is_left_until_each_ca_has_its_own_key(tmp_path: Path) -> None:
         words = f"sros rotate_ca {root}{' --permissions' if stage == 'none' else ''} --next"
         (remedy,) = [
             each.remedy
-            for each in keystore_findings(Keystore(root), now=LATER)
+            for each in keystore_findings(OpenedKeystore(root), now=LATER)
             if each.id == "keystore.one-authority"
         ]
         assert re.findall("`(.+?)`", remedy) == [words]
@@ -471,9 +476,9 @@ def test_a_keystore_of_ros2_can_be_renewed_after_an_update(tmp_path: Path) -> No
     """With settings, every right has to be in the ledger, so all are recorded."""
     root = tmp_path / "ks"
     made_by_ros2.make(root, "/free", "/robot", now=NOW)
-    assert present_settings(Keystore(root)).without_settings
+    assert present_settings(OpenedKeystore(root)).without_settings
     target = with_values(
-        present_settings(Keystore(root)).settings, [("protection.rtps", "ENCRYPT")]
+        present_settings(OpenedKeystore(root)).settings, [("protection.rtps", "ENCRYPT")]
     )
     assert update_keystore(root, target, now=LATER).names("signed") == ("/free", "/robot")
     renew(root, ["/robot"], now=LATER)
@@ -497,7 +502,7 @@ def test_two_cas_do_not_become_one(root: Path) -> None:
     assert snapshot(root) == before
     kept = with_values(load_template("sros2"), [("authorities.layout", "separate")])
     to(root, kept)
-    assert Keystore(root).template.name == "sros2"
+    assert OpenedKeystore(root).template.name == "sros2"
 
 
 def test_a_key_is_not_moved(root: Path) -> None:
@@ -561,7 +566,7 @@ def test_an_edit_is_found_and_taken_over_or_undone(case: str, root: Path, tmp_pa
     assert (note.id, "--take-edits" in note.text) == ("keystore.edited", True)
     (note,) = create_enclaves(root, ["/late"], now=NOW).notes
     assert note.id == "keystore.edited"
-    target, domains = edited_settings(root, present_settings(Keystore(root)))
+    target, domains = edited_settings(root, present_settings(OpenedKeystore(root)))
     if looser:
         with pytest.raises(UsageError, match="looser"):
             update_keystore(root, target, domains, now=LATER, replace_edits=True)
@@ -572,14 +577,14 @@ def test_an_edit_is_found_and_taken_over_or_undone(case: str, root: Path, tmp_pa
         assert edit_again != edited
         return
     update_keystore(
-        root, present_settings(Keystore(root)).without_edits(), now=LATER, replace_edits=True
+        root, present_settings(OpenedKeystore(root)).without_edits(), now=LATER, replace_edits=True
     )
     assert {each: (root / each).read_bytes() for each in clean} == clean
     assert finding not in found(root)
     edit(root)
     update_keystore(root, target, domains, now=LATER, allow_looser=True, replace_edits=True)
     assert finding not in found(root)
-    assert Keystore(root).governance.domain_access_rules[0].rtps_protection_kind == "NONE"
+    assert OpenedKeystore(root).governance.domain_access_rules[0].rtps_protection_kind == "NONE"
     sound(root)
 
 
@@ -659,12 +664,12 @@ def test_during_a_rotation(stages: int, root: Path) -> None:
         assert not open_enclave(enclave_path(root, name), now=LATER).problems
     rotate_ca(root, now=LATER, finish=True)
     sound(root)
-    assert Keystore(root).template == target
+    assert OpenedKeystore(root).template == target
 
 
 def test_settings_that_changed_meanwhile(root: Path) -> None:
     """Two changes at once: the later one would undo the first, from which it did not start."""
-    seen = present_settings(Keystore(root))
+    seen = present_settings(OpenedKeystore(root))
     change(root, ("protection.rtps", "ENCRYPT"))
     state = snapshot(root)
     with pytest.raises(KeystoreError, match="have just changed"):
@@ -689,7 +694,9 @@ def test_a_governance_of_one_s_own_is_not_replaced_unasked(tmp_path: Path) -> No
 def _sign_governance(root: Path, old: str, new: str) -> None:
     """Edit the governance as its owner does who signs it with another tool."""
     _put(root / "enclaves/governance.xml", old, new)
-    authorities = load_authorities(Keystore(root), Keystore(root).template, IN_KEYSTORE, NOW)
+    authorities = load_authorities(
+        OpenedKeystore(root), OpenedKeystore(root).template, IN_KEYSTORE, NOW
+    )
     document = (root / "enclaves/governance.xml").read_bytes()
     (root / "enclaves/governance.p7s").write_bytes(authorities.permissions.sign(document, "it"))
 
@@ -699,7 +706,7 @@ def test_a_governance_that_was_signed_elsewhere(root: Path) -> None:
     _sign_governance(root, "<rtps_protection_kind>SIGN", "<rtps_protection_kind>NONE")
     assert "governance.not-as-settings" in found(root)
     sros("update_keystore", root, "--discard-edits").ok()
-    assert Keystore(root).governance.domain_access_rules[0].rtps_protection_kind == "SIGN"
+    assert OpenedKeystore(root).governance.domain_access_rules[0].rtps_protection_kind == "SIGN"
     assert "governance.not-as-settings" not in found(root)
 
 
@@ -713,12 +720,12 @@ def test_edits_that_contradict_each_other(root: Path) -> None:
     _stronger_settings(root)
     _governance(root)
     with pytest.raises(KeystoreError, match="differ"):
-        edited_settings(root, present_settings(Keystore(root)))
+        edited_settings(root, present_settings(OpenedKeystore(root)))
 
 
 def test_without_an_edit_there_is_nothing_to_take(root: Path) -> None:
     with pytest.raises(KeystoreError, match=r"no file .* was edited"):
-        edited_settings(root, present_settings(Keystore(root)))
+        edited_settings(root, present_settings(OpenedKeystore(root)))
 
 
 def test_a_keystore_from_before_the_record(root: Path) -> None:
@@ -775,19 +782,22 @@ def test_the_options(root: Path) -> None:
         "update_keystore", root, "--domain", "0,7", "--rule",
         "topic /camera/* data=NONE metadata=SIGN", "--allow-looser",
     ).ok()  # fmt: skip
-    assert str(present_settings(Keystore(root)).domains) == "0,7"
+    assert str(present_settings(OpenedKeystore(root)).domains) == "0,7"
     sros("update_keystore", root, "--drop-rule", "topic /camera/*").ok()
     assert (
-        Keystore(root).governance.domain_access_rules[0].topic_access_rules[0].topic_expression
+        OpenedKeystore(root)
+        .governance.domain_access_rules[0]
+        .topic_access_rules[0]
+        .topic_expression
         == "*"
     )
     _stronger_settings(root)
     assert "--take-edits" in sros("update_keystore", root, "--set", "protection.rtps=NONE").err
     sros("update_keystore", root, "--take-edits").ok()
-    assert Keystore(root).template.protection.rtps == "ENCRYPT"
+    assert OpenedKeystore(root).template.protection.rtps == "ENCRYPT"
     _put(root / "sros.toml", 'rtps = "ENCRYPT"', 'rtps = "NONE"')
     sros("update_keystore", root, "--discard-edits").ok()
-    assert Keystore(root).template.protection.rtps == "ENCRYPT"
+    assert OpenedKeystore(root).template.protection.rtps == "ENCRYPT"
 
 
 @pytest.mark.parametrize(
@@ -813,10 +823,10 @@ def test_wrong_usage_changes_nothing(words: tuple[str, ...], root: Path) -> None
 
 def test_no_keystore(tmp_path: Path) -> None:
     with pytest.raises(SrosError):
-        present_settings(Keystore(tmp_path))
+        present_settings(OpenedKeystore(tmp_path))
 
 
 def test_the_settings_are_in_the_ledger(root: Path) -> None:
     to(root, "production")
-    entries = [each for each in Keystore(root).ledger.entries if each.what == "settings"]
+    entries = [each for each in OpenedKeystore(root).ledger.entries if each.what == "settings"]
     assert ['name = "production"' in each.settings for each in entries] == [False, True]

@@ -16,7 +16,7 @@ from sros_tool.keystore.delivery.robot import RequestAnswer, check_answer, seal
 from sros_tool.keystore.issuing.authority import load_authority
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import PERMISSIONS, SEAL
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.keys import load_key
 from tests.support.harness import Ended, copy_of, policy_text, publish, snapshot, sros
 from tests.support.long_form import sometimes
@@ -210,7 +210,7 @@ def test_a_sealed_answer_with_files_that_do_not_fit(
     del files[SEAL]
     files = spoil(files, root)
     authority = load_authority(
-        Keystore(root), PERMISSIONS, Keystore(root).template, IN_KEYSTORE, now
+        OpenedKeystore(root), PERMISSIONS, OpenedKeystore(root).template, IN_KEYSTORE, now
     )
     key = load_key((folder / "robot/enclaves/far/key.pem").read_bytes(), "key").public_key()
     answer = RequestAnswer("/far", files, seal(files, 9, authority))

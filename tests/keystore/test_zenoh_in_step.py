@@ -13,7 +13,7 @@ from sros_tool.dds.permissions import Criteria, Grant, Rule
 from sros_tool.errors import PolicyError
 from sros_tool.files import templates_dir
 from sros_tool.keystore.lifecycle.update import set_zenoh
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.zenoh_permissions import rights_in_domain
 from sros_tool.pki import smime
 from sros_tool.zenoh.configuration import ZenohNetwork
@@ -49,7 +49,7 @@ def folder(made: Path, tmp_path: Path) -> Path:
 def in_step(root: Path) -> None:
     """The files are what the keystore needs, and signed by its permissions CA."""
     assert sros("zenoh", root, "--check").status == 0
-    authority = Keystore(root).ca_certificate("permissions")
+    authority = OpenedKeystore(root).ca_certificate("permissions")
     documents = list((root / "enclaves").rglob("*.json5"))
     assert documents
     for each in documents:

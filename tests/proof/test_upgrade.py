@@ -23,7 +23,7 @@ from sros_tool.errors import DocumentError
 from sros_tool.files import policies_dir
 from sros_tool.fleet.fleet_file import read_fleet
 from sros_tool.keystore.fleet import stated_distributions
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.proof.upgrade import changes, check_distributions, check_upgrade, signed_files
 from tests.checks.bench import DAY, SECRET, Bench, name_of
 from tests.checks.keystore_cases import IS_CA, own_signature, with_zenoh
@@ -240,7 +240,7 @@ def test_an_update_changes_nothing_of_shipped_policies(tmp_path: Path) -> None:
     sros("create_keystore", root, "--template", "production").ok()
     policies = [word for file in sorted(policies_dir().glob("*.xml")) for word in ("-p", file)]
     sros("generate_artifacts", "-k", root, *policies).ok()
-    keystore = Keystore(root)
+    keystore = OpenedKeystore(root)
     assert len(keystore.names) > 20
     first, *others = (
         Shipped(vendor.traits.product, vendor.release, vendor, SUPPORTED[0]) for vendor in TESTED
@@ -321,11 +321,11 @@ def test_a_keystore_says_for_which_distributions_it_is(bench: Bench) -> None:
     secret = {"SROS_CA_PASSPHRASE": SECRET}
     denied_status(bench, "base")
     checked = partial(check_distributions, moment=bench.now)
-    assert checked(Keystore(bench.root)) == []
+    assert checked(OpenedKeystore(bench.root)) == []
     words = ("update_keystore", bench.root, "--set", "distributions=lyrical,jazzy")
     sros(*words, env=secret).ok()
     assert 'distributions = ["jazzy", "lyrical"]' in bench.path("sros.toml").read_text()
-    (found,) = checked(Keystore(bench.root))
+    (found,) = checked(OpenedKeystore(bench.root))
     assert (found.id, found.subject) == ("distribution.differ", "/base")
     assert (
         "publish topic /status: open on Lyrical with Cyclone DDS 11.0, closed on Jazzy"
@@ -340,9 +340,9 @@ def test_a_keystore_says_for_which_distributions_it_is(bench: Bench) -> None:
 def test_an_enclave_that_one_distribution_refuses(bench: Bench) -> None:
     words = ("update_keystore", bench.root, "--set", "distributions=jazzy,lyrical")
     sros(*words, env={"SROS_CA_PASSPHRASE": SECRET}).ok()
-    assert check_distributions(Keystore(bench.root), moment=bench.now) == []
+    assert check_distributions(OpenedKeystore(bench.root), moment=bench.now) == []
     expired_authority(bench)
-    (found,) = check_distributions(Keystore(bench.root), moment=bench.now)
+    (found,) = check_distributions(OpenedKeystore(bench.root), moment=bench.now)
     assert found.id == "distribution.refused"
     assert found.text.startswith("Jazzy with Cyclone DDS 0.10 refuses it (permissions_ca.cert.pem")
 
@@ -363,7 +363,7 @@ def test_a_robot_of_a_fleet_has_a_distribution_of_its_own(tmp_path: Path) -> Non
     assert "from which distribution /r2/base is updated to Jazzy" in refused.err
     assert refused.status == 2
     sros("update_keystore", root, "--set", "distributions=jazzy").ok()
-    keystore = Keystore(root)
+    keystore = OpenedKeystore(root)
     assert stated_distributions(keystore, "/r1/base") == ("humble",)
     assert stated_distributions(keystore, "/r2/base") == ("jazzy",)
     compared = sros("check", root, "--upgrade-to", "jazzy", env={"ROS_DISTRO": None}).ok()

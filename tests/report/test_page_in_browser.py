@@ -14,7 +14,7 @@ import pytest
 
 from sros_tool.files import templates_dir
 from sros_tool.keystore.layout import enclave_names
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import load_rights
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
@@ -233,7 +233,7 @@ def test_the_flow_agrees_with_the_one_that_explain_follows(
             load_rights(root).rights,
             excluded=OF_EVERY_NODE,
             questions=QUESTIONS,
-            unguarded=unguarded(Keystore(root).governance),
+            unguarded=unguarded(OpenedKeystore(root).governance),
             everybody=enclave_names(root),
         )
         path = tmp_path / "open.html"

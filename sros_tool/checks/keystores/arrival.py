@@ -32,7 +32,7 @@ from sros_tool.keystore.layout import (
     waits_for_answer,
 )
 from sros_tool.keystore.participant import evaluated
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.token import Secrets, TokenUri, open_enclave_key
 from sros_tool.values import Words, shows
 
@@ -188,7 +188,7 @@ def verify_arrival(
             if path.is_file() and path.name.endswith(SUFFIXES)
             else "Name the folder that `sros distribute_key` or `sros import` has written to.",
         )
-    keystore = Keystore(root)
+    keystore = OpenedKeystore(root)
     enclaves = tuple(_enclave(keystore, name, now, domain, zone) for name in names)
     elsewhere = {
         str(enclave_path(root, enclave.name) / KEY_FILE)
@@ -228,7 +228,7 @@ TOKEN_KEY = FindingKind(
 
 
 def _token_findings(
-    keystore: Keystore, name: str, now: datetime, secrets: Secrets
+    keystore: OpenedKeystore, name: str, now: datetime, secrets: Secrets
 ) -> Iterator[Finding]:
     """Yield a finding unless the token has the key of an enclave's certificate."""
     state = keystore.enclave(name, now=now)
@@ -254,7 +254,7 @@ def _why_none(path: Path) -> str:
 
 
 def _enclave(
-    keystore: Keystore, name: str, now: datetime, domain: int | None, zone: tzinfo
+    keystore: OpenedKeystore, name: str, now: datetime, domain: int | None, zone: tzinfo
 ) -> ArrivedEnclave:
     folder = keystore.folder(name)
     if waits_for_answer(folder):

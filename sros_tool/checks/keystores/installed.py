@@ -16,7 +16,7 @@ from sros_tool.errors import SrosError
 from sros_tool.keystore.confirmation import COULD_NOT_START
 from sros_tool.keystore.layout import enclave_path, waits_for_answer
 from sros_tool.keystore.participant import evaluated
-from sros_tool.keystore.reader import FilesReadOnce, Keystore, OpenedEnclave, open_enclave
+from sros_tool.keystore.reader import FilesReadOnce, OpenedEnclave, OpenedKeystore, open_enclave
 from sros_tool.wording import first_few
 
 _MOST_NAMED = 2
@@ -60,7 +60,7 @@ def exposed_sentences(folder: Path, now: datetime) -> Iterator[str]:
     """Yield sentences on files that others can read or change, as `sros verify` finds them."""
     paths: dict[tuple[str, str], list[str]] = {}
     try:
-        for finding in check_files(CheckedKeystore(Keystore(folder), now, on_robot=True)):
+        for finding in check_files(CheckedKeystore(OpenedKeystore(folder), now, on_robot=True)):
             if finding.severity >= ERROR:
                 path = os.path.relpath(finding.file, folder)
                 paths.setdefault((finding.kind.title, finding.text), []).append(path)

@@ -67,7 +67,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     waits_for_answer,
 )
-from sros_tool.keystore.reader import Keystore, read_consistently
+from sros_tool.keystore.reader import OpenedKeystore, read_consistently
 from sros_tool.parallel import map_slices, tick
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import Right
@@ -90,7 +90,7 @@ _OF_SEVERAL_FILES = frozenset(
 
 @read_consistently
 def keystore_findings(
-    opened: Keystore,
+    opened: OpenedKeystore,
     *,
     now: datetime,
     zone: tzinfo = UTC,
@@ -359,7 +359,7 @@ _OF_AN_ENCLAVE = (UNEXPLAINED, KEY_READABLE, TIME_FORMAT, NOT_UNIQUE, LONG_PERMI
 _MOST_NAMED = 3
 
 
-def _with_cause_of_ros2(findings: Sequence[Finding], keystore: Keystore) -> list[Finding]:
+def _with_cause_of_ros2(findings: Sequence[Finding], keystore: OpenedKeystore) -> list[Finding]:
     """Return the findings; several findings that ros2/sros2 causes get a common cause."""
     root = keystore.root
     if keystore.is_of_ros2:

@@ -31,7 +31,7 @@ from sros_tool.keystore.layout import (
     search_enclaves,
 )
 from sros_tool.keystore.ledger import Ledger
-from sros_tool.keystore.reader import Keystore, OpenedEnclave
+from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore
 from sros_tool.keystore.settings import HandEdits, hand_edits
 from sros_tool.keystore.template import Template, load_template, template_names
 from sros_tool.pki.crl import RevocationList
@@ -72,7 +72,7 @@ class CheckedKeystore:
         on_zenoh: whether its nodes use Zenoh.
     """
 
-    opened: Keystore
+    opened: OpenedKeystore
     now: datetime
     zone: tzinfo = UTC
     policies: tuple[Policy, ...] = ()

@@ -26,7 +26,7 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_FILE,
     ROLES,
 )
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import issued_by, load_certificate, load_certificates
 from sros_tool.pki.crl import lists_as_revoked, read_list
@@ -105,7 +105,7 @@ def _certificates(data: bytes) -> _Certificates:
     return load_certificates(data, "the certificate of a CA")
 
 
-Targets = Mapping[str, tuple[Keystore, Sequence[str]]]
+Targets = Mapping[str, tuple[OpenedKeystore, Sequence[str]]]
 """Maps what the user named to a keystore or export, and the enclaves in it."""
 
 
@@ -189,7 +189,7 @@ def _refused_roles(
     return min(pairs, key=len, default=())
 
 
-def _parties(keystore: Keystore, enclaves: Sequence[str]) -> Iterator[tuple[_Kind, _Party]]:
+def _parties(keystore: OpenedKeystore, enclaves: Sequence[str]) -> Iterator[tuple[_Kind, _Party]]:
     """Yield one enclave of each group that trusts and presents the same CAs, with these CAs."""
     seen = set()
     for name in enclaves:
@@ -238,7 +238,7 @@ def _revoked(targets: Targets) -> Iterator[Finding]:
         yield PEERS_REVOKED.found(shown, text, shown)
 
 
-def _names_revoked(data: bytes, keystore: Keystore, enclaves: Sequence[str]) -> Iterator[str]:
+def _names_revoked(data: bytes, keystore: OpenedKeystore, enclaves: Sequence[str]) -> Iterator[str]:
     """Yield the enclaves whose certificates a revocation list revokes."""
     with suppress(SrosError):
         revocation_list = read_list(data, CRL_FILE)
@@ -257,7 +257,7 @@ def _names_revoked(data: bytes, keystore: Keystore, enclaves: Sequence[str]) -> 
 class _Governed:
     """The governance documents of a target, and the domains that its enclaves may join."""
 
-    def __init__(self, keystore: Keystore, enclaves: Sequence[str], now: datetime) -> None:
+    def __init__(self, keystore: OpenedKeystore, enclaves: Sequence[str], now: datetime) -> None:
         self._keystore = keystore
         self._enclaves = enclaves
         self._now = now

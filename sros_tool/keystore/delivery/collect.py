@@ -62,7 +62,7 @@ from sros_tool.keystore.lifecycle.revoke import (
     restored_note,
 )
 from sros_tool.keystore.outcomes import changes_below
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     SigningRequest,
@@ -201,10 +201,10 @@ def collect(
             messages, too.
         DocumentError: ``restored`` names no robot of the fleet; the inbox is not a folder.
     """
-    recorded_fleet(Keystore(root))
+    recorded_fleet(OpenedKeystore(root))
     with nullcontext() if dry_run else locked_confirmations(root):
         refused_before = refusals(root)
-        keystore = Keystore(root)
+        keystore = OpenedKeystore(root)
         fleet = checked_fleet(keystore)
         assert fleet
         for name in restored:
@@ -440,7 +440,7 @@ class _Verifier:
     """Verifier of messages against the CAs, the ledger and the fleet of a keystore."""
 
     def __init__(
-        self, keystore: Keystore, fleet: Fleet, now: datetime, restored: Collection[str]
+        self, keystore: OpenedKeystore, fleet: Fleet, now: datetime, restored: Collection[str]
     ) -> None:
         self._keystore = keystore
         self._fleet = fleet
@@ -628,7 +628,7 @@ class _DecidedRequest:
 class _Renewals:
     """Decides which requests of robots may be signed: none that changes who has which rights."""
 
-    def __init__(self, keystore: Keystore, fleet: Fleet, now: datetime) -> None:
+    def __init__(self, keystore: OpenedKeystore, fleet: Fleet, now: datetime) -> None:
         self._keystore = keystore
         self._fleet = fleet
         self._now = now
@@ -759,7 +759,7 @@ def _revoke_again(
     signed; but if they are lists of a CA service, which alone can sign another one and knows its
     certificates, there is only a note.  Return the same as `_sign`.
     """
-    if not (forgotten_lists.lists or forgotten_lists.unknown_certificates(Keystore(root))):
+    if not (forgotten_lists.lists or forgotten_lists.unknown_certificates(OpenedKeystore(root))):
         return "", [], []
     forgotten_serials = {entry.serial for crl in forgotten_lists.lists for entry in crl.revoked}
     requests = [request for message in messages for request in message.requests if request.request]
@@ -769,7 +769,7 @@ def _revoke_again(
     have = (
         f"{first_few(robots_with_lists, _SHOWN)} {'has' if len(robots_with_lists) == 1 else 'have'}"
     )
-    if keyring.ca_service(root, IDENTITY, Keystore(root).template):
+    if keyring.ca_service(root, IDENTITY, OpenedKeystore(root).template):
         # Its list is for all sites, and everybody can have it: nobody else has to wait.
         text = (
             f"{have} a revocation list of the CA service that the keystore lacks: import it "

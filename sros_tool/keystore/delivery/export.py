@@ -47,7 +47,7 @@ from sros_tool.keystore.outcomes import (
     enclave_result,
 )
 from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
-from sros_tool.keystore.reader import Keystore, OpenedEnclave, open_enclave
+from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, open_enclave
 from sros_tool.keystore.selection import missing_enclave_error, select_enclaves
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
@@ -109,7 +109,12 @@ def select(
     chosen: list[str] = []
     left_out: list[str] = []
     for name in select_enclaves(
-        Keystore(root), names, patterns, robots=robots, all_enclaves=all_enclaves, checked=True
+        OpenedKeystore(root),
+        names,
+        patterns,
+        robots=robots,
+        all_enclaves=all_enclaves,
+        checked=True,
     ):
         only_matches = name not in names and not keyless
         at_robot = only_matches and key_on_robot(enclave_path(root, name))
@@ -205,7 +210,7 @@ def exported_files(
     Raises:
         KeystoreError: an enclave does not exist, or cannot run.
     """
-    keystore = Keystore(root)
+    keystore = OpenedKeystore(root)
     keystore.check()
     for name in names:
         if not has_enclave(root, check_enclave_name(name)):
@@ -435,7 +440,7 @@ def _write_folder(
 def _check_robot(root: Path, target: Path, files: Mapping[str, bytes]) -> None:
     """Raise `KeystoreError` if the agent in ``target`` is of another robot than an enclave."""
     settings = target / AGENT / "agent.toml"
-    if not settings.is_file() or not (fleet := load_fleet(Keystore(root))):
+    if not settings.is_file() or not (fleet := load_fleet(OpenedKeystore(root))):
         return
     owner = None
     with suppress(SrosError, ValueError):  # the agent refuses these settings itself
@@ -549,7 +554,7 @@ def exported_outcomes(
 
     ``changed`` says whether the export changed any file.
     """
-    keystore, outcome = Keystore(root), "exported" if changed else "kept"
+    keystore, outcome = OpenedKeystore(root), "exported" if changed else "kept"
     return [
         enclave_result(keystore, name, outcome, written=True, folder=folder / enclave_folder(name))
         for name in names

@@ -73,7 +73,7 @@ from sros_tool.keystore.lifecycle.revoke import (
     restored_note,
 )
 from sros_tool.keystore.outcomes import changes_below
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.transaction.transaction import KeystoreLock
 from sros_tool.parallel import map_slices, tick
 from sros_tool.pki.certificates import load_certificates
@@ -196,7 +196,7 @@ def publish(
         UnavailableError: the package ``tuf`` is not installed.
     """
     check_tuf()
-    keystore = Keystore(root)
+    keystore = OpenedKeystore(root)
     recorded_fleet(keystore)
     checked_fleet(keystore)
     _check_apart(root, folder)
@@ -249,7 +249,7 @@ def publish(
         return run.result(keys)
 
 
-def later_in_folder(keystore: Keystore) -> str:
+def later_in_folder(keystore: OpenedKeystore) -> str:
     """Return a clause with evidence that the publishing folder is newer than the keystore.
 
     "" if the folder is not newer, or if this is unknown here.  Only metadata that keys of the
@@ -551,7 +551,12 @@ class _Run:
     """One run of `publish`: the published state, the intended state, and the writing."""
 
     def __init__(
-        self, keystore: Keystore, folder: Path, now: datetime, expiry: MetadataExpiry, dry_run: bool
+        self,
+        keystore: OpenedKeystore,
+        folder: Path,
+        now: datetime,
+        expiry: MetadataExpiry,
+        dry_run: bool,
     ) -> None:
         """Read what was published, and what is in the folder."""
         from sros_tool.keystore.delivery.repository import Roots, read_present
@@ -759,7 +764,7 @@ class _Run:
             keyring=keyring,
             dry_run=self._dry_run,
         )
-        self.keystore = Keystore(self.keystore.root)
+        self.keystore = OpenedKeystore(self.keystore.root)
         done = ""
         if forgotten_lists.lists:
             whence = f"the last release in '{self._folder}' has"

@@ -19,7 +19,7 @@ from sros_tool.errors import DocumentError, SrosError
 from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT
 from sros_tool.keystore.delivery.release import read_release, release_target
 from sros_tool.keystore.layout import CRL_FILE, IDENTITY, PUBLISHED
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.crl import load_crl, signed_by
 from sros_tool.validity import iso, parse_iso
 from sros_tool.values import parse_json
@@ -132,7 +132,7 @@ class Published:
         return json.dumps({**value, "superseded": superseded, "robots": robots}).encode()
 
 
-def read_published(keystore: Keystore) -> Published:
+def read_published(keystore: OpenedKeystore) -> Published:
     """Return what was published last; empty if nothing was.
 
     Raises:
@@ -157,7 +157,7 @@ def read_published(keystore: Keystore) -> Published:
         raise damaged_list_error(keystore) from error
 
 
-def may_have_later_releases(keystore: Keystore) -> bool:
+def may_have_later_releases(keystore: OpenedKeystore) -> bool:
     """Return whether the publishing folder has later metadata than the keystore recorded.
 
     If so, the keystore was restored from a backup, or somebody else wrote the metadata, which is
@@ -174,7 +174,7 @@ def may_have_later_releases(keystore: Keystore) -> bool:
     return False
 
 
-def later_revoked_serials(keystore: Keystore) -> frozenset[int]:
+def later_revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
     """Return the serials that the keystore's lists in a folder with later releases revoke."""
     serials: set[int] = set()
     seen: set[bytes] = set()
@@ -192,7 +192,7 @@ def later_revoked_serials(keystore: Keystore) -> frozenset[int]:
     return frozenset(serials)
 
 
-def damaged_list_error(keystore: Keystore, why: str = "") -> DocumentError:
+def damaged_list_error(keystore: OpenedKeystore, why: str = "") -> DocumentError:
     """Return the error for a damaged list of published releases; ``why`` is its reason."""
     return DocumentError(
         f"'{keystore.root / PUBLISHED}' is damaged",

@@ -51,8 +51,8 @@ from sros_tool.keystore.outcomes import (
 )
 from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.reader import (
-    Keystore,
     OpenedEnclave,
+    OpenedKeystore,
     open_enclave,
     read_certificate,
     weaknesses,
@@ -164,7 +164,7 @@ def create_request(
         elif place_of_key:
             made = make_enclave_key(place_of_key, secrets)
             remedy = "Name another object of the token."
-            KnownKeys(Keystore(folder)).refuse_shared_key(made.public_key(), name, remedy)
+            KnownKeys(OpenedKeystore(folder)).refuse_shared_key(made.public_key(), name, remedy)
             transaction.write(f"{place}/{KEY_URI_FILE}", made.file)
         else:
             made = generate_key()
@@ -547,7 +547,7 @@ def _check_key(folder: Path, answer: RequestAnswer, key: PublicKey) -> None:
     path = folder / enclave_folder(answer.name) / "cert.pem"
     present = read_certificate(path) if path.exists() else None
     if not present or present.public_key() != key:
-        KnownKeys(Keystore(folder)).refuse_shared_key(key, answer.name, remedy)
+        KnownKeys(OpenedKeystore(folder)).refuse_shared_key(key, answer.name, remedy)
         return
     crl = answer.file("crl.pem")
     for revoked in load_crl(crl, "of the answer").revoked if crl else ():

@@ -70,7 +70,7 @@ from sros_tool.keystore.outcomes import (
     changes_below,
     trusted_authorities,
 )
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import SignedRights
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import (
@@ -323,7 +323,7 @@ def _check_distinct(requests: Sequence[SigningRequest]) -> None:
             )
 
 
-def _is_certified(keystore: Keystore, request: SigningRequest) -> bool:
+def _is_certified(keystore: OpenedKeystore, request: SigningRequest) -> bool:
     """Return whether the enclave of a request already has a certificate for the request's key."""
     if not has_enclave(keystore.root, request.name):
         return False
@@ -543,7 +543,7 @@ def _check_key(
 
 
 def _check_same_key(
-    keystore: Keystore, request: SigningRequest, present_certificate: x509.Certificate | None
+    keystore: OpenedKeystore, request: SigningRequest, present_certificate: x509.Certificate | None
 ) -> None:
     """Raise `KeystoreError` if the keystore has another key for the enclave of a request."""
     root, folder = keystore.root, keystore.folder(request.name)

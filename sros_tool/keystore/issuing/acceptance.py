@@ -49,7 +49,7 @@ from sros_tool.keystore.layout import (
     has_enclave,
 )
 from sros_tool.keystore.participant import JoinContext, VendorParticipant, load_enclave
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki import smime
@@ -108,7 +108,7 @@ def refuse_stopping(
     transaction: Transaction,
     now: datetime,
     *,
-    keystore: Keystore | None = None,
+    keystore: OpenedKeystore | None = None,
     allowed: Collection[Vendor] = (),
     revoked_before: Collection[int] = (),
     remedy: Callable[[], str] = str,
@@ -134,7 +134,9 @@ def refuse_stopping(
     Raises:
         KeystoreError: nodes of a vendor that is not ``allowed`` would stop.
     """
-    files = _FilesOfChange(transaction, keystore or Keystore(transaction.root), revoked_before)
+    files = _FilesOfChange(
+        transaction, keystore or OpenedKeystore(transaction.root), revoked_before
+    )
     stopped, revoked = _stopped_enclaves(files, now)
     if refused := {vendor: why for vendor, why in stopped.items() if vendor not in allowed}:
         raise _refused_change_error(transaction.root, refused, remedy())
@@ -402,7 +404,7 @@ class _FilesOfChange:
     """The files of enclaves before and after a transaction; shared files are read once."""
 
     def __init__(
-        self, transaction: Transaction, keystore: Keystore, revoked_before: Collection[int]
+        self, transaction: Transaction, keystore: OpenedKeystore, revoked_before: Collection[int]
     ) -> None:
         self._revoked_before = revoked_before
         self.transaction = transaction

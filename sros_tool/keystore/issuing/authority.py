@@ -31,7 +31,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
 )
 from sros_tool.keystore.loading import authority_refusals, refusals_text
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki import smime
@@ -210,7 +210,7 @@ def create_authorities(
 
 
 def load_authorities(
-    keystore: Keystore, template: Template, keyring: Keyring, now: datetime
+    keystore: OpenedKeystore, template: Template, keyring: Keyring, now: datetime
 ) -> Authorities:
     """Return both CAs of a keystore with their keys, ready to sign.
 
@@ -223,7 +223,7 @@ def load_authorities(
 
 
 def load_authority(
-    keystore: Keystore, role: str, template: Template, keyring: Keyring, now: datetime
+    keystore: OpenedKeystore, role: str, template: Template, keyring: Keyring, now: datetime
 ) -> Authority:
     """Return the identity or permissions CA with its key, ready to sign.
 

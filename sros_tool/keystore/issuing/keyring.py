@@ -17,7 +17,7 @@ from sros_tool.errors import DocumentError, KeystoreError, PkiError, UsageError
 from sros_tool.files import remove_file, write_new_file
 from sros_tool.keystore.issuing.ca_service import CaService, check_ca_service, is_ca_service
 from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, ROLES, ca_key, key_path
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
@@ -106,7 +106,7 @@ class Keyring:
             )
         return CaService(place, root)
 
-    def open(self, keystore: Keystore, role: str, template: Template) -> PrivateKey:
+    def open(self, keystore: OpenedKeystore, role: str, template: Template) -> PrivateKey:
         """Return the private key of the ``role`` CA.
 
         Raises:
@@ -171,7 +171,7 @@ class Keyring:
             return create_token_key(place, self.secrets, named=named)
         if place and key_path(transaction.root, place).exists():
             self._check_chosen(role, place, compared=compared)
-            return self.open(Keystore(transaction.root), role, template)
+            return self.open(OpenedKeystore(transaction.root), role, template)
         key = generate_key()
         pem = key_pem(key, self._new_passphrase(role) if self.encrypt else None)
         if not place:
@@ -198,7 +198,7 @@ class Keyring:
             permissions = identity
         return replace(template, identity_key=identity, permissions_key=permissions)
 
-    def _read(self, keystore: Keystore, path: Path, role: str) -> bytes:
+    def _read(self, keystore: OpenedKeystore, path: Path, role: str) -> bytes:
         """Return the PEM of a CA key.
 
         The settings or a link in another user's keystore could name a CA key that only this user

@@ -56,7 +56,7 @@ from sros_tool.keystore.ledger import (
 )
 from sros_tool.keystore.lifecycle.replaced import ReplacedRights, Superseded
 from sros_tool.keystore.outcomes import KeptZenoh
-from sros_tool.keystore.reader import Keystore, check_domain
+from sros_tool.keystore.reader import OpenedKeystore, check_domain
 from sros_tool.keystore.rights import RecordedRights, SignedRights
 from sros_tool.keystore.settings import (
     edit_notes,
@@ -164,7 +164,7 @@ class KeystoreChange:
         self.dry_run = dry_run
         self.is_new = new_keystore
         self.transaction = Transaction(root, new_keystore=new_keystore, dry_run=dry_run)
-        self.keystore = Keystore(root)
+        self.keystore = OpenedKeystore(root)
         self.entries: list[Entry] = []
         self.notes: list[Note] = []
         self.remarks: list[Note] = []
@@ -186,7 +186,7 @@ class KeystoreChange:
         if not self.is_new:
             check_keystore(self.root)
         self.transaction.__enter__()
-        self.keystore = Keystore(self.root, locked=not self.dry_run)
+        self.keystore = OpenedKeystore(self.root, locked=not self.dry_run)
         return self
 
     def __exit__(
@@ -587,7 +587,7 @@ _ADOPTED = "taken over"
 
 
 def _take_over_records(
-    transaction: Transaction, keystore: Keystore, now: datetime, entries: Iterable[Entry]
+    transaction: Transaction, keystore: OpenedKeystore, now: datetime, entries: Iterable[Entry]
 ) -> list[Entry]:
     """Return ``entries`` after entries for the files that ros2/sros2 made; stage the settings.
 
@@ -609,7 +609,7 @@ def _take_over_records(
 
 
 def _entries_for_ros2_files(
-    keystore: Keystore, names: Iterable[str], now: datetime
+    keystore: OpenedKeystore, names: Iterable[str], now: datetime
 ) -> Iterator[Entry]:
     authorities = dict.fromkeys(keystore.ca_certificate(role) for role in ROLES)
     for authority in authorities:
@@ -629,7 +629,7 @@ def _entries_for_ros2_files(
 
 
 def _settings_of_ros2(
-    transaction: Transaction, keystore: Keystore, now: datetime
+    transaction: Transaction, keystore: OpenedKeystore, now: datetime
 ) -> Iterator[Entry]:
     present = present_settings(keystore)
     if protection_for(present.governance):  # else settings would say another protection
@@ -639,7 +639,7 @@ def _settings_of_ros2(
 def _keep_zenoh(
     transaction: Transaction,
     *,
-    keystore: Keystore,
+    keystore: OpenedKeystore,
     network: ZenohNetwork,
     domains: DomainSet,
     authority: x509.Certificate,

@@ -83,7 +83,7 @@ from sros_tool.keystore.lifecycle.replaced import (
     with_ledger,
 )
 from sros_tool.keystore.protection import less_protected, with_stated
-from sros_tool.keystore.reader import Keystore, check_domain
+from sros_tool.keystore.reader import OpenedKeystore, check_domain
 from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.keystore.settings import edit_remedy, found_edits, with_places, write_settings
 from sros_tool.keystore.template import NODE_BASICS, Template, template_names
@@ -414,7 +414,7 @@ def _revoked_before(
 
 def refuse_other_template(root: Path, template: Template) -> None:
     """Raise `UsageError` if the existing keystore ``root`` was made from another template."""
-    present = Keystore(root).template
+    present = OpenedKeystore(root).template
     named = template.name == present.name and template.name in template_names()
     plain = replace(template, name=present.name, description=present.description)
     if not (named or with_places(plain, present) == present):

@@ -22,7 +22,7 @@ from sros_tool.fleet.robots import Fleet, folded
 from sros_tool.keystore.delivery.published import may_have_later_releases
 from sros_tool.keystore.known_keys import restored_at, revoked_serials
 from sros_tool.keystore.ledger import Entry, certificate_entry
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.certificates import key_digest, subject_text, validity_of
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, compare
@@ -88,7 +88,7 @@ class ReplacedRights:
 
 
 def earlier_permissions(
-    keystore: Keystore,
+    keystore: OpenedKeystore,
     name: str,
     authority: x509.Certificate,
     certificate: x509.Certificate | None = None,
@@ -142,7 +142,7 @@ class IssuedEarlier:
     backup, so that its ledger may lack some of these files.
     """
 
-    def __init__(self, keystore: Keystore, names: Collection[str]) -> None:
+    def __init__(self, keystore: OpenedKeystore, names: Collection[str]) -> None:
         self.lacks_some = bool(restored_at(keystore) or may_have_later_releases(keystore))
         self._expiry: dict[tuple[str, str], str] = {}
         revoked = revoked_serials(keystore)
@@ -162,7 +162,7 @@ class IssuedEarlier:
 
 
 def with_ledger(
-    keystore: Keystore, replaced_rights: Collection[ReplacedRights], now: datetime
+    keystore: OpenedKeystore, replaced_rights: Collection[ReplacedRights], now: datetime
 ) -> tuple[ReplacedRights, ...]:
     """Return the replaced rights, each with the latest expiry that the ledger has for its enclave.
 

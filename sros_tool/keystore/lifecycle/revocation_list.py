@@ -46,7 +46,7 @@ from sros_tool.keystore.lifecycle.rotation import (
     crls_confusable,
     read_rotation,
 )
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import check_enclave_name
@@ -78,7 +78,7 @@ class Forgotten:
     wherever they come from.  Certificates map serial numbers (hexadecimal) to ledger entries.
     """
 
-    def __init__(self, keystore: Keystore, now: datetime) -> None:
+    def __init__(self, keystore: OpenedKeystore, now: datetime) -> None:
         self.lists: list[RevocationList] = []
         self.certificates: dict[str, Entry] = {}
         self._now = now
@@ -106,7 +106,7 @@ class Forgotten:
         self.certificates.setdefault(entry.serial, entry)
         return True
 
-    def unknown_certificates(self, keystore: Keystore) -> dict[str, Entry]:
+    def unknown_certificates(self, keystore: OpenedKeystore) -> dict[str, Entry]:
         """Return the certificates that ``keystore`` neither issued nor revoked, as far as it knows.
 
         A certificate that the ledger has only from a robot's message is included if a sealed
@@ -203,7 +203,7 @@ def _carried_over(old: RevocationList | None, expiries: Mapping[int, str]) -> li
 
 
 def _certificates_of_revoked(
-    keystore: Keystore, known: Container[str] = ()
+    keystore: OpenedKeystore, known: Container[str] = ()
 ) -> Iterator[x509.Certificate]:
     """Yield the certificates in the folder ``revoked`` that a trusted identity CA issued.
 
@@ -230,7 +230,7 @@ class RevocationListSigner:
     def __init__(
         self,
         transaction: Transaction,
-        keystore: Keystore,
+        keystore: OpenedKeystore,
         *,
         authority: Authority,
         template: Template,
@@ -685,7 +685,7 @@ def _link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
         transaction.link_to_first_list(lacking)
 
 
-def another_ca_remedy(keystore: Keystore, purpose: str) -> str:
+def another_ca_remedy(keystore: OpenedKeystore, purpose: str) -> str:
     """Return the remedy, as a sentence, if DDS refuses the lists of the identity CA.
 
     ``purpose`` is the command to repeat afterwards, such as ``revoke``.

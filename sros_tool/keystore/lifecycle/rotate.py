@@ -73,7 +73,7 @@ from sros_tool.keystore.lifecycle.rotation import (
     render_rotation,
     retired_key,
 )
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import SignedRights
 from sros_tool.keystore.settings import edit_remedy, found_edits, write_settings
 from sros_tool.keystore.template import Template
@@ -181,7 +181,7 @@ def _step(change: KeystoreChange, **more: Any) -> RotationStep:
 
 
 def robots_cut_off(
-    keystore: Keystore, rotation: Rotation, to: RotationStage, now: datetime
+    keystore: OpenedKeystore, rotation: Rotation, to: RotationStage, now: datetime
 ) -> tuple[str, ...]:
     """Return the sorted names of the robots that the stage ``to`` would cut off from the others.
 
@@ -205,7 +205,7 @@ def _leaves_out_stages(rotation: Rotation, to: RotationStage) -> bool:
     return stages.index(to) - stages.index(rotation.stage) > 1
 
 
-def _no_robot_notes(keystore: Keystore, names: Iterable[str]) -> Iterator[Note]:
+def _no_robot_notes(keystore: OpenedKeystore, names: Iterable[str]) -> Iterator[Note]:
     """Yield a note on enclaves without a robot in the fleet, whose state no confirmation shows."""
     fleet = load_fleet(keystore)
     without = [name for name in names if robot_of(fleet, name) is None] if fleet else []
@@ -242,7 +242,7 @@ def _cut_off_error(
     )
 
 
-def _refuse_edited(keystore: Keystore) -> None:
+def _refuse_edited(keystore: OpenedKeystore) -> None:
     """Raise `KeystoreError` if settings or governance were edited: signing would undo the edits."""
     root, governance = keystore.root, None
     with suppress(SrosError):  # signing it again reports it
@@ -255,7 +255,7 @@ def _refuse_edited(keystore: Keystore) -> None:
         )
 
 
-def _was_replaced(keystore: Keystore) -> bool:
+def _was_replaced(keystore: OpenedKeystore) -> bool:
     """Return whether the ledger records a CA that another CA replaced."""
     names = (keystore.certificates_of(f"{role}_ca") for role in ROLES)
     trusted = {
@@ -270,7 +270,7 @@ def _was_replaced(keystore: Keystore) -> bool:
 
 
 def _target_stage(
-    keystore: Keystore, rotation: Rotation, to: RotationStage | None
+    keystore: OpenedKeystore, rotation: Rotation, to: RotationStage | None
 ) -> RotationStage:
     """Return the stage to go to; NONE if the keystore is already there.
 

@@ -28,7 +28,7 @@ from sros_tool.keystore.layout import (
     ROLES,
     ROTATION,
 )
-from sros_tool.keystore.reader import Keystore, open_keystore
+from sros_tool.keystore.reader import OpenedKeystore, open_keystore
 from sros_tool.pki.certificates import (
     digest,
     issued_by,
@@ -127,7 +127,7 @@ def retired_key(certificate: x509.Certificate) -> str:
     return f"{RETIRED}/{certificate.serial_number:x}.key.pem"
 
 
-def read_rotation(keystore: Keystore) -> Rotation:
+def read_rotation(keystore: OpenedKeystore) -> Rotation:
     """Return the rotation in progress; an empty `Rotation` if there is none.
 
     Raises:
@@ -218,7 +218,7 @@ def rotation_status(root: Path, *, now: datetime) -> RotationStatus:
 
 
 def _count(
-    keystore: Keystore, role: str, authorities: tuple[x509.Certificate, ...]
+    keystore: OpenedKeystore, role: str, authorities: tuple[x509.Certificate, ...]
 ) -> Counter[int]:
     """Count the enclaves of each CA, by its index in ``authorities``.
 
@@ -271,7 +271,7 @@ def _expiry_remarks(authority_states: Sequence[AuthorityStatus], now: datetime) 
     return remarks
 
 
-def _restart_remarks(keystore: Keystore, rotation: Rotation) -> list[str]:
+def _restart_remarks(keystore: OpenedKeystore, rotation: Rotation) -> list[str]:
     """Return remarks, by vendor, on the processes to restart at the stage DISTRIBUTE or REISSUE."""
     files = [replacement.file for replacement in rotation.replacements]
     if rotation.stage is RotationStage.DISTRIBUTE:
@@ -320,7 +320,7 @@ def _has_identifier(certificate: x509.Certificate) -> bool:
     return True
 
 
-def _fast_dds_hindrance(keystore: Keystore, files: Sequence[str]) -> str:
+def _fast_dds_hindrance(keystore: OpenedKeystore, files: Sequence[str]) -> str:
     """Return a sentence on why Fast DDS cannot trust the old and the new CA at once; "" if it can.
 
     Fast DDS 2.9.1 (tested) distinguishes two CAs of the same name by their key identifiers, and

@@ -24,7 +24,7 @@ from sros_tool.keystore.outcomes import (
     changes_below,
     enclave_result,
 )
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.certificates import load_certificate, subject_text
 from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes, Words, shows
 
@@ -83,7 +83,7 @@ def shown(result: Changed, form: type[Form], **more: Any) -> Form:
 
 def enclave_results(result: Changed) -> list[EnclaveResult[str]]:
     """Return the outcomes of enclaves; in a dry run, new enclaves have no certificate yet."""
-    keystore = Keystore(result.root)
+    keystore = OpenedKeystore(result.root)
     return [
         enclave_result(keystore, name, done, written=not result.dry_run or done == "kept")
         for name, done in result.outcomes.items()
@@ -166,7 +166,7 @@ def shown_keystore(
     for roles in [(role,) for role in ROLES] if separate else [ROLES]:
         role, certificate = roles[0], None
         if not result.dry_run:
-            certificate = Keystore(result.root).ca_certificate(role)
+            certificate = OpenedKeystore(result.root).ca_certificate(role)
         elif role in imported_cas:
             certificate = load_certificate(imported_cas[role], f"of the {role} CA")
         authorities.append(

@@ -77,7 +77,7 @@ from sros_tool.keystore.lifecycle.replaced import (
     with_ledger,
 )
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import RecordedRights, SignedRights
 from sros_tool.keystore.settings import (
     PresentSettings,
@@ -163,7 +163,7 @@ def edited_settings(root: Path, present_settings: PresentSettings) -> tuple[Temp
             "Edit one of them first, or name what to change with --set or --template.",
         )
     if present_settings.written is None and not present_settings.without_settings:
-        _ = Keystore(root).template  # raises what is wrong with them
+        _ = OpenedKeystore(root).template  # raises what is wrong with them
         raise KeystoreError(
             f"there is no {SETTINGS} in keystore '{root}', so there is no change to apply",
             "",
@@ -217,7 +217,7 @@ def _checked_target(root: Path, present_settings: PresentSettings, target: Templ
                 f"Leave authorities.{name} out; `sros rotate_ca --{name.replace('_', '-')}` makes "
                 "a CA with a key elsewhere.",
             )
-    if not target.separate_authorities and len(Keystore(root).authority_files) > 1:
+    if not target.separate_authorities and len(OpenedKeystore(root).authority_files) > 1:
         raise UsageError(
             "a keystore with separate CAs cannot change back to one CA for both purposes",
             "With one CA, every enclave can sign its own permissions (Cyclone DDS 0.10.2, Fast DDS "
