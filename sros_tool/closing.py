@@ -41,8 +41,9 @@ from sros_tool.explain.audit import DeniedRight, audit, audited_enclaves
 from sros_tool.explain.explanation import likely_meaning
 from sros_tool.files import policies_dir, remove_file, replace_file
 from sros_tool.folders import Folder, make_folders, remove_folders
-from sros_tool.graph.learn import common_parts, is_tool, name_as_written, stable_name
+from sros_tool.graph.learn import common_parts, is_tool, stable_name
 from sros_tool.graph.observation import (
+    PUBLISH,
     Endpoint,
     Observation,
     ObservedNode,
@@ -62,7 +63,7 @@ from sros_tool.keystore.participant import JoinContext
 from sros_tool.keystore.reader import FilesReadOnce, OpenedKeystore, open_enclave
 from sros_tool.keystore.selection import revocation_of
 from sros_tool.keystore.template import load_template
-from sros_tool.names import expand, is_expression
+from sros_tool.names import expand, is_expression, right_to_use
 from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.merge import merge_into
@@ -1163,7 +1164,8 @@ class OpenRobot:
         renamed, nodes = {} if all_nodes else self._renamed_nodes(), []
         for node in self._observed_nodes():
             if new := renamed.get(_node_name(node)):
-                nodes.append(_under_name(node, *new))
+                endpoints = frozenset(self._renamed_endpoints(node, *new).values())
+                nodes.append(replace(node, ns=new[0], name=new[1], endpoints=endpoints))
             elif names.issuperset(node.enclaves):
                 nodes.append(node)
             elif place := moved.get((node.ns, stable_name(node.name))):
@@ -1193,6 +1195,26 @@ class OpenRobot:
             if len(old) == len(new) == 1:
                 renamed[old.pop()] = new.pop()
         return renamed
+
+    def _renamed_endpoints(
+        self, node: ObservedNode, ns: str, name: str
+    ) -> dict[Endpoint, Endpoint]:
+        """Map the endpoints of an observed node to those that it should have under another name.
+
+        The first possible name that its enclave allows counts; without one, the first.
+        """
+        possible = {
+            endpoint: _possible_endpoints(endpoint, node, ns, name) for endpoint in node.endpoints
+        }
+        tried = frozenset(chain.from_iterable(possible.values()))
+        tried_by = make_observation([replace(node, ns=ns, name=name, endpoints=tried)])
+        denied = {
+            endpoint for right in self._denied_rights(tried_by) for endpoint in right.endpoints
+        }
+        return {
+            endpoint: next((new for new in names if new not in denied), names[0])
+            for endpoint, names in possible.items()
+        }
 
     def _variables(self, enclave: str, rmw: str = "") -> dict[str, str]:
         """Return the environment of an enclave of the export."""
@@ -1312,14 +1334,14 @@ class OpenRobot:
 
     def _denied_access_texts(self) -> list[str]:
         """Return, as sentences, what the keystore denies to the observed nodes."""
-        return [str(right) for right in self._denied_rights()]
+        return [str(right) for right in self._denied_rights(self._observation())]
 
-    def _denied_rights(self) -> Sequence[DeniedRight]:
-        """Return the rights that the observed nodes need and the keystore denies."""
+    def _denied_rights(self, observation: Observation) -> Sequence[DeniedRight]:
+        """Return the rights that observed nodes need and the keystore denies."""
         context = JoinContext(self.domain, self._shell.now(), self._shell.zone)
         vendor = chosen_vendor(None, None, self._shell.environment)[0]
         enclaves = audited_enclaves([self._rights], vendor, context)
-        return audit(self._observation(), enclaves, _OBSERVER).denied
+        return audit(observation, enclaves, _OBSERVER).denied
 
     def _problems(self, closing: Closing, *, partial: bool) -> Iterator[str]:
         """Yield what keeps the robot from running closed, with what to do."""
@@ -1599,6 +1621,8 @@ class OpenRobot:
         if renamed:
             names = [f"{old} as {expand('~', *renamed[old])}" for old in sorted(renamed)]
             text = f"; compared under a new name: {first_few(names, _MOST_NAMES)}"
+            if moved := self._moved_names(renamed):
+                text += f", with {enumerated(moved)} (a name that does not move: write it absolute)"
             if fails:
                 text += " (if it is another node, remove what it does not use from its profile)"
         _, without = self._divide_by_profile(self._observed_nodes())
@@ -1611,6 +1635,21 @@ class OpenRobot:
                 "--for 1m)"
             )
         return text
+
+    def _moved_names(self, renamed: Mapping[str, tuple[str, str]]) -> list[str]:
+        """Return, as text, which names of renamed nodes are compared in their new namespaces.
+
+        The private names of a node are left out.
+        """
+        return sorted(
+            {
+                f"{_use_of(before)[1]} as {_use_of(after)[1]}"
+                for node in self._observed_nodes()
+                if (new := renamed.get(_node_name(node)))
+                for before, after in self._renamed_endpoints(node, *new).items()
+                if before != after == _possible_endpoints(before, node, *new)[-1]
+            }
+        )
 
     def _divide_by_profile(
         self, nodes: Iterable[ObservedNode]
@@ -1785,7 +1824,7 @@ class OpenRobot:
         Processes of the enclaves ``missing`` do not run; ``running`` are those of the other
         enclaves at the beginning of the proof.
         """
-        denied = self._denied_rights()
+        denied = self._denied_rights(self._observation())
         words = ("audit", str(self._rights), "--keystore", str(self.export), "--enclave", _OBSERVER)
         step = _Step(
             (*words, "--domain", str(self.domain), "--json", *["--partial"] * bool(missing))
@@ -1818,7 +1857,10 @@ class OpenRobot:
             reason = next((f"{why}: {first_few(of, 3)}" for why, of in wrong.items() if of), "")
             if not reason:
                 number = counted(len(before.nodes), "node")
-                but = f", but for {counted(len(denied), 'right')} that the policy denies now"
+                but = f", but for {counted(len(denied), 'right')} that the policy denies now: "
+                but += ", ".join(
+                    f"{right.right.enclave} {right.right.describe()}" for right in denied
+                )
                 seen = f"{number} with {before.endpoint_count} endpoints as before"
                 left = f", without {', '.join(missing)}" if missing else ""
                 _, others = self._divide_by_profile(now.nodes)
@@ -1958,32 +2000,45 @@ def _lost_endpoints(
 ) -> list[str]:
     """Return the endpoints, as text, that nodes had before and lack now, unless ``denied``."""
     expected = {*_endpoints(before.nodes)} - {
-        f"{node} {way} {topic}"
-        for right in denied
-        for node in right.nodes
-        for topic, way in right.endpoints
+        (node, endpoint) for right in denied for node in right.nodes for endpoint in right.endpoints
     }
-    return sorted(expected - {*_endpoints(now.nodes)})
+    lost: dict[str, list[str]] = {}
+    gone = expected - {*_endpoints(now.nodes)}
+    for node, right, name in sorted({(node, *_use_of(endpoint)) for node, endpoint in gone}):
+        lost.setdefault(f"{node} {right}", []).append(name)
+    return [f"{uses} {first_few(names, _MOST_NAMES)}" for uses, names in lost.items()]
+
+
+def _use_of(endpoint: Endpoint) -> tuple[str, str]:
+    """Return the right that an endpoint needs, and its ROS name, or its DDS topic without one."""
+    right, name = right_to_use(endpoint.topic, writes=endpoint.direction == PUBLISH)
+    return right or endpoint.direction, name
 
 
 def _node_name(node: ObservedNode) -> str:
     return f"{node.ns.rstrip('/')}/{stable_name(node.name)}"
 
 
-def _under_name(node: ObservedNode, ns: str, name: str) -> ObservedNode:
-    """Return a node under another name, with the topics that a policy then gives it."""
+def _possible_endpoints(
+    endpoint: Endpoint, node: ObservedNode, ns: str, name: str
+) -> Sequence[Endpoint]:
+    """Return an endpoint of a node as it may be named under another node name, likeliest first.
 
-    def under_name(topic: str) -> str:
-        prefix, ros_name = topic[:2], topic[2:]
-        if not ros_name.startswith("/"):  # a DDS topic without a ROS name
-            return topic
-        return f"{prefix}{expand(name_as_written(ros_name, node.ns, node.name), ns, name)}"
+    Private names of the node move with it.  The graph does not show whether a program wrote another
+    name of its namespace as a relative one, which moves, or as an absolute one.
+    """
+    prefix, fqn = endpoint.topic[:2], endpoint.topic[2:]
+    own, near = expand("~/", node.ns, node.name), expand("", node.ns, "")
+    if fqn.startswith(own):
+        moved = f"{expand('~/', ns, name)}{fqn.removeprefix(own)}"
+        return endpoint._replace(topic=prefix + moved), endpoint
+    if fqn.startswith(near):  # a DDS topic without a ROS name does not
+        moved = expand(fqn.removeprefix(near), ns, name)
+        return endpoint, endpoint._replace(topic=prefix + moved)
+    return (endpoint,)
 
-    endpoints = {Endpoint(under_name(topic), way) for topic, way in node.endpoints}
-    return replace(node, ns=ns, name=name, endpoints=frozenset(endpoints))
 
-
-def _endpoints(nodes: Iterable[ObservedNode]) -> Iterator[str]:
+def _endpoints(nodes: Iterable[ObservedNode]) -> Iterator[tuple[str, Endpoint]]:
     for node in nodes:
         for topic, way in node.endpoints:
-            yield f"{_node_name(node)} {way} {topic.replace(node.name, stable_name(node.name))}"
+            yield _node_name(node), Endpoint(topic.replace(node.name, stable_name(node.name)), way)

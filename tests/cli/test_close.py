@@ -51,10 +51,11 @@ SERVICES = (
 
 
 def ros_node(name: str, participant: str, *endpoints: str) -> Any:
-    """A node of the graph with what every node has."""
+    """A node of the graph, in the root namespace or a/b, with what every node has."""
+    ns, _, base = f"/{name}".rpartition("/")
     own = [f"publish rr/{name}/{service}Reply" for service in SERVICES]
     own += [f"subscribe rq/{name}/{service}Request" for service in SERVICES]
-    return "/", "/", name, participant, [*endpoints, *own, "publish rt/rosout", *EVENTS]
+    return "/", ns or "/", base, participant, [*endpoints, *own, "publish rt/rosout", *EVENTS]
 
 
 EVENTS = ("publish rt/parameter_events", "subscribe rt/parameter_events")
@@ -251,7 +252,8 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     robot.close()
     robot.remaining = (TALKER, ros_node("listener", "04"))
     said = robot.close("--apply").out
-    assert "36 endpoints as before, but for 1 right that the policy denies now\n" in said
+    assert "36 endpoints as before, but for 1 right that the policy denies now: " in said
+    assert "denies now: /listener subscribe topic /chatter\n" in said
 
 
 LOST = "robot/export/enclaves/lost"
@@ -581,7 +583,10 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     robot.absent = set()
     assert f"{lost}ended while the proof ran: {stopped}add --without /listener)\n" in said
     robot.remaining = (TALKER, (*ros_node("listener", LISTENER[3])[:4], EVENTS))
-    assert f"{lost}gone: /listener publish r" in robot.close("--proof", status=1).out
+    assert (
+        f"{lost}gone: /listener publish /rosout, /listener re"
+        in robot.close("--proof", status=1).out
+    )
     robot.remaining = (TALKER, LISTENER, ros_node("guest", "05"))
     assert f"{lost}denied: /guest " in robot.close("--proof", status=1).out
     robot.remaining = (TALKER, LISTENER)
@@ -715,28 +720,35 @@ def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
 
 def test_a_renamed_node_is_compared_and_a_new_one_is_named(robot: Robot) -> None:
     """Or a robot whose node got another name could never be proved closed again."""
-    robot.units, of = UNITS, LISTENER[3]
-    robot.nodes = (TALKER, LISTENER, ros_node("rear_camera", of, "publish rt/rear_camera/image"))
+    robot.units, of, kept = UNITS, LISTENER[3], ("publish rt/cmd_vel", "publish rt/plan")
+    rear = ros_node("rear_camera", of, "publish rt/rear_camera/image", "publish rt/odom", *kept)
+    robot.nodes = (TALKER, LISTENER, rear)
     robot.close()
     policy = robot.folder / "robot/policy.xml"
-    policy.write_text(policy.read_text().replace('node="rear_camera"', 'node="stern_camera"'))
-    assert "used when sros watched, and denied now" not in robot.close().out
-    stern_camera = ros_node("stern_camera", of, "publish rt/stern_camera/image")
+    text = policy.read_text().replace('ns="/" node="rear_', 'ns="/nav" node="stern_')
+    policy.write_text(text.replace(">cmd_vel<", ">/cmd_vel<").replace("<topic>plan</topic>", ""))
+    said, denied = robot.close().out, "denies now: /listener publish topic /plan"
+    assert said.count("used when sros watched") == 1 and f"{denied[7:]} (/nav/stern_c" in said
+    moved = "publish rt/nav/stern_camera/image", "publish rt/nav/odom"
+    stern_camera = ros_node("nav/stern_camera", of, *moved, kept[0])
     ghost = ("/", "/", "ghost_node", of, ["publish rt/rosout"])
     robot.remaining = (TALKER, LISTENER, stern_camera, ghost)
     said = robot.close("--apply").out
     talk = "everything that talked can still talk: "
-    assert f"yes: {talk}3 nodes with 54 endpoints as before; new, without a profile: /gho" in said
-    renamed = "compared under a new name: /rear_camera as /stern_camera"
-    assert f"/ghost_node in /listener; {renamed}\n" in said
-    robot.remaining = (TALKER, LISTENER, ros_node("stern_camera", of))
+    assert (
+        f"yes: {talk}3 nodes with 57 endpoints as before, but for 1 right that the policy " in said
+    )
+    assert f"{denied}; new, without a profile: /ghost_node in /listener; compared " in said
+    renamed = "compared under a new name: /rear_camera as /nav/stern_camera, with /odom as /nav/o"
+    assert f"; {renamed}dom (a name that does not move: write it absolute)\n" in said
+    robot.remaining = (TALKER, LISTENER, ros_node("nav/stern_camera", of, *moved))
     said = robot.close("--proof", status=1).out
-    assert f"no: {talk}gone: /stern_camera publish rt/stern_camera/image; {renamed} (if it" in said
-    copied = re.sub(r'( *<profile ns="/" node=")stern(.*?</profile>)', r"\1stern\2\n\1bow\2",
+    assert f"no: {talk}gone: /nav/stern_camera publish /cmd_vel; {renamed}dom" in said
+    copied = re.sub(r'( *<profile ns="/nav" node=")stern(.*?</profile>)', r"\1stern\2\n\1bow\2",
                     policy.read_text(), flags=re.DOTALL)  # fmt: skip
     policy.write_text(copied)
     robot.close()
-    bow_camera = ros_node("bow_camera", of, "publish rt/bow_camera/image")
+    bow_camera = ros_node("nav/bow_camera", of, "publish rt/nav/bow_camera/image")
     robot.nodes, robot.remaining = (), (TALKER, LISTENER, stern_camera, bow_camera)
     said = robot.close("--proof").out
     assert "policy has no profile for them any more: /rear_camera (if they have new names, " in said
