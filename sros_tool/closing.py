@@ -195,11 +195,11 @@ class ClosedProcess(NamedTuple):
         return self._replace(pid=pids[0] if pids else 0)
 
     def open_command(self, domain: int) -> str:
-        """Return the shell command that starts the process open, in its ROS domain."""
+        """Return the shell command that starts the process open, in its ROS domain and RMW."""
         if self.container:
             return "docker compose up -d"
-        set_domain = ("env", f"{DOMAIN}={domain}") if domain else ()
-        words = (*set_domain, *(self.launch or self.command))
+        variables = [f"{DOMAIN}={domain}"] * bool(domain) + [f"{RMW}={self.rmw}"] * bool(self.rmw)
+        words = (*(("env", *variables) if variables else ()), *(self.launch or self.command))
         return f"cd {shlex.quote(self.folder)} && {shlex.join(words)}"
 
     def secured_command(self, folder: Path, of_launch: str = "") -> str:
@@ -215,10 +215,11 @@ class ClosedProcess(NamedTuple):
         if self.launch:
             after = launch_verb(self.launch) + 1
             words = _launch_words(folder, self.launch[:after], self.launch[after:])
+        elif _needs_enclave_argument(self):
+            words = (*words, ROS_ARGS, "--enclave", self.enclave)
         enclave = of_launch if self.launch else self.enclave
         if enclave:
-            run = ("sros", "run", str(folder / "export"), enclave)
-            words = (*run, *(("--rmw", self.rmw) if self.rmw else ()), "--", *words)
+            words = (*_run_words(folder / "export", enclave, self.rmw), *words)
         elif self.rmw:
             words = ("env", f"{RMW}={self.rmw}", *words)
         return f"cd {shlex.quote(self.folder)} && {shlex.join(words)}"
@@ -228,6 +229,11 @@ def _without_enclave_argument(command: Sequence[str], enclave: str) -> Sequence[
     """Return a command without the argument for its enclave that ``sros run`` adds at its end."""
     words = tuple(command)
     return words[:-3] if words[-3:] == (ROS_ARGS, "--enclave", enclave) else words
+
+
+def _run_words(export: Path, enclave: str, rmw: str) -> Sequence[str]:
+    """Return the words before a command that start it in an enclave; ``rmw`` is "" on DDS."""
+    return ("sros", "run", str(export), enclave, *(("--rmw", rmw) if rmw else ()), "--")
 
 
 def _launch_words(folder: Path, before: Sequence[str], after: Sequence[str]) -> Sequence[str]:
@@ -292,6 +298,11 @@ class ObservedProcesses(NamedTuple):
             ],
             elsewhere=[enclave for enclave in self.elsewhere if enclave in names],
         )
+
+    def command_of_new(self, export: Path, enclave: str) -> str:
+        """Return the shell command for a process of an enclave of which none was observed."""
+        rmw = next((process.rmw for process in self.processes if process.rmw), "")
+        return f"{shlex.join(_run_words(export, enclave, rmw))} COMMAND"
 
     def started_in(self, process: ClosedProcess) -> str:
         """Return the enclave in which the command of a process is started.
@@ -1291,9 +1302,9 @@ class OpenRobot:
             lines = [f"# Stop each of these processes, and start it {place}"]
         lines = [*lines, *_commands(due)] if due else []
         for name in closing.new:
-            start = shlex.join(("sros", "run", str(self.export.absolute()), name))
+            start = closing.observed.command_of_new(self.export.absolute(), name)
             why = "has ended" if name in closing.observed.ended else "is new"
-            lines += ["", f"# {name} {why}: COMMAND is what starts it", f"{start} -- COMMAND"]
+            lines += ["", f"# {name} {why}: COMMAND is what starts it", start]
         if rest:
             lines += ["", "# These processes run closed, with the current files."]
         return [*lines, *_commands(rest)]
@@ -1375,7 +1386,8 @@ class OpenRobot:
         for process in observed.processes:
             command = process.command
             if process.launch and not (node_argument(command) or launch_verb(command)):
-                prefix = f"prefix='sros run {export} {process.enclave} --'"
+                words = _run_words(export, process.enclave, process.rmw)
+                prefix = f"prefix='{' '.join(words)}'"
                 yield (
                     f"the process of {process.enclave} has no name= in its launch file, and would "
                     f"not start: give it one, or {prefix}"
@@ -1849,7 +1861,9 @@ class OpenRobot:
                     for node in unseen
                     if node["enclave"] in ended
                 ],
-                "not seen": [self._unseen_text(node["node"], node["enclave"]) for node in unseen],
+                "not seen": [
+                    self._unseen_text(node["node"], node["enclave"], running) for node in unseen
+                ],
                 "gone": _lost_endpoints(before, now, denied),
                 "not judged": value["unjudged"],
                 "not done": ["the ROS graph kept changing"] if status else [],
@@ -1883,8 +1897,18 @@ class OpenRobot:
             if process.pid not in pids
         }
 
-    def _unseen_text(self, node: str, enclave: str) -> str:
+    def _unseen_text(self, node: str, enclave: str, running: RunningProcesses) -> str:
         """Return a node that an enclave has a profile for, and what to do if it does not exist."""
+        for process, of in self._secured(running):
+            if (
+                of.name == enclave
+                and process.is_zenoh
+                and named_enclave(process.command) != of.name
+            ):
+                return (
+                    f"{node or f'any node in {enclave}'} (start {process.label} with `{ROS_ARGS} "
+                    f"--enclave {enclave}` at its end: on Zenoh, others do not see it otherwise)"
+                )
         if not node or is_expression(node):
             return f"any node in {enclave}"
         return f"{node} (if it is gone for good, remove its profile from '{self.policy}')"

@@ -210,10 +210,10 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
             pid = "started by another command than observed" if runs else pid
         nodes = _nodes(policy, process.enclave)
         echo(f"  {process.enclave}: {pid}{nodes}: {how}")
-    export = shlex.quote(str(robot.export.absolute()))
     for name in closed.new:
         why = "has ended" if name in closed.observed.ended else "new"
-        echo(f"  {name}: {why}, start it with: sros run {export} {name} -- COMMAND")
+        start = closed.observed.command_of_new(robot.export.absolute(), name)
+        echo(f"  {name}: {why}, start it with: {start}")
     if not_here := closed.observed.not_here:
         bring = f"sros distribute_key {shlex.quote(str(robot.keystore))} ENCLAVE FOLDER"
         echo(f"not on this machine: {', '.join(not_here)} (to bring one there: {bring})")

@@ -9,6 +9,7 @@ import shutil
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -25,6 +26,7 @@ from sros_tool.runtime.environment import secured_environment
 from sros_tool.runtime.processes import (
     FileReader,
     Process,
+    ProcessEnclave,
     ProcessOrigin,
     ProcessRoot,
     ProcessTable,
@@ -1195,6 +1197,29 @@ def test_a_node_on_zenoh_gets_an_argument_from_its_unit(robot: Robot) -> None:
     assert closing._as_its_unit_starts(script).unit == ""
     for other in (script._replace(rmw=""), script._replace(enclave="/router")):
         assert closing._as_its_unit_starts(other) == other
+
+
+def test_the_commands_of_a_robot_on_zenoh_name_its_rmw_and_the_enclaves() -> None:
+    """Without them, a process runs open, or others do not see it."""
+    start = "/talker", 1, ("python3", "talk"), "/opt", 0, "", "program"
+    talker = closing.ClosedProcess(*start, rmw="rmw_zenoh_cpp")
+    run = "sros run export {} --rmw rmw_zenoh_cpp --"
+    assert talker.secured_command(Path()) == (
+        f"cd /opt && {run.format('/talker')} python3 talk --ros-args --enclave /talker"
+    )
+    router = talker._replace(enclave="/router", command=("rmw_zenohd",))
+    assert router.secured_command(Path()) == f"cd /opt && {run.format('/router')} rmw_zenohd"
+    in_domain = "cd /opt && env ROS_DOMAIN_ID=7 RMW_IMPLEMENTATION=rmw_zenoh_cpp python3 talk"
+    assert talker.open_command(7) == in_domain
+    observed = closing.ObservedProcesses(7, [talker])
+    assert observed.command_of_new(Path("export"), "/horn") == f"{run.format('/horn')} COMMAND"
+    variables = {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}
+    process = Process(1, ("python3", "talk"), variables, datetime.now(UTC))
+    running: Any = SimpleNamespace(
+        _secured=lambda _running: [(process, ProcessEnclave("/export", "/talker"))]
+    )
+    unseen = closing.OpenRobot._unseen_text(running, "/talker", "/talker", RunningProcesses())
+    assert "start process 1 (talk) with `--ros-args --enclave /talker` at its end" in unseen
 
 
 @pytest.mark.parametrize(
