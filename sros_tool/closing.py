@@ -1512,10 +1512,12 @@ class OpenRobot:
         """
         running = ProcessTable().look(self._shell.now())
         are_open = {
-            process.program[1]
+            process.program[1]: process
             for process in filter(self._is_neighbour, running.processes)
             if not process.asks_for_security
         }
+        observed_commands = {tuple(process.command) for process in observed.processes}
+        others = [are_open[command] for command in are_open if command not in observed_commands]
         own = [*self._secured(running, everywhere=True)]
         secured = {
             enclave.name: process
@@ -1538,8 +1540,16 @@ class OpenRobot:
             yield f"restart it open: {command}"
         for process in by_hand:
             if process.enclave not in secured and tuple(process.command) not in are_open:
-                how = f"start it open: {process.open_command(self.domain)}"
-                self._shell.say(f"{process.enclave} does not run; {how}")
+                names, old = self._node_names(process.enclave)
+                under = f", under its old name {old}" if old else ""
+                how = f"start it open{under}: {process.open_command(self.domain)}"
+                like = [other.label for other in others if _is_like(other, process, names)]
+                state = "does not run; "
+                if like:
+                    state = (
+                        f"runs open by another command ({like[0]}); if that is another program, "
+                    )
+                self._shell.say(f"{process.enclave} {state}{how}")
         for name in sorted(secured.keys() - {process.enclave for process in observed.processes}):
             guest = secured[name]
             how = f"restart it open: {_process_text(guest)}"
@@ -1559,6 +1569,19 @@ class OpenRobot:
                 yield f"{unseen.label} speaks ROS 2, and cannot be looked at: {unseen.why}"
         if running.hidden or any(not unseen.speaks for unseen in running.unseen):
             self._shell.say("some processes cannot be looked at: to be sure of them, ask as root")
+
+    def _node_names(self, enclave: str) -> tuple[set[str], str]:
+        """Return the names of an enclave's nodes, observed or in the policy, and a replaced one.
+
+        The replaced name is that of a node to which the policy gives another one; "" for none.
+        """
+        with suppress(SrosError):  # a broken file must not keep the robot closed
+            seen = {_node_name(node) for node in self._observed_nodes() if enclave in node.enclaves}
+            of_policy = read_policy(self.policy).enclave(enclave)
+            profiles = of_policy.all_profiles() if of_policy else ()
+            names = {expand("~", profile.ns, profile.node) for profile in profiles}
+            return seen | names, next(iter(seen & self._renamed_nodes().keys()), "")
+        return set(), ""
 
     # ── the proof ───────────────────────────────────────────────────────────────────────────
 
@@ -1936,6 +1959,13 @@ class OpenRobot:
         self._shell.say(f"+ {step.command}")
         status, output, _ = self._shell.run(step.words, False)
         return status, json.loads(output)
+
+
+def _is_like(process: Process, observed: ClosedProcess, nodes: Collection[str]) -> bool:
+    """Return whether a process may be an observed one, which has these nodes, by other words."""
+    if named := node_argument(process.program[1]):
+        return expand("~", *named) in nodes
+    return program_of(process.program[1]) == program_of(tuple(observed.command))
 
 
 def _closed_process(process: Process, enclave: str) -> ClosedProcess:

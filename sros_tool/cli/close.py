@@ -303,7 +303,8 @@ def _show_undone(robot: OpenRobot, closed: Closing) -> None:
         ask = f"ask again with sros close {shlex.quote(str(robot.folder))} --undo"
         echo(f"the robot is not open yet; next: restart these processes, and {ask}", err=True)
     else:
-        stopped = not any(process.pid for process in closed.observed.processes)
+        pids = [process.pid for process in closed.observed.processes if process.pid]
+        stopped = not (pids or closed.observed.unknown)
         state = "no process of the robot runs" if stopped else "the robot is open"
         but = ""
         if other_machines := closed.observed.not_here:
