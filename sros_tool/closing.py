@@ -54,6 +54,7 @@ from sros_tool.keystore.layout import (
     CLOSED_OBSERVER,
     CLOSED_POLICY,
     CLOSED_PROCESSES,
+    KEY_FILE,
     KEY_FILES,
     enclave_folder,
     enclave_path,
@@ -96,7 +97,12 @@ from sros_tool.runtime.processes import (
     process_origin,
     program_of,
 )
-from sros_tool.runtime.rmw import RMW, chosen_vendor
+from sros_tool.runtime.rmw import (
+    RMW,
+    built_without_security,
+    chosen_vendor,
+    rmw_implementations,
+)
 from sros_tool.runtime.units import unit_changes, unit_instance, unit_words, write_units
 from sros_tool.runtime.variables import DOMAIN, ENCLAVE, KEYSTORE, STRATEGY, domain_of
 from sros_tool.values import DryRun, FileChange, FileChanges, Words, as_plain, shows
@@ -834,9 +840,22 @@ class OpenRobot:
         denied = self._denied_access_texts()
         newly = [right for right in denied if right not in denied_before]
         problems += self._problems(closing, partial=partial)
+        if not closing.secured:
+            self._warn_of_rmw()
         return closing._replace(
             denied=denied, newly_denied=newly, problems=problems, changes=changes
         )
+
+    def _warn_of_rmw(self) -> None:
+        """Say so if nodes on the RMW of this shell cannot run secured."""
+        environment = self._shell.environment
+        rmw = environment.get(RMW) or next(iter(rmw_implementations(environment)), "")
+        if built_without_security(rmw, environment):
+            self._shell.say(
+                f"WARNING: {rmw} is built without security here: no node starts in an enclave "
+                "with it. Before you stop the robot, find an RMW that enforces security: "
+                "sros doctor"
+            )
 
     def _closing(self) -> Closing:
         """Return the processes of the enclaves that the policy has, as they run now."""
@@ -1739,7 +1758,7 @@ class OpenRobot:
     ) -> str:
         """Return which enclaves have no process, or an open one, and what the others lack."""
         wrong = {
-            enclave.name: (process, self._why_not_current(process))
+            enclave.name: (process, self._why_not_current(process, enclave))
             for process, enclave in self._secured(running)
             if enclave.name in missing
         }
@@ -1770,13 +1789,20 @@ class OpenRobot:
             reasons.append(f"{why} the processes of {named}; restart them")
         return "; ".join(reasons)
 
-    def _why_not_current(self, process: Process) -> str:
+    def _why_not_current(self, process: Process, enclave: ProcessEnclave) -> str:
         """Return what precedes "the processes of ENCLAVE" where they do not count as closed."""
         if not self._may_use_files(process):
             return f"user {process.user}, who cannot read the files, runs"
         if process.environment.get(STRATEGY) != "Enforce":
             return f"no {STRATEGY}=Enforce in"
-        return "earlier files in"
+        newer = first_few([*newer_files(process, enclave)], _MOST_NAMES) or "files"
+        mode = enclave.file(KEY_FILE).mode
+        readable = (
+            f"others can read {KEY_FILE} (its mode is {mode:04o}): if anybody did, `sros renew "
+            f"KEYSTORE {enclave.name} --new-key --revoke-old`, otherwise chmod 600; "
+        )
+        lead = readable if mode & 0o077 else ""
+        return f"{lead}{newer} changed, or got another mode, after the start of"
 
     def _enclaves_with_process(self, running: RunningProcesses) -> set[str]:
         """Return the enclaves in which a process runs with the current files of the export.

@@ -205,7 +205,14 @@ def test_everything_is_prepared_and_nothing_is_closed(robot: Robot) -> None:
     mine = robot.folder / "robot/base.py"
     mine.parent.mkdir()
     mine.touch()
-    ended = robot.close()
+    index = robot.folder / "ros/share/ament_index/resource_index/rmw_typesupport"
+    index.mkdir(parents=True)
+    (index / "rmw_fastrtps_cpp").touch()
+    (robot.folder / "ros/lib").mkdir()
+    library = robot.folder / "ros/lib/librmw_fastrtps_shared_cpp.so"
+    library.write_bytes(b"this Fast DDS version doesn't have the security libraries")
+    ended = robot.close(AMENT_PREFIX_PATH=str(robot.folder / "ros"))
+    assert "\nWARNING: rmw_fastrtps_cpp is built without security here: " in ended.err
     mine.unlink()
     assert ended.err.startswith("'robot' has files of yours: sros adds its own to them\n")
     assert made(robot.folder) == MADE
@@ -565,9 +572,16 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     assert "ROS_SECURITY_ENABLE. Stop it: another process runs in /talker.\n" in ended.err
     robot.more = ()
     robot.outdated = {"/talker"}
-    named = f"earlier files in the processes of /talker (process {PID['/talker']}); restart them\n"
-    out = robot.close("--proof", status=1).out
-    assert f"no: every process was started in its enclave: {named}" in out
+    key = robot.folder / "robot/export/enclaves/talker/key.pem"
+    key.chmod(0o644)
+    said = robot.close("--proof", status=1).out
+    key.chmod(0o600)
+    assert (
+        "others can read key.pem (its mode is 0644): if anybody did, `sros renew KEYSTORE /talker"
+        in said
+    )
+    assert " and 3 more changed, or got another mode, after the start of" in said
+    assert f"the processes of /talker (process {PID['/talker']}); restart them\n" in said
     robot.outdated, robot.absent = set(), {"/talker"}
     talker = robot.process("/talker", is_secured=True)
     lax = {**talker.environment, "ROS_SECURITY_STRATEGY": "Permissive"}
@@ -610,7 +624,6 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     needed.write_text("[[only]]\n")
     assert "[[only]] names no right" in robot.close("--proof", status=2).err
     needed.write_text('[[only]]\npublish = ["/chatter"]\nenclaves = ["/listener"]\n')
-    key = robot.folder / "robot/export/enclaves/talker/key.pem"
     key.chmod(0o644)
     ended = robot.close("--proof", status=1)
     key.chmod(0o600)
