@@ -44,6 +44,7 @@ from sros_tool.folders import Folder, make_folders, remove_folders
 from sros_tool.graph.learn import common_parts, is_tool, stable_name
 from sros_tool.graph.observation import (
     PUBLISH,
+    SUBSCRIBE,
     Endpoint,
     Observation,
     ObservedNode,
@@ -1675,7 +1676,10 @@ class OpenRobot:
         if renamed:
             names = [f"{old} as {expand('~', *renamed[old])}" for old in sorted(renamed)]
             text = f"; compared under a new name: {first_few(names, _MOST_NAMES)}"
-            if moved := self._moved_names(renamed):
+            pairs = self._moved_endpoints(renamed)
+            topics = sorted({(_use_of(old)[1], _use_of(new)[1]) for old, new in pairs})
+            own = tuple(f"{name}/" for name in renamed)
+            if moved := [f"{old} as {new}" for old, new in topics if not old.startswith(own)]:
                 text += f", with {enumerated(moved)} (a name that does not move: write it absolute)"
             if fails:
                 text += " (if it is another node, remove what it does not use from its profile)"
@@ -1690,20 +1694,17 @@ class OpenRobot:
             )
         return text
 
-    def _moved_names(self, renamed: Mapping[str, tuple[str, str]]) -> list[str]:
-        """Return, as text, which names of renamed nodes are compared in their new namespaces.
-
-        The private names of a node are left out.
-        """
-        return sorted(
-            {
-                f"{_use_of(before)[1]} as {_use_of(after)[1]}"
-                for node in self._observed_nodes()
-                if (new := renamed.get(_node_name(node)))
-                for before, after in self._renamed_endpoints(node, *new).items()
-                if before != after == _possible_endpoints(before, node, *new)[-1]
-            }
-        )
+    def _moved_endpoints(
+        self, renamed: Mapping[str, tuple[str, str]]
+    ) -> set[tuple[Endpoint, Endpoint]]:
+        """Return the endpoints of renamed nodes that are renamed, too, each with the new one."""
+        return {
+            (before, after)
+            for node in self._observed_nodes()
+            if (new := renamed.get(_node_name(node)))
+            for before, after in self._renamed_endpoints(node, *new).items()
+            if before != after
+        }
 
     def _divide_by_profile(
         self, nodes: Iterable[ObservedNode]
@@ -1885,7 +1886,9 @@ class OpenRobot:
         Processes of the enclaves ``missing`` do not run; ``running`` are those of the other
         enclaves at the beginning of the proof.
         """
-        denied = self._denied_rights(self._observation())
+        observation = self._observation()
+        denied = self._denied_rights(observation)
+        moved = self._moved_endpoints(self._renamed_nodes())
         words = ("audit", str(self._rights), "--keystore", str(self.export), "--enclave", _OBSERVER)
         step = _Step(
             (*words, "--domain", str(self.domain), "--json", *["--partial"] * bool(missing))
@@ -1914,6 +1917,7 @@ class OpenRobot:
                     self._unseen_text(node["node"], node["enclave"], running) for node in unseen
                 ],
                 "gone": _lost_endpoints(before, now, denied),
+                "left alone": left_alone(before, observation, moved, denied),
                 "not judged": value["unjudged"],
                 "not done": ["the ROS graph kept changing"] if status else [],
             }
@@ -2079,14 +2083,45 @@ def _lost_endpoints(
     before: Observation, now: Observation, denied: Iterable[DeniedRight]
 ) -> list[str]:
     """Return the endpoints, as text, that nodes had before and lack now, unless ``denied``."""
-    expected = {*_endpoints(before.nodes)} - {
-        (node, endpoint) for right in denied for node in right.nodes for endpoint in right.endpoints
-    }
+    expected = {*_endpoints(before.nodes)} - _denied_endpoints(denied)
     lost: dict[str, list[str]] = {}
     gone = expected - {*_endpoints(now.nodes)}
     for node, right, name in sorted({(node, *_use_of(endpoint)) for node, endpoint in gone}):
         lost.setdefault(f"{node} {right}", []).append(name)
     return [f"{uses} {first_few(names, _MOST_NAMES)}" for uses, names in lost.items()]
+
+
+def left_alone(
+    before: Observation,
+    everybody: Observation,
+    moved: Collection[tuple[Endpoint, Endpoint]],
+    denied: Iterable[DeniedRight],
+) -> list[str]:
+    """Return, as text, what nodes use by a name whose whole other side ``moved`` to another one.
+
+    ``before`` are the nodes to compare, of ``everybody``, with the names that count now; what is
+    ``denied`` is left out.
+    """
+    refused = _denied_endpoints(denied)
+    of_robot = [node for node in everybody.nodes if not is_tool(node)]
+    kept = {endpoint for _, endpoint in {*_endpoints(of_robot)} - refused}
+    used = {*_endpoints(node for node in before.nodes if not is_tool(node))} - refused
+    other = {PUBLISH: SUBSCRIBE, SUBSCRIBE: PUBLISH}
+    new_names = {
+        old._replace(direction=other[old.direction]): _use_of(new)[1]
+        for old, new in moved
+        if old not in kept
+    }
+    alone = {(node, *_use_of(end), new_names[end]) for node, end in used if end in new_names}
+    return [
+        f"{node} {right} {name}, which is {new} now" for node, right, name, new in sorted(alone)
+    ]
+
+
+def _denied_endpoints(denied: Iterable[DeniedRight]) -> set[tuple[str, Endpoint]]:
+    return {
+        (node, endpoint) for right in denied for node in right.nodes for endpoint in right.endpoints
+    }
 
 
 def _use_of(endpoint: Endpoint) -> tuple[str, str]:

@@ -17,11 +17,14 @@ import yaml
 
 from sros_tool import closing
 from sros_tool.cli import close
-from sros_tool.closing import access_lines, assign
+from sros_tool.closing import access_lines, assign, left_alone
+from sros_tool.explain.audit import DeniedRight
 from sros_tool.graph import observe
-from sros_tool.graph.observation import Endpoint, ObservedNode
+from sros_tool.graph.observation import Endpoint, ObservedNode, make_observation
 from sros_tool.keystore.layout import list_enclaves
 from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import ALLOW
+from sros_tool.policy.rights import Right
 from sros_tool.runtime.environment import secured_environment
 from sros_tool.runtime.processes import (
     FileReader,
@@ -776,6 +779,22 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(robot: Robot) -> None
     said = robot.close("--proof").out
     assert "policy has no profile for them any more: /rear_camera (if they have new names, " in said
     assert "watched again: sros close robot --undo, sros close robot --for 1m)\n" in said
+
+
+def test_a_name_that_moved_leaves_nobody_alone() -> None:
+    """Or /base never hears /cmd_vel again, and the proof says that everything talks."""
+    old, new = Endpoint("rt/cmd_vel", "publish"), Endpoint("rt/nav/cmd_vel", "publish")
+    heard = Endpoint("rt/cmd_vel", "subscribe")
+    planner = replace(node("planner", ns="/nav"), endpoints=frozenset({new}))
+    base = replace(node("base"), endpoints=frozenset({heard}))
+    joystick = replace(node("joystick"), endpoints=frozenset({old}))
+    seen, moved = make_observation([planner, base]), {(old, new)}
+    alone = "/base subscribe /cmd_vel, which is /nav/cmd_vel now"
+    assert left_alone(seen, seen, moved, ()) == [alone]
+    assert not left_alone(seen, make_observation([planner, base, joystick]), moved, ())
+    right = Right("/base", ALLOW, "subscribe", "/cmd_vel")
+    denied = DeniedRight(right, ("/base",), "no rule", False, False, (heard,))
+    assert not left_alone(seen, seen, moved, [denied])
 
 
 def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None:
