@@ -54,6 +54,7 @@ POLICIES = {
     "protected.xml": policy_text({"/a": publish('/x<?sros protect="sign"?>')}),
     "denied.xml": policy_text({"/a": _DENIED, "/b": publish("/x")}),
     "wild.xml": policy_text({"/a": _WILD, "/b": publish("/x")}),
+    "quiet.xml": policy_text({"/a": publish("/x"), "/quiet": ""}),
     "large.xml": policy_text({"/a": publish(*(f"/{'n' * 60}/x{i}" for i in range(900)))}),
     "equal.xml": policy_text(
         {f"/r{n}": publish(*(f"/r{n}/{e}" for e in ("xyq" if n == 4 else "xyz"))) for n in range(5)}
@@ -322,6 +323,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("policy.xml ks", 1),
         Case("ks/enclaves/a/permissions.xml ks/enclaves/a", 0),
         Case("wild.xml policy.xml", 1),
+        Case("policy.xml quiet.xml", 1),
         Case("protected.xml policy.xml", 1),
         Case("crew.xml crew.xml --fleet near.toml --fleet far.toml", 1),
         Case("--no-new-access policy.xml policy.xml"),
