@@ -123,6 +123,8 @@ _RESTART_SECONDS, _START_SECONDS = 30.0, 3.0
 _TRIES = 3
 _LOOK_SECONDS = 1.0
 """How often processes are looked at while the robot is watched; shorter ones can be missed."""
+_MOST_SEEN = 10_000
+"""Number of commands of processes that are kept; of others, the start command is not known."""
 
 
 class Shell(NamedTuple):
@@ -317,8 +319,8 @@ class ObservedProcesses(NamedTuple):
         It differs from the enclave of the process if the program itself chooses that enclave.
         """
         names = {process.enclave, *process.shares}
-        return min((other.chooses, other.enclave) for other in self.processes
-                   if other.enclave in names)[1]  # fmt: skip
+        program = (other for other in self.processes if other.enclave in names)
+        return min((part.chooses, part.enclave) for part in program)[1]
 
     def commands_by_hand(self, folder: Path) -> Mapping[str, Sequence[ClosedProcess]]:
         """Map shell commands to the processes that they start and that no unit starts alone.
@@ -972,16 +974,21 @@ class OpenRobot:
         table, over = ProcessTable(), threading.Event()
 
         def look() -> None:
-            while True:
-                for process in table.look(self._shell.now()).processes:
-                    before, origin = seen.get(process.command, (process, None))
-                    if before.pid != process.pid or origin is None:
-                        origin = process_origin(process.pid)
+            for process in table.look(self._shell.now()).processes:
+                before, origin = seen.get(process.command, (process, None))
+                if before.pid != process.pid or origin is None:
+                    origin = process_origin(process.pid)
+                if process.command in seen or len(seen) < _MOST_SEEN:
                     seen[process.command] = process, origin
+
+        def look_again_and_again() -> None:
+            while True:
+                with suppress(OSError):  # the next look may succeed
+                    look()
                 if over.wait(_LOOK_SECONDS):
                     return
 
-        looking = threading.Thread(target=look)
+        looking = threading.Thread(target=look_again_and_again)
         looking.start()
         try:
             yield

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from datetime import datetime
-from itertools import product
 from shlex import quote
 
-from sros_tool.errors import Note
+from sros_tool.errors import Note, SrosError
 from sros_tool.keystore.known_keys import revoked_serials
 from sros_tool.keystore.layout import LEDGER
-from sros_tool.keystore.ledger import Entry
+from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.validity import iso
 from sros_tool.wording import first_few
@@ -24,16 +23,29 @@ def note_on_earlier_permissions(
 
     Permissions cannot be revoked: earlier ones work with a certificate that they fit, until one of
     the two expires or the certificate is revoked.  The ledger does not have the rights of earlier
-    permissions; those that were signed from the same policy as the present ones do not count.
+    permissions; those that were signed from the same policy as the present ones do not count.  If
+    the ledger or a revocation list cannot be read, or lines are missing, the note says so.
     """
+    if not denied or not keystore.has(LEDGER):  # an export, or a keystore of ros2/sros2
+        return
     ends: dict[str, str] = {}
-    for name, entries in _issued(keystore, denied).items():
+    try:
+        ledger = keystore.ledger_file.with_values("enclave", denied)
+        revoked = revoked_serials(keystore)
+    except SrosError as error:
+        yield _unknown(error.what)
+        return
+    if ledger.gaps:
+        yield _unknown(f"{LEDGER}: {first_few(ledger.gaps, 1)}")
+    for name, entries in _issued(ledger, denied, revoked).items():
         permissions = [entry for entry in entries if entry.what == "permissions"]
-        certificates = [entry for entry in entries if entry.what == "certificate"]
-        for earlier, certificate in product(permissions, certificates):
-            end = min(earlier.not_after, certificate.not_after)
-            other = earlier.policy != permissions[-1].policy
-            if other and earlier.subject == certificate.subject and end > iso(now):
+        expiry: dict[str, str] = {}
+        for certificate in (entry for entry in entries if entry.what == "certificate"):
+            last = max(certificate.not_after, expiry.get(certificate.subject, ""))
+            expiry[certificate.subject] = last
+        for earlier in permissions:
+            end = min(earlier.not_after, expiry.get(earlier.subject, ""))
+            if earlier.policy != permissions[-1].policy and end > iso(now):
                 ends[name] = max(end, ends.get(name, ""))
     if ends:
         names, root = sorted(ends), quote(str(keystore.root))
@@ -46,12 +58,17 @@ def note_on_earlier_permissions(
         yield Note("explain.earlier-permissions", text)
 
 
-def _issued(keystore: OpenedKeystore, names: Collection[str]) -> Mapping[str, Sequence[Entry]]:
+def _unknown(reason: str) -> Note:
+    text = f"whether earlier permissions may still allow it is not known: {reason}."
+    return Note("explain.earlier-permissions", text)
+
+
+def _issued(
+    ledger: Ledger, names: Collection[str], revoked: Container[int]
+) -> Mapping[str, Sequence[Entry]]:
     """Return what the ledger has of each of the enclaves, except for revoked certificates."""
     issued: defaultdict[str, list[Entry]] = defaultdict(list)
-    if names and keystore.has(LEDGER):
-        revoked = revoked_serials(keystore)
-        for entry in keystore.ledger_file.with_values("enclave", names).entries:
-            if entry.enclave in names and not (entry.serial and int(entry.serial, 16) in revoked):
-                issued[entry.enclave].append(entry)
+    for entry in ledger.entries:
+        if entry.enclave in names and not (entry.serial and int(entry.serial, 16) in revoked):
+            issued[entry.enclave].append(entry)
     return issued

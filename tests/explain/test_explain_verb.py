@@ -724,6 +724,14 @@ def test_earlier_permissions_that_still_allow_it(keystore: Path, tmp_path: Path)
     assert "earlier-permissions" not in explain(keystore, "--who", "publish", "/other").err
     sros("renew", keystore, ENCLAVE, "--revoke-old").ok()
     assert "earlier-permissions" not in explain(keystore, "--who", *asked).err
+    (ledger := keystore / "ledger.jsonl").write_text("damaged")
+    for _ in range(2):
+        denied = explain(keystore, "--who", *asked)
+        assert denied.status == 1
+        assert "whether earlier permissions may still allow it is not known" in denied.err
+        if ledger.is_file():
+            ledger.unlink()
+            ledger.mkdir()
 
 
 def test_who_tells_wildcards_and_what_cannot_run(keystore: Path) -> None:
