@@ -282,10 +282,10 @@ def _have_same_value(first_text: str, second_text: str) -> bool:
 
 
 def _moves(edges: Iterable[tuple[int, int]]) -> _Moves:
-    targets: dict[int, int] = {}
+    places_by_distance: dict[int, int] = {}
     for at, to in edges:
-        targets[to - at] = targets.get(to - at, 0) | 1 << at
-    return targets
+        places_by_distance[to - at] = places_by_distance.get(to - at, 0) | 1 << at
+    return places_by_distance
 
 
 def _moved_places(positions: int, moves: _Moves) -> int:
@@ -501,8 +501,8 @@ class NameSet:
         names.
         """
         joined = [
-            (cls.union(names for names, _ in kept_rules)._node, kept)
-            for kept, kept_rules in groupby(rules, key=lambda pair: pair[1])
+            (cls.union(names for names, _ in group)._node, kept)
+            for kept, group in groupby(rules, key=lambda pair: pair[1])
         ]
         if not otherwise and joined and not joined[-1][1]:
             joined.pop()  # it takes away what nothing accepts
@@ -763,21 +763,21 @@ def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
     if len(automata) > _MOST_AUTOMATA:
         raise _too_many_error()
     exact = frozenset[str]().union(*(leaf.exact for leaf in leaves))
-    all_required = frozenset[Automaton]().union(*(leaf.everything for leaf in leaves))
+    accepting_all = frozenset[Automaton]().union(*(leaf.everything for leaf in leaves))
     around = _including_set(node, _fewest_automata_first)
-    for required in sorted(automata if around is None else around.automata, key=_automaton_order):
+    for searched in sorted(automata if around is None else around.automata, key=_automaton_order):
         met = frozenset(
-            automaton for leaf in leaves for automaton in leaf.possibly_overlapping(required)
+            automaton for leaf in leaves for automaton in leaf.possibly_overlapping(searched)
         )
         if further_steps := len(met) // _OF_A_STEP:
             limit.spend(further_steps)
-        left = _simplified(node, all_required | {required}, met)
+        left = _simplified(node, accepting_all | {searched}, met)
         if left is not False:
             yield _Search(
-                _accepted_names(required, left), frozenset(filter(required.matches, exact))
+                _accepted_names(searched, left), frozenset(filter(searched.matches, exact))
             )
     no_automata = frozenset[Automaton]()
-    if around is None and not all_required and _simplified(node, no_automata, no_automata):
+    if around is None and not accepting_all and _simplified(node, no_automata, no_automata):
         left = _simplified(node, no_automata, None)
         yield _Search(_Not(_Some()) if isinstance(left, bool) else left, exact)
 
@@ -874,9 +874,9 @@ class _Search:
                 return _letters_to(state, before)
             ways = taken.next_letters(place, machine.classes)
             limit.spend(len(ways) * (1 + machine.size // 1024))
-            for letter, moves, reached_next in ways:
+            for letter, moves, next_place in ways:
                 to = _moved_places(reached, moves) & machine.useful
-                new, paid = (to, reached_next), cost + len(letter.encode())
+                new, paid = (to, next_place), cost + len(letter.encode())
                 if (
                     costs.get(new, paid + 1) <= paid
                     or (left := self._fewest_letters_left(to)) is None
@@ -1004,7 +1004,7 @@ def _classes(edges: Iterable[tuple[int, Letters, int]]) -> tuple[_Class, ...]:
             _Class(
                 letters,
                 _best_letter(letters),
-                _moves(letters for same_class in of for letters in same_class),
+                _moves(edge for edges_of_kind in of for edge in edges_of_kind),
             )
         )
     return tuple(sorted(classes, key=lambda each: _letter_rank(each.best)))

@@ -278,14 +278,12 @@ class Network:
         followed: _Followed = set()
         queue = deque(paths)
         while queue:
-            enclave_here = queue.popleft()
-            for hop in self._steps(enclave_here, forward, followed, paths):
-                next_enclave = hop.target if forward else hop.source
-                if next_enclave not in paths:
-                    paths[next_enclave] = (
-                        (*paths[enclave_here], hop) if forward else (hop, *paths[enclave_here])
-                    )
-                    queue.append(next_enclave)
+            enclave = queue.popleft()
+            for hop in self._steps(enclave, forward, followed, paths):
+                reached = hop.target if forward else hop.source
+                if reached not in paths:
+                    paths[reached] = (*paths[enclave], hop) if forward else (hop, *paths[enclave])
+                    queue.append(reached)
         return {enclave: path for enclave, path in paths.items() if path}
 
     def _steps(

@@ -187,10 +187,8 @@ def parse_advisories(data: bytes, label: str) -> tuple[Advisory, ...]:
         for record in records:
             for advisory in _advisories_of(_object(record)):
                 key = advisory.id, advisory.product
-                earlier_record = merged.get(key)
-                merged[key] = (
-                    earlier_record.with_releases_of(advisory) if earlier_record else advisory
-                )
+                earlier = merged.get(key)
+                merged[key] = earlier.with_releases_of(advisory) if earlier else advisory
         return tuple(merged.values())
     except ValueError as error:
         raise DocumentError(

@@ -153,9 +153,9 @@ class DomainSet:
     def __and__(self, other: DomainSet) -> DomainSet:
         """Return the domains that two closed sets have in common."""
         common = (
-            (max(own_range.first or 0, two.first or 0), min(own_range.last or 0, two.last or 0))
-            for own_range in self.ranges
-            for two in other.ranges
+            (max(left.first or 0, right.first or 0), min(left.last or 0, right.last or 0))
+            for left in self.ranges
+            for right in other.ranges
         )
         return DomainSet.of(*(pair for pair in common if pair[0] <= pair[1]))
 

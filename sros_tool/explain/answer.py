@@ -227,10 +227,8 @@ def _checked_name(name: str, word: str, kind: str) -> str:
         remedy = "Write one name, as the running robot shows it."
     elif not problem and not name.startswith("/"):
         problem = "It is relative to a node, and an enclave may have nodes of many namespaces."
-        full_name = f"/NODE/{name[1:].lstrip('/') or 'NAME'}"
-        remedy = (
-            f"Write {full_name if name.startswith('~') else f'/{name}'}, or /NAMESPACE/... in full."
-        )
+        full = f"/NODE/{name[1:].lstrip('/') or 'NAME'}"
+        remedy = f"Write {full if name.startswith('~') else f'/{name}'}, or /NAMESPACE/... in full."
     elif not problem and name == "/":
         problem = "It is a namespace."
     if problem:

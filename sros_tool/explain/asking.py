@@ -135,24 +135,24 @@ def open_to_ask(
         KeystoreError: the keystore does not have the enclave.
         PolicyError: the policy does not have the enclave.
     """
-    policy = own_enclave = stated = None
+    policy = policy_enclave = stated = None
     keystore = OpenedKeystore(root) if root else None
     if policy_file:
         stated, policy = policy_to_ask(policy_file, fleet_of(asking.fleet_file, keystore))
-        own_enclave = policy.enclave(name)
-        if own_enclave is None and not is_enclave(Path(name)):
+        policy_enclave = policy.enclave(name)
+        if policy_enclave is None and not is_enclave(Path(name)):
             raise not_in_policy_error(policy, name, policy_file)
-    enclave = signed_enclave(keystore, name, asking.at, planned=own_enclave is not None)
+    enclave = signed_enclave(keystore, name, asking.at, planned=policy_enclave is not None)
     if enclave is None:
-        assert own_enclave is not None
-        enclave = planned_enclave(own_enclave, keystore, asking)
-    elif own_enclave is None and policy_file and policy:
-        own_enclave = policy.enclave(enclave.name)
-        if own_enclave is None and not is_enclave(Path(enclave.name)):
+        assert policy_enclave is not None
+        enclave = planned_enclave(policy_enclave, keystore, asking)
+    elif policy_enclave is None and policy_file and policy:
+        policy_enclave = policy.enclave(enclave.name)
+        if policy_enclave is None and not is_enclave(Path(enclave.name)):
             raise not_in_policy_error(policy, enclave.name, policy_file)
     enclave = enclave._replace(
         keystore=keystore,
-        policy=own_enclave,
+        policy=policy_enclave,
         policy_file=policy_file,
         has_placeholders=policy != stated
         or (policy_file is None and keystore is not None and _is_of_robot(keystore, enclave.name)),

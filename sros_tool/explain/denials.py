@@ -119,8 +119,8 @@ def _denials_of(process: str, numbered: list[tuple[int, str]]) -> Iterator[Denia
     for index, (number, line) in enumerate(numbered):
         if named := SECURITY_DIRECTORY.search(line):
             enclave, folder = named["enclave"] or "/", named["folder"]
-        if denial := denied_topic(line):
-            vendor, match = denial
+        if denied := denied_topic(line):
+            vendor, match = denied
             topic = match["topic"]
             remote, direction = _direction(lines[index : index + 1 + _NEAR_LINES], topic)
             by_rule = "deny" in match["how"].lower()
@@ -155,12 +155,7 @@ def propose(denials: Iterable[Denial]) -> MissingRights:
     service, and a denied service of an action to a right to the action.
     """
     rights: dict[str, set[NodeRight]] = {}
-    unproposed: dict[str, list[Denial]] = {
-        "unclear": [],
-        "by_rule": [],
-        "remote": [],
-        "foreign": [],
-    }
+    skipped: dict[str, list[Denial]] = {"unclear": [], "by_rule": [], "remote": [], "foreign": []}
     for denial in denials:
         kind = (
             "remote" if denial.remote
@@ -170,12 +165,12 @@ def propose(denials: Iterable[Denial]) -> MissingRights:
             else ""
         )  # fmt: skip
         if kind:
-            unproposed[kind].append(denial)
+            skipped[kind].append(denial)
         else:
             rights.setdefault(denial.enclave, set()).add(_right(denial))
     return MissingRights(
         {enclave: _without_parts(right) for enclave, right in rights.items()},
-        **{kind: tuple(denials_of_kind) for kind, denials_of_kind in unproposed.items()},
+        **{kind: tuple(denials_of_kind) for kind, denials_of_kind in skipped.items()},
     )
 
 
@@ -318,13 +313,13 @@ def as_learned(
         if enclave and path not in ("", enclave)
     }
     notes = [
-        Note(name, text.format("; ".join(f"{who}: {reason}" for who, reason in denials.items())))
-        for name, text, denials in (
+        Note(name, text.format("; ".join(f"{who}: {reason}" for who, reason in reasons.items())))
+        for name, text, reasons in (
             ("log.other-node", _OTHER, other_nodes),
             ("log.common-part", _WHOLE, wholes),
             ("log.other-enclave", _ELSEWHERE, elsewhere),
         )
-        if denials
+        if reasons
     ]
     return Learned(tuple(profiles), (*_notes(missing_rights), *notes), source=RightsFound.LOG)
 
@@ -356,18 +351,17 @@ def _rights_by_profile(
     """Return the rights by the profile to which they are added: its namespace and node name."""
     if node is not None:
         return {node: rights}
-    nodes_by_right = nodes_served((right.right, right.name) for right in rights)
+    nodes = nodes_served((right.right, right.name) for right in rights)
     rights_by_profile: dict[tuple[str, str], set[NodeRight]] = {}
     (only,) = present if len(present) == 1 else (None,)
-    (only_profile,) = nodes_by_right if len(nodes_by_right) == 1 else (None,)
-    default_profile = only or (
-        _profile_of_node(only_profile, present) if only_profile and not present else _ANY_NODE
+    (node_served,) = nodes if len(nodes) == 1 else (None,)
+    default = only or (
+        _profile_of_node(node_served, present) if node_served and not present else _ANY_NODE
     )
     for right in rights:
         served = nodes_served([(right.right, right.name)])
-        rights_by_profile.setdefault(
-            _profile_of_node(served[0], present) if served else default_profile, set()
-        ).add(right)
+        profile = _profile_of_node(served[0], present) if served else default
+        rights_by_profile.setdefault(profile, set()).add(right)
     return {profile: frozenset(node_rights) for profile, node_rights in rights_by_profile.items()}
 
 

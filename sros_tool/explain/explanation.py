@@ -187,10 +187,8 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
         enclave: the name of the enclave.
         file: the enclave's file that has the fault, if known.
     """
-    fault_or_text = (
-        cause if isinstance(cause, Fault) else FAULTS.get(cause, _BY_REASON.get(cause, ""))
-    )
-    fault, text = (fault_or_text, "") if isinstance(fault_or_text, Fault) else (None, fault_or_text)
+    known = cause if isinstance(cause, Fault) else FAULTS.get(cause, _BY_REASON.get(cause, ""))
+    fault, text = (known, "") if isinstance(known, Fault) else (None, known)
     if fault:
         file = file or (GOVERNANCE_FILE if fault in _OF_GOVERNANCE else "")
         text = fault.remedy_in(file)
@@ -224,13 +222,8 @@ def _filled_remedy(text: str, root: str, enclave: str, file: str) -> str:
 
 def _is_own_copy(keystore: Path, enclave: str, file: str) -> bool:
     """Return whether an enclave has its own copy of a file, and no link to the keystore's file."""
-    own_file, common = enclave_path(keystore, enclave) / file, keystore / _SHARED.get(file, "")
-    return (
-        file in _SHARED
-        and own_file.is_file()
-        and common.is_file()
-        and not own_file.samefile(common)
-    )
+    copy, common = enclave_path(keystore, enclave) / file, keystore / _SHARED.get(file, "")
+    return file in _SHARED and copy.is_file() and common.is_file() and not copy.samefile(common)
 
 
 def _is_rotating(keystore: Path) -> bool:
@@ -329,16 +322,16 @@ def _blocking_denials(rights: Iterable[Right], answer: Answer) -> list[Right]:
     """
     expression = answer.decision.expression or ""
     publishes = answer.part is not None and answer.part.verb is AccessVerb.PUBLISH
-    denials_of_name: list[Right] = []
+    in_direction: list[Right] = []
     other: list[Right] = []
     for right in rights:
         if right.qualifier is DENY:
             names = right.topics
             if expression in (names.publish if publishes else names.subscribe):
-                denials_of_name.append(right)
+                in_direction.append(right)
             elif expression in names.publish + names.subscribe:
                 other.append(right)
-    return denials_of_name or other
+    return in_direction or other
 
 
 _ANY_NODE = ("/", "*")
@@ -431,11 +424,9 @@ def _similar_names(
     name: str, names: AbstractSet[str], is_service: bool, *, or_only: bool
 ) -> tuple[str, ...]:
     last = name.rpartition("/")[2]
-    same_name_elsewhere = sorted(
-        other_name for other_name in names if other_name.rpartition("/")[2] == last
-    )
-    if (is_service and last in NODE_SERVICES) or 0 < len(same_name_elsewhere) <= _SHOWN:
-        return tuple(same_name_elsewhere) if len(same_name_elsewhere) <= _SHOWN else ()
+    same_last = sorted(other for other in names if other.rpartition("/")[2] == last)
+    if (is_service and last in NODE_SERVICES) or 0 < len(same_last) <= _SHOWN:
+        return tuple(same_last) if len(same_last) <= _SHOWN else ()
     if not names:
         return ()
     from difflib import get_close_matches  # for this alone, which is asked last

@@ -375,12 +375,12 @@ def _rejoined_message(process: str, line: str, rest: str, following: str) -> str
 
 def _meaning_of(line: str, rest: str) -> tuple[LogText, re.Match[str] | None]:
     """Return the meaning of a line, and its match, if any; ``rest`` is the line without label."""
-    if text := zenoh_text(line):
-        return text
+    if meaning := zenoh_text(line):
+        return meaning
     if ZENOH_LINE.search(rest):  # what is not in the table is no trouble of security
         return UNKNOWN, None
-    if text := log_text(line):
-        return text
+    if meaning := log_text(line):
+        return meaning
     return UNKNOWN, None if denied_topic(line) else UNKNOWN.pattern.search(rest)
 
 
@@ -757,14 +757,12 @@ class _Examiner:
                 loaded = signed_enclave(None, str(folder), self._context(enclave).at)
         if loaded is None:
             return [], ""
-        own_answer = Evaluator(denial.vendor, loaded, self._context(loaded)).answer(
-            _question(denial)
-        )
-        if own_answer.allowed:
+        answer = Evaluator(denial.vendor, loaded, self._context(loaded)).answer(_question(denial))
+        if answer.allowed:
             return [f"the process runs from '{folder}', whose permissions also allow it"], (
                 "Restart the process: it loaded earlier permissions."
             )
-        return [f"the process runs from '{folder}', and there {own_answer.decision.text}"], (
+        return [f"the process runs from '{folder}', and there {answer.decision.text}"], (
             f"Export enclave {enclave.name} again, install it there, and restart the process."
         )
 

@@ -159,10 +159,7 @@ class Comparison(NamedTuple):
         """Who decides differently than the first vendor or distribution, as a sentence."""
         if self.vendors:
             return _vendor_differences(self.vendors)
-        decided = [
-            (explanation.shipped.title, explanation.outcome)
-            for explanation in self.distributions or ()
-        ]
+        decided = [(answer.shipped.title, answer.outcome) for answer in self.distributions or ()]
         return _differing_titles("distributions", decided)
 
 
@@ -233,7 +230,7 @@ def explain_on_dds(
         answer if v is vendor else Evaluator(v, enclave, context).answer(question)
         for v in PRINCIPAL
     ]
-    if len({tested_vendor.outcome for tested_vendor in tested}) > 1:
+    if len({tested_answer.outcome for tested_answer in tested}) > 1:
         notes = (*notes, Note("explain.vendors-differ", f"{_vendor_differences(tested)}."))
     return VendorExplanation(asked, answer, why, beside, notes)
 

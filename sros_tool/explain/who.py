@@ -155,12 +155,9 @@ def names_meant(decider: Decider, question: Question, enclaves: Container[str]) 
         }
     )
     last = question.name.rpartition("/")[2]
-    same_last_part = [
-        name for name in names if name.rpartition("/")[2] == last and not is_expression(name)
-    ]
-    meant = same_last_part or likely_names(
-        question.name, [name for name in names if not is_expression(name)]
-    )
+    exact = [name for name in names if not is_expression(name)]
+    same_last = [name for name in exact if name.rpartition("/")[2] == last]
+    meant = same_last or likely_names(question.name, exact)
     if not meant or question.name in meant:  # an enclave with the right cannot start now
         return None
     text = f"they may {question.word} {first_few(meant, 3)}: perhaps that is meant."

@@ -499,13 +499,9 @@ class ZenohEvaluator:
 
         The enclave's file decides; for a client, the file of its router.
         """
-        own_process = self._file(answer.enclave, self._file_of(answer.enclave)).process
+        process = self._file(answer.enclave, self._file_of(answer.enclave)).process
         wanted = self._rights(answer.enclave, answer.question)
-        if (
-            own_process is None
-            or not wanted
-            or (own_process.mode is Mode.CLIENT and not answer.allowed)
-        ):
+        if process is None or not wanted or (process.mode is Mode.CLIENT and not answer.allowed):
             return set()
         return {
             name
@@ -514,11 +510,11 @@ class ZenohEvaluator:
                 delivery.arrives
                 for delivery in (
                     self._deliveries_between(
-                        own_process, _unrestricted_process(name, Mode.CLIENT), wanted
+                        process, _unrestricted_process(name, Mode.CLIENT), wanted
                     )
-                    if own_process.mode is Mode.CLIENT
+                    if process.mode is Mode.CLIENT
                     else self._direct_deliveries(
-                        own_process, _unrestricted_process(name, Mode.PEER), wanted
+                        process, _unrestricted_process(name, Mode.PEER), wanted
                     )
                 )
             )
@@ -577,9 +573,8 @@ class ZenohEvaluator:
         """Return the mode of a process, what it enforces, and where it connects or listens."""
         data = self.keystore.read(path, "Zenoh configuration")
         rendered = self._rendered.read(data)
-        if (
-            rendered and rendered.settings is SettingsEdition.RULES_ONCE
-        ):  # rules have the ids of the file
+        # Where each rule is written once, rules have the ids of the file.
+        if rendered and rendered.settings is SettingsEdition.RULES_ONCE:
             texts = rendered.listen if rendered.mode is Mode.ROUTER else rendered.connect
             return rendered.mode, rendered.access_control, tuple(map(ZenohEndpoint, texts))
         document = parse_configuration(data, str(path), lines=False)

@@ -178,8 +178,8 @@ class Includer:
                 f"Include '{place.file}' itself instead of the link.",
             )
         names = path.split("/")
-        first_name = next((index for index, name in enumerate(names) if name not in ("..", ".")), 0)
-        if "#" in href or "?" in href or ".." in names[first_name:]:
+        up = next((index for index, name in enumerate(names) if name not in ("..", ".")), 0)
+        if "#" in href or "?" in href or ".." in names[up:]:
             raise PolicyError(
                 f"{where}: the include of {_short(href)} is not a plain path",
                 "'#', '?', and '..' after the name of a folder can be understood in two ways.",
@@ -555,10 +555,8 @@ class _Reader:
             return PolicyError(f"{where}: {error.what}", error.why, error.remedy)
         remedy = ""
         if written.startswith("{robot"):
-            suggestions = (
-                [written.replace("{robot", "{namespace", 1)] if label == "namespace" else []
-            )
-            remedy = f"Write {' or '.join(map(_short, (*suggestions, f'/{written}')))}."
+            fixes = [written.replace("{robot", "{namespace", 1)] if label == "namespace" else []
+            remedy = f"Write {' or '.join(map(_short, (*fixes, f'/{written}')))}."
         return PolicyError(f"{where}: {_short(written)} is not a valid {label}", error.why, remedy)
 
     def _read_profiles(self, element: etree._Element, place: IncludedFile) -> Profiles:
@@ -648,9 +646,8 @@ class _Reader:
                 "",
                 f"Remove the element, or name one: <{item}>NAME</{item}>.",
             )
-        is_one_file = all(
-            at.file == place.file for _, at in items
-        )  # names can be included one by one
+        # Names can be included one by one.
+        is_one_file = all(at.file == place.file for _, at in items)
         for level, members in by_level.items():
             names, lines = tuple(name for name, _ in members), tuple(line for _, line in members)
             source = self._source_of(element, place)
@@ -680,7 +677,7 @@ class _Reader:
         if word not in PROTECT:
             raise PolicyError(
                 f"{where}: <?sros {_short(instruction.text or '')[1:-1]}?> is not a protection",
-                "It can be " + " or ".join(f'protect="{level}"' for level in PROTECT) + ".",
+                "It can be " + " or ".join(f'protect="{known}"' for known in PROTECT) + ".",
                 _EXAMPLE,
             )
         return PROTECT[word]
@@ -1243,10 +1240,10 @@ def _files_below(folder: Path) -> Iterator[Path]:
                 "Name a policy in it.",
             )
         folders[:] = sorted(name for name in folders if name != ".git")  # no file of a repository
-        for link in (Path(parent, name) for name in folders):
-            if link.is_symlink():
+        for subfolder in (Path(parent, name) for name in folders):
+            if subfolder.is_symlink():
                 raise DocumentError(
-                    f"'{link}' is a link to a folder, and not followed",
+                    f"'{subfolder}' is a link to a folder, and not followed",
                     "The policies in it would not count.",
                     "Name that folder itself, or remove the link.",
                 )

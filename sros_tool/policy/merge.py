@@ -485,13 +485,9 @@ def _check_protection(path: Path, merged: Policy, additions: Policy) -> None:
     """
     present = {(e.kind, e.name): e for e in stated_protections(merged.enclaves)}
     for protection in stated_protections(additions.enclaves):
-        present_level = present.get((protection.kind, protection.name))
-        if present_level is None or present_level.level is not protection.level:
-            says = (
-                f'says protect="{present_level.word}" at {present_level.source}'
-                if present_level
-                else "does not state it"
-            )
+        old = present.get((protection.kind, protection.name))
+        if old is None or old.level is not protection.level:
+            says = f'says protect="{old.word}" at {old.source}' if old else "does not state it"
             raise PolicyError(
                 f'{protection.source}: {protection} has protect="{protection.word}", and '
                 f"'{path}' {says}",
@@ -524,10 +520,8 @@ def _group(kind: str, rights: GroupRights, entries: Iterable[AddedName]) -> _New
 def _groups(entries: Sequence[AddedName]) -> list[_New]:
     """Group names that are sorted by kind and rights."""
     return [
-        _group(kind, rights, entries_of_group)
-        for (kind, rights), entries_of_group in groupby(
-            entries, key=lambda entry: (entry.kind, entry.rights)
-        )
+        _group(kind, rights, names)
+        for (kind, rights), names in groupby(entries, key=lambda entry: (entry.kind, entry.rights))
     ]
 
 
@@ -599,11 +593,9 @@ class _Editor:
             [entry for entry in entries if (entry.kind, entry.rights) not in groups]
         ):
             self._append(profiles[0], new)
-        for (kind, rights), entries_of_group in groupby(
-            entries, key=lambda entry: (entry.kind, entry.rights)
-        ):
+        for (kind, rights), names in groupby(entries, key=lambda entry: (entry.kind, entry.rights)):
             if group := groups.get((kind, rights)):
-                self._add_names(group, kind, list(entries_of_group))
+                self._add_names(group, kind, list(names))
 
     def _add_names(self, group: PlacedElement, kind: str, entries: Sequence[AddedName]) -> None:
         """Insert names into a group: sorted if the group is sorted, otherwise at its end."""

@@ -169,18 +169,16 @@ def _protected_as_before(before: Policy, after: Policy) -> Policy:
     for kind, name, level in sorted(gone):
         met = list(names[kind].overlapping(name)) if kind in names else []
         # A wildcard of others gets it only if nobody has the right to the name itself.
-        for wildcard in [e for e in met if covers(name, e)] or met:
-            levels[kind, wildcard] = max(
-                level, levels.get((kind, wildcard), level), key=list(Level).index
-            )
+        for kept in [e for e in met if covers(name, e)] or met:
+            levels[kind, kept] = max(level, levels.get((kind, kept), level), key=list(Level).index)
 
     def groups(group: Group, profile: Profile) -> Iterator[Group]:
-        names_of_kind: dict[Level | None, list[str]] = {}
+        by_level: dict[Level | None, list[str]] = {}
         for name in group.names:
             fqn = expand(name, profile.ns, profile.node)
             level = group.protect or levels.get((group.kind, fqn))
-            names_of_kind.setdefault(level, []).append(name)
-        for level, names in names_of_kind.items():
+            by_level.setdefault(level, []).append(name)
+        for level, names in by_level.items():
             yield replace(group, names=tuple(names), protect=level, lines=())
 
     return with_groups(after, groups)
@@ -190,12 +188,12 @@ class _KnownNames:
     """All exact names in policies and observations: by kind, sorted."""
 
     def __init__(self, all_rights: Iterable[Iterable[Right]]) -> None:
-        names_by_place: dict[str, set[str]] = defaultdict(set)
+        by_kind: dict[str, set[str]] = defaultdict(set)
         for rights in all_rights:
             for right in folded(rights):
                 if not is_expression(right.name):
-                    names_by_place[right.kind].add(right.name)
-        self._names = {kind: sorted(names) for kind, names in names_by_place.items()}
+                    by_kind[right.kind].add(right.name)
+        self._names = {kind: sorted(names) for kind, names in by_kind.items()}
 
     def of(self, kind: str) -> Sequence[str]:
         """Return the known names of a kind (topics, services or actions)."""
@@ -354,9 +352,8 @@ class _Narrowing:
                 pairs.update((right.right, name) for name in matched)
             else:
                 pairs.add((right.right, right.name))
-        if (
-            wild
-        ):  # wildcards of services and topics can match all parts of an action, or the missing ones
+        if wild:
+            # Wildcards of services and topics can match all parts of an action, or missing parts.
             pairs = self._with_actions(pairs, Rules(rights))
         if not self._denied:
             return pairs
@@ -421,11 +418,9 @@ def _profile(
                 whole = Right(path, qualifier, right, fqn)
                 if qualifier is DENY or whole in kept_rights:
                     statements.setdefault((group.kind, name, level), {})[right, qualifier] = None
-                for replacement in pending.pop(whole, ()):
-                    written = _name_written_like(replacement.name, name, profile)
-                    statements.setdefault((replacement.kind, written, level), {})[
-                        replacement.right, ALLOW
-                    ] = None
+                for new in pending.pop(whole, ()):
+                    written = _name_written_like(new.name, name, profile)
+                    statements.setdefault((new.kind, written, level), {})[new.right, ALLOW] = None
     groups: dict[tuple[str, GroupRights, Level | None], list[str]] = {}
     for (kind, name, level), rights in statements.items():
         for together in group_rights(rights):
@@ -483,14 +478,12 @@ def propose_wildcards(
     returns the size of a right in bytes.  The largest savings come first; wildcards that newly
     allow a known name are used only if the safe ones do not suffice.
     """
-    own_rights = [
-        right for right in rights if right.enclave == enclave and right.qualifier is ALLOW
-    ]
-    rules = Rules(own_rights)
+    allowed = [right for right in rights if right.enclave == enclave and right.qualifier is ALLOW]
+    rules = Rules(allowed)
     foreign = _names_without_right(enclave, rules, known_rights)
-    present = Rules(right for right in own_rights if is_expression(right.name))
+    present = Rules(right for right in allowed if is_expression(right.name))
     # A large document does not list the names that its wildcards match, so these save nothing.
-    listed = (right for right in own_rights if not present.cover(right))
+    listed = (right for right in allowed if not present.cover(right))
     candidates: dict[frozenset[Right], WildcardProposal] = {}
     for rule, listed_rights in _candidates(listed).items():
         other = candidates.get(frozenset(listed_rights))

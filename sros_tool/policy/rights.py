@@ -108,7 +108,7 @@ def group_rights(rights: Iterable[tuple[str, Qualifier]]) -> Iterator[GroupRight
         yield tuple(ordered)
         return
     for qualifier in Qualifier:
-        yield tuple(right for right in ordered if right[1] is qualifier)
+        yield tuple(pair for pair in ordered if pair[1] is qualifier)
 
 
 def policy_rights(policy: Policy) -> frozenset[Right]:
@@ -178,12 +178,10 @@ def folded(rights: Iterable[Right]) -> frozenset[Right]:
         for right in remaining
         if right.right in WHOLE and right.name.endswith(GOAL) and right.name.startswith("/")
     ]
-    whole_actions = [
-        right for right in actions if right.name and remaining.issuperset(parts(right))
-    ]
-    for right in whole_actions:
+    complete = [right for right in actions if right.name and remaining.issuperset(parts(right))]
+    for right in complete:
         remaining.difference_update(parts(right))
-    return frozenset(remaining.union(whole_actions))
+    return frozenset(remaining.union(complete))
 
 
 # ── queries ────────────────────────────────────────────────────────────────────────────────
@@ -206,12 +204,8 @@ class Rules:
 
     def covering_rights(self, right: Right) -> tuple[Right, ...]:
         """Return the rights that together cover ``right``, or () if it is not covered."""
-        covering_parts = [self._covering_right(part) for part in parts(right)]
-        return (
-            tuple(dict.fromkeys(covering for covering in covering_parts if covering))
-            if all(covering_parts)
-            else ()
-        )
+        covering = [self._covering_right(part) for part in parts(right)]
+        return tuple(dict.fromkeys(filter(None, covering))) if all(covering) else ()
 
     def overlaps(self, right: Right) -> bool:
         """Return whether a right of the set has a name in common with ``right``."""
@@ -267,10 +261,8 @@ class RightsDifference:
 
     def lines(self) -> list[tuple[str, Right]]:
         """Return the different rights with "-" (only first side) or "+" (only second side)."""
-        marked_rights = [("-", right) for right in self.only_first] + [
-            ("+", e) for e in self.only_second
-        ]
-        return sorted(marked_rights, key=lambda line: (*order(line[1]), line[0] == "+"))
+        lines = [("-", right) for right in self.only_first] + [("+", e) for e in self.only_second]
+        return sorted(lines, key=lambda line: (*order(line[1]), line[0] == "+"))
 
     def without(self, enclaves: Collection[str]) -> RightsDifference:
         """Return the difference in the rights of all other enclaves."""

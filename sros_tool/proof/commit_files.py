@@ -294,10 +294,10 @@ class CommitFiles:
         paths = []
         with Folder(work_tree) as folder:
             for path in self.files:
-                working_entry = None
+                content = None
                 with suppress(SrosError, OSError):
-                    working_entry = folder.read(path)
-                if working_entry != self.written(path):
+                    content = folder.read(path)
+                if content != self.written(path):
                     paths.append(path)
         return paths
 

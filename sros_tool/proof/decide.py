@@ -139,13 +139,9 @@ class Worlds:
     def __init__(self, worlds: Iterable[World]) -> None:
         self._first_alike: dict[World, World] = {}
         for world in worlds:
-            other_worlds = self._first_alike.values()
-            same_access = (
-                world_of_group
-                for world_of_group in other_worlds
-                if world.has_same_access(world_of_group)
-            )
-            self._first_alike[world] = next(same_access, world)
+            known = self._first_alike.values()
+            alike = (earlier for earlier in known if world.has_same_access(earlier))
+            self._first_alike[world] = next(alike, world)
 
     def decide(
         self, requirement: Requirement, limit: SearchLimit
@@ -317,13 +313,13 @@ def _first_of(uses: Mapping[str, Sequence[Use]]) -> Witness | None:
     """Return the shortest use as a witness, with a use of every other enclave."""
     if not uses:
         return None
-    best = min((use for uses_of_right in uses.values() for use in uses_of_right), key=_use_order)
+    best = min((use for enclave_uses in uses.values() for use in enclave_uses), key=_use_order)
     other_uses = (
         min(
-            uses_of_right,
+            enclave_uses,
             key=lambda use: ((use.right, use.name) != (best.right, best.name), _use_order(use)),
         )
-        for enclave, uses_of_right in sorted(uses.items())
+        for enclave, enclave_uses in sorted(uses.items())
         if enclave != best.enclave
     )
     return Witness((best,), tuple((use,) for use in other_uses))
@@ -760,19 +756,14 @@ def _shortest_chain(
     queue: deque[tuple[str, str, _Chain]] = deque((start, start, ()) for start in starts)
     flows = [_Flow(domain_world, limit) for domain_world in (world, *world.elsewhere)]
     while queue:
-        enclave_here, origin, chain = queue.popleft()
+        source, origin, chain = queue.popleft()
 
         def is_new(enclave: str, origin: str = origin) -> bool:
-            origins_here = origins.get(enclave, ())
-            return (
-                enclave not in excluded and origin not in origins_here and len(origins_here) < most
-            )
+            known = origins.get(enclave, ())
+            return enclave not in excluded and origin not in known and len(known) < most
 
         def is_unused(
-            number: int,
-            topic: str,
-            origin: str = origin,
-            router: str = world.router_of(enclave_here),
+            number: int, topic: str, origin: str = origin, router: str = world.router_of(source)
         ) -> bool:
             by = used.setdefault((number, topic, router), set())
             fresh = origin not in by and len(by) < most
@@ -780,8 +771,8 @@ def _shortest_chain(
             return fresh
 
         for number, flow in enumerate(flows):
-            for topic, target in flow.hops(enclave_here, partial(is_unused, number), is_new):
-                longer = (*chain, TopicHop(enclave_here, target, topic))
+            for topic, target in flow.hops(source, partial(is_unused, number), is_new):
+                longer = (*chain, TopicHop(source, target, topic))
                 if target in targets:
                     return longer
                 origins.setdefault(target, set()).add(origin)

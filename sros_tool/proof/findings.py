@@ -257,13 +257,9 @@ def _violation_finding(violation: Violation) -> Finding:
         for step in named
         if step.source
     ]
-    requirement_place = requirement.source
+    place = requirement.source
     related.append(
-        RelatedPlace(
-            f"required: {_with_title(requirement)}",
-            requirement_place.file,
-            requirement_place.line or None,
-        )
+        RelatedPlace(f"required: {_with_title(requirement)}", place.file, place.line or None)
     )
     return VIOLATED.found(
         _subject(violation),
@@ -339,36 +335,22 @@ def _listed_names(names: Sequence[str]) -> str:
 
 
 def _vacuous_finding(requirement: Requirement, why: Sequence[str]) -> Finding:
-    requirement_place = requirement.source
+    place = requirement.source
     text = f"{'; '.join(why)}: {demand(requirement)}"
-    return VACUOUS.found(
-        requirement_place.file, text, requirement_place.file, requirement_place.line
-    )
+    return VACUOUS.found(place.file, text, place.file, place.line)
 
 
 def _assumption_finding(requirement: Requirement, name: str) -> Finding:
-    requirement_place = requirement.source
+    place = requirement.source
     text = f"{demand(requirement)}: {assumption_text(name)}"
-    return ASSUMED.found(
-        requirement_place.file, text, requirement_place.file, requirement_place.line
-    )
+    return ASSUMED.found(place.file, text, place.file, place.line)
 
 
 def _not_crossing_finding(requirement: Requirement, kept_use: KeptUse) -> Finding:
-    requirement_place, use, other_names = (
-        requirement.source,
-        kept_use.use,
-        _listed_names(kept_use.others),
-    )
-    ends = (
-        f"from {use.enclave} to {other_names}"
-        if use.writes
-        else f"from {other_names} to {use.enclave}"
-    )
+    place, use, peers = requirement.source, kept_use.use, _listed_names(kept_use.others)
+    ends = f"from {use.enclave} to {peers}" if use.writes else f"from {peers} to {use.enclave}"
     text = f"{use.name} does not pass between routers {ends}: {demand(requirement)}"
-    return NOT_CROSSING.found(
-        requirement_place.file, text, requirement_place.file, requirement_place.line
-    )
+    return NOT_CROSSING.found(place.file, text, place.file, place.line)
 
 
 def assumption_text(name: str) -> str:

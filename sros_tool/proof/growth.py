@@ -315,14 +315,14 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     unknown = "only some enclaves are compared" if partial else ""
     if None in sides:
         unknown = f"there are more than {_MOST_HOPS:,} hops between enclaves"
-    lost_protection = dict.fromkeys(_lost_protection(head, base, limit, rules=False))
+    gained = dict.fromkeys(_lost_protection(head, base, limit, rules=False))
     return Growth(
         added,
         tuple(_gains(after, before, worlds, scope, limit)),
         tuple(islice(_new_reach(*sides), _MOST_REACH)),
         unknown,
         lost,
-        tuple(replace(change, effect=Effect.TIGHTER) for change in lost_protection),
+        tuple(replace(change, effect=Effect.TIGHTER) for change in gained),
         tuple(world.title for world in worlds),
         tuple(sorted({domain for world in worlds for domain in world.domains})),
         tuple(_assumptions(base, head)),
@@ -522,15 +522,13 @@ def _access_on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
             return stated[id(side)](enclave, domain)
         if enclave in side.routers:
             return _NO_ACCESS
-        access_granted = enforced_access(side.enforcers, enclave, domain)
+        enforced = enforced_access(side.enforcers, enclave, domain)
 
         def decide(verb: AccessVerb, topic: str) -> bool:
             writes = verb is AccessVerb.PUBLISH
             return is_enforced(side.enforcers, enclave, domain, topic, writes=writes)
 
-        writes, reads = (
-            name_set & ROS_TOPICS for name_set in (access_granted.writes, access_granted.reads)
-        )
+        writes, reads = (names & ROS_TOPICS for names in (enforced.writes, enforced.reads))
         topics = {AccessVerb.PUBLISH: writes, AccessVerb.SUBSCRIBE: reads}
         joins = any(enclave in enforcer.names() for enforcer in side.enforcers)
         return _Access(topics, decide, joins=joins)
@@ -574,10 +572,10 @@ def _access_by_rights(
         )
 
         def decide(verb: AccessVerb, topic: str) -> bool:
-            def union_of_names(patterns: Iterable[str]) -> bool:
+            def matches_any(patterns: Iterable[str]) -> bool:
                 return any(matches(Style.FNMATCH, pattern, topic) for pattern in patterns)
 
-            return union_of_names(allowed[verb]) and not union_of_names(denied[verb])
+            return matches_any(allowed[verb]) and not matches_any(denied[verb])
 
         def topics(verb: AccessVerb) -> NameSet:
             granted = names_of(Style.FNMATCH, allowed[verb]) - names_of(Style.FNMATCH, denied[verb])
@@ -626,8 +624,8 @@ def _gains(
             domains=tuple(sorted(domains)),
         )
         # What the governance gives, it gives to many.
-        gain_without_enclaves = one if one.right else replace(one, enclaves=())
-        together.setdefault(gain_without_enclaves, []).extend(gain.enclaves)
+        same = one if one.right else replace(one, enclaves=())
+        together.setdefault(same, []).extend(gain.enclaves)
     for gain, enclaves in together.items():
         yield replace(gain, enclaves=tuple(dict.fromkeys(enclaves)))
 
@@ -1082,10 +1080,8 @@ def _completed(side: AccessSource, other: AccessSource) -> AccessSource:
     permissions = _certified_as(side, other)
     if domains:
         permissions = {
-            name: _permissions_for_domain(enclave_permissions, domains[name])
-            if name in domains
-            else enclave_permissions
-            for name, enclave_permissions in permissions.items()
+            name: _permissions_for_domain(given, domains[name]) if name in domains else given
+            for name, given in permissions.items()
         }
     if side.governance:
         return replace(side, permissions=permissions)

@@ -189,11 +189,11 @@ def _certified_otherwise(old: AccessSource, new: AccessSource) -> Iterator[Setti
         before = names.get(new_one.key, enclave)
         old_one = old.certified.get(enclave)
         if new_one.name not in (before, old_one.name if old_one else enclave):
-            document, text = (
+            key, text = (
                 f"certificate of {enclave}",
                 "anyone who has its key can act as that enclave",
             )
-            yield SettingChange(Effect.LOOSER, document, before, new_one.name, text)
+            yield SettingChange(Effect.LOOSER, key, before, new_one.name, text)
 
 
 def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
@@ -201,7 +201,7 @@ def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChan
     if old.trusts is None or new.trusts is None:
         return
     all_revoked = frozenset(entry for trust in old.trusts.values() for entry in trust.revoked)
-    trusted_serials: dict[int, list[str]] = defaultdict(list)
+    trusted: dict[int, list[str]] = defaultdict(list)
 
     @lru_cache(maxsize=8)  # most enclaves have the same lists
     def lost_revocations(before: frozenset[tuple[str, int]], after: Trust) -> list[int]:
@@ -212,17 +212,15 @@ def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChan
         if old.scope is None or new.scope is not None or name in old.scope:
             before = old.trusts[name].revoked if name in old.trusts else all_revoked
             for serial in lost_revocations(before, new.trusts[name]):
-                trusted_serials[serial].append(name)
-    for serial in sorted(trusted_serials)[:_MOST_SERIALS]:
-        names = [enclave for enclave in trusted_serials[serial] if enclave != KEYSTORE_ITSELF] or [
-            KEYSTORE_ITSELF
-        ]
+                trusted[serial].append(name)
+    for serial in sorted(trusted)[:_MOST_SERIALS]:
+        names = [name for name in trusted[serial] if name != KEYSTORE_ITSELF] or [KEYSTORE_ITSELF]
         who = (
             f"{names[0]} again trusts" if len(names) == 1 else f"{len(names)} enclaves again trust"
         )
         text = f"{who} anyone who has its key"
         yield SettingChange(Effect.LOOSER, f"certificate {serial:x}", "revoked", "trusted", text)
-    if (more := len(trusted_serials) - _MOST_SERIALS) > 0:
+    if (more := len(trusted) - _MOST_SERIALS) > 0:
         text = "enclaves again trust anyone who has their keys"
         yield SettingChange(Effect.LOOSER, f"{more} certificates more", "revoked", "trusted", text)
 
@@ -237,7 +235,7 @@ def _looser_governance(
         (rule, new_rule)
         for rule in old.domain_access_rules
         for new_rule in new.domain_access_rules
-        if any(domains in new_rule.domains.closed() for domains in rule.domains.closed())
+        if any(domain in new_rule.domains.closed() for domain in rule.domains.closed())
     )
     for rule, other in pairs:
         for change in attribute_changes(rule, other, "protection", ""):
@@ -257,14 +255,14 @@ def _looser_topics(
                 for change in attribute_changes(before, after, "protection", "{}")
                 if change.effect is Effect.LOOSER
             ]
-            unchanged = had & has
+            shared = had & has
             if not changes:
                 continue
-            topic = unchanged.example(limit)
+            topic = shared.example(limit)
             if topic is None:
                 continue
             if topic not in ROS_TOPICS:
-                topic = (unchanged & ROS_TOPICS).example(limit) or topic
+                topic = (shared & ROS_TOPICS).example(limit) or topic
             for change in changes:
                 yield replace(change, meaning=change.meaning.replace("{}", f"DDS topic {topic}"))
 

@@ -129,9 +129,9 @@ class Repository:
             raise _unknown_revision_error(name)
         base, rest = expression["name"], expression["rest"]
         if _HASH.match(base):
-            commit_hash = base
+            object_id = base
         elif base in ("HEAD", "@"):
-            base, commit_hash = "HEAD", self._ask("rev-parse", "--verify", "--quiet", "HEAD")
+            base, object_id = "HEAD", self._ask("rev-parse", "--verify", "--quiet", "HEAD")
         else:
             candidates = self._candidates(base)
             if len(candidates) > 1:
@@ -140,14 +140,14 @@ class Repository:
                     f"It is {_candidates_text(candidates)}.",
                     "Write the full name, such as refs/remotes/origin/main.",
                 )
-            base, commit_hash = next(iter(candidates.items()), (base, ""))
-        if commit_hash and rest:
-            start = base if rest.startswith("@") else commit_hash
+            base, object_id = next(iter(candidates.items()), (base, ""))
+        if object_id and rest:
+            start = base if rest.startswith("@") else object_id
             words = ("--verify", "--quiet", "--end-of-options", f"{start}{rest}^{{commit}}")
-            commit_hash = self._ask("rev-parse", *words)
-        if not commit_hash:
+            object_id = self._ask("rev-parse", *words)
+        if not object_id:
             raise _unknown_revision_error(name)
-        return self._commit_id(commit_hash, name)
+        return self._commit_id(object_id, name)
 
     def _candidates(self, name: str) -> dict[str, str]:
         """Return the ids of all references that a short name can stand for, by reference.
@@ -334,9 +334,8 @@ class Repository:
                 than ``maximum`` bytes.
         """
         known = self.sizes(wanted := dict.fromkeys(ids))
-        sizes = {
-            object_id: known.get(object_id, 0) for object_id in wanted
-        }  # what is missing is an error below
+        # A missing object is an error below.
+        sizes = {object_id: known.get(object_id, 0) for object_id in wanted}
         if sum(sizes.values()) > maximum:
             raise DocumentError(f"the files of the commit have more than {maximum} bytes")
         part: list[str] = []

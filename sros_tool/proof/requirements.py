@@ -219,10 +219,8 @@ def demand(requirement: Requirement) -> str:
             shown = _listed_names([f"{kind.removesuffix('s')} {name}" for kind, name in names])
             return f"{shown} has to be {'encrypted' if level is Level.ENCRYPT else 'signed'}"
         case Apart(sources=sources, targets=targets, through=through):
-            exception = f" except through {enclaves_text(through)}" if through else ""
-            return (
-                f"{enclaves_text(sources)} must not influence {enclaves_text(targets)}{exception}"
-            )
+            past = f" except through {enclaves_text(through)}" if through else ""
+            return f"{enclaves_text(sources)} must not influence {enclaves_text(targets)}{past}"
         case _:
             raise AssertionError(requirement)
 
@@ -242,22 +240,18 @@ def _enclaves_text(enclaves: Iterable[str], of_robots: Iterable[RobotNames]) -> 
     excepted = [name.removeprefix(EXCEPT) for name in entries if name.startswith(EXCEPT)]
     names = [name for name in entries if not name.startswith(EXCEPT)]
     shown = list(names)
-    for robot_names in of_robots:
+    for plural in of_robots:
         if (
-            robot_names.own in excepted
-            and robot_names.names.count(robot_names.own) == 1
-            and {*robot_names.names} <= {*shown}
+            plural.own in excepted
+            and plural.names.count(plural.own) == 1
+            and {*plural.names} <= {*shown}
         ):
-            robots = (
-                f"the other robots of {robot_names.group}"
-                if robot_names.group
-                else "all other robots"
-            )
-            shown[shown.index(robot_names.names[0])] = f"{robot_names.pattern} of {robots}"
-            shown = [name for name in shown if name not in robot_names.names]
-            names.remove(robot_names.own)
+            robots = f"the other robots of {plural.group}" if plural.group else "all other robots"
+            shown[shown.index(plural.names[0])] = f"{plural.pattern} of {robots}"
+            shown = [name for name in shown if name not in plural.names]
+            names.remove(plural.own)
     # "All other robots" already names the exception of the own robot, unless other names need it.
-    own_names = {robot_names.own for robot_names in of_robots} - {*names}
+    own_names = {plural.own for plural in of_robots} - {*names}
     excepted = [
         enclave
         for enclave in excepted
@@ -699,8 +693,8 @@ def _filled_words(text: object, used_placeholders: Iterable[Placeholder], robot:
 
 
 def _only_from(table: _Table) -> Only:
-    known_keys = table.known(*KIND_OF, "enclaves")
-    return Only(**known_keys, rights=table.rights(), enclaves=table.enclaves("enclaves"))
+    common = table.known(*KIND_OF, "enclaves")
+    return Only(**common, rights=table.rights(), enclaves=table.enclaves("enclaves"))
 
 
 def _nobody_from(table: _Table) -> Nobody:
@@ -708,7 +702,7 @@ def _nobody_from(table: _Table) -> Nobody:
 
 
 def _must_from(table: _Table) -> Must:
-    known_keys = table.known(*KIND_OF, "enclave")
+    common = table.known(*KIND_OF, "enclave")
     enclave = table.text("enclave")
     problem = expression_problem(enclave)
     if is_expression(enclave):
@@ -719,11 +713,11 @@ def _must_from(table: _Table) -> Must:
             f"{_short(enclave)} is not an enclave",
             problem or "An enclave begins with '/'.",
         )
-    return Must(**known_keys, rights=table.rights(), enclave=enclave)
+    return Must(**common, rights=table.rights(), enclave=enclave)
 
 
 def _at_most_from(table: _Table) -> AtMost:
-    known_keys = table.known(*KIND_OF, "enclaves")
+    common = table.known(*KIND_OF, "enclaves")
     most = table.values.get("enclaves")
     if type(most) is not int or not 0 < most < 2**31:
         raise table.error(
@@ -731,24 +725,22 @@ def _at_most_from(table: _Table) -> AtMost:
             f"enclaves has {_short(most)}, which is not a number",
             "Write how many enclaves may use one name, from 1; for none there is [[nobody]].",
         )
-    return AtMost(**known_keys, rights=table.rights(), most=most)
+    return AtMost(**common, rights=table.rights(), most=most)
 
 
 def _widest_from(table: _Table) -> Widest:
-    known_keys = table.known(*KIND_OF, "enclaves")
-    return Widest(**known_keys, rights=table.rights(least=0), enclaves=table.enclaves("enclaves"))
+    common = table.known(*KIND_OF, "enclaves")
+    return Widest(**common, rights=table.rights(least=0), enclaves=table.enclaves("enclaves"))
 
 
 def _nothing_but_from(table: _Table) -> NothingBut:
-    known_keys = table.known(*KIND_OF, "enclaves")
-    return NothingBut(
-        **known_keys, rights=table.rights(least=0), enclaves=table.enclaves("enclaves")
-    )
+    common = table.known(*KIND_OF, "enclaves")
+    return NothingBut(**common, rights=table.rights(least=0), enclaves=table.enclaves("enclaves"))
 
 
 def _not_both_from(table: _Table) -> NotBoth:
     rights: list[RightNames] = []
-    known_keys = table.known("first", "second")
+    common = table.known("first", "second")
     for key in ("first", "second"):
         value = table.values.get(key)
         if not isinstance(value, dict) or not value or set(value) - set(KIND_OF):
@@ -760,11 +752,11 @@ def _not_both_from(table: _Table) -> NotBoth:
         line = table.lines.get(key, table.source.line)
         inner = _Table(f"not_both.{key}", value, Source(table.source.file, line), {})
         rights.append(inner.rights())
-    return NotBoth(**known_keys, first=rights[0], second=rights[1])
+    return NotBoth(**common, first=rights[0], second=rights[1])
 
 
 def _protected_from(table: _Table) -> Protected:
-    known_keys = table.known(*RIGHTS, "level")
+    common = table.known(*RIGHTS, "level")
     level = table.values.get("level")
     if not isinstance(level, str) or level not in _LEVELS:
         raise table.error(
@@ -773,14 +765,14 @@ def _protected_from(table: _Table) -> Protected:
     names = tuple((k, name) for k in RIGHTS if k in table.values for name in table.names(k))
     if not names:
         raise table.error("", "[[protected]] names nothing", f"Write one of {', '.join(RIGHTS)}.")
-    return Protected(**known_keys, names=names, level=_LEVELS[level])
+    return Protected(**common, names=names, level=_LEVELS[level])
 
 
 def _apart_from(table: _Table) -> Apart:
-    known_keys = table.known("from", "to", "through")
+    common = table.known("from", "to", "through")
     through = table.enclaves("through") if "through" in table.values else ()
     return Apart(
-        **known_keys, sources=table.enclaves("from"), targets=table.enclaves("to"), through=through
+        **common, sources=table.enclaves("from"), targets=table.enclaves("to"), through=through
     )
 
 
@@ -899,14 +891,11 @@ def dropped_findings(
     return [
         DROPPED.found(
             ": ".join(filter(None, (first.name, first.demand))),
-            first.text()
-            + _other_robots_text(
-                [dropped_requirement.requirement.robot for dropped_requirement in same_table]
-            ),
+            first.text() + _other_robots_text([other.requirement.robot for other in others]),
             file,
             related=(RelatedPlace("required before", first.file, first.line or None),),
         )
-        for first, *same_table in tables.values()
+        for first, *others in tables.values()
     ]
 
 

@@ -328,13 +328,13 @@ class _Review:
     def all(self) -> Iterator[ReviewStep]:
         asked = self.request
         if asked.base == asked.head:
-            same_commits = DocumentError(
+            refusal = DocumentError(
                 "both commits are the same, so that nothing would be compared",
                 "",
                 "Check out the commit of the change (GitHub's pull_request_target does not), or "
                 "ask for no comparison: --base none.",
             )
-            yield ReviewStep("files", "", _UNDECIDED, same_commits)
+            yield ReviewStep("files", "", _UNDECIDED, refusal)
         head_fleet = yield from self._fleet(self.head)
         base_fleet = yield from self._fleet(self.base)
         of_head = yield from self._policies(self.head, head_fleet)
@@ -507,10 +507,8 @@ class _Review:
             before, after = (read_connections(e.folder / file) for e in (self.base, self.head))
             for where in sorted({*before, *after}, key=_decisive_first):
                 if before.get(where) != (value := after.get(where)):
-                    change = "is gone, which" if value is None else f"is {value}, which"
-                    lines.append(
-                        (f"{change} can change which keys Ansible delivers, and how", where)
-                    )
+                    text = "is gone, which" if value is None else f"is {value}, which"
+                    lines.append((f"{text} can change which keys Ansible delivers, and how", where))
         return (_FOUND, Facts(tuple(lines))) if lines else None
 
     def _unreviewed_step(
@@ -635,8 +633,8 @@ class _Review:
 
         ``path`` is a path in HEAD.
         """
-        reviewed_apart = (*self.request.left_out, *self.request.keystores)
-        if entry.mode not in (LINK, SUBMODULE) or _is_below(path, reviewed_apart):
+        excluded = (*self.request.left_out, *self.request.keystores)
+        if entry.mode not in (LINK, SUBMODULE) or _is_below(path, excluded):
             return ""
         if entry.mode == SUBMODULE:
             return entry.kind
@@ -644,14 +642,8 @@ class _Review:
         target = os.fsdecode(repository.content(entry.id))
         with suppress(SrosError):
             place = os.path.normpath(Path(path).parent / target)
-            entry_at_place = (
-                None if _is_below(place, self.request.left_out) else self.head.entry(place)
-            )
-            if (
-                entry_at_place
-                and entry_at_place.mode in FILES
-                and not may_be_policy(repository.content(entry_at_place.id))
-            ):
+            linked = None if _is_below(place, self.request.left_out) else self.head.entry(place)
+            if linked and linked.mode in FILES and not may_be_policy(repository.content(linked.id)):
                 return ""
         return f"a symbolic link to '{target[:_LONGEST]}'"
 

@@ -66,12 +66,12 @@ def _joined_requirement(requirement: Requirement, other: Requirement) -> Require
     """Return a requirement that demands the same as two, or None if they cannot be joined."""
     match requirement, other:
         case (
-            Nobody(rights=(("request", holders),)),
+            Nobody(rights=(("request", names),)),
             Nobody(rights=(("request", more),)),
-        ) if len(holders) < _WIDE_LIST:
-            return replace(requirement, rights=(("request", (*holders, *more)),))
-        case Protected(names=holders, level=level), Protected(names=more) if other.level is level:
-            return replace(requirement, names=(*holders, *more))
+        ) if len(names) < _WIDE_LIST:
+            return replace(requirement, rights=(("request", (*names, *more)),))
+        case Protected(names=names, level=level), Protected(names=more) if other.level is level:
+            return replace(requirement, names=(*names, *more))
     return None
 
 
@@ -199,10 +199,8 @@ def _with_placeholder(name: str, robot: Robot, placeholder: Placeholder) -> str:
     space = f"{robot.namespace}/"
     if placeholder.value == "namespace" and robot.namespace != "/" and name.startswith(space):
         begin, rest = str(placeholder), name[len(robot.namespace) :]
-    placeholder_text = str(placeholder._replace(value="robot"))
-    return begin + "/".join(
-        placeholder_text if part == robot.name else part for part in rest.split("/")
-    )
+    word = str(placeholder._replace(value="robot"))
+    return begin + "/".join(word if part == robot.name else part for part in rest.split("/"))
 
 
 def _joined_names(names: Names, value: str, fleet: Fleet) -> Names:

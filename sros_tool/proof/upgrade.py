@@ -312,12 +312,12 @@ def _vulnerabilities(
         )
         unclear = {advisory.id for advisory in known[1].unclear} if known[1] else set()
         parts = [f"{len(old & new)} stay"] if old & new else []
-        for ids, verb in (
+        for ids, status in (
             (old - new - unclear, "fixed"),
             (old & unclear, f"not known for {releases[1].latest}"),
             (new - old, "new"),
         ):
-            parts += [f"{verb}: {', '.join(sorted(ids))}"] if ids else []
+            parts += [f"{status}: {', '.join(sorted(ids))}"] if ids else []
         if old != new:
             title = f"{releases[0].product} {releases[0].latest} to {releases[1].latest}"
             yield VULNERABILITIES.found(title, "; ".join(parts))
@@ -442,8 +442,7 @@ class _Decided:
             for holder in fitting_others
         )
         other_accesses = (
-            VendorParticipant(shipped.vendor, permissions, context).access
-            for permissions in presented
+            VendorParticipant(shipped.vendor, loaded, context).access for loaded in presented
         )
         usable = (participant.access, *other_accesses) if participant.access else ()
         self.access: tuple[Access, ...] = tuple(filter(None, usable))
@@ -478,16 +477,16 @@ def _changes_of_enclave(
         for topic in names_without_wildcards(grant)
     }
     file = files.place(name, PERMISSIONS_FILE)
-    for kind, first_access, other in ((_MORE, old, new), (_LESS, new, old)):
+    for kind, first, second in ((_MORE, old, new), (_LESS, new, old)):
         gains = list(
             by_vendors.gained_topics(
-                name, first_access.access, other.access, other.shipped.vendor, domain, names
+                name, first.access, second.access, second.shipped.vendor, domain, names
             )
         )
         if gains:
             accesses = first_few(list(dict.fromkeys(map(_words, gains))), _SHOWN, "; ", "; and ")
-            closed = first_access.shipped.title
-            opened = f"{where}{accesses}: open on {other.shipped.title}, closed on {closed}"
+            closed = first.shipped.title
+            opened = f"{where}{accesses}: open on {second.shipped.title}, closed on {closed}"
             yield DecisionChange(kind, name, opened, file)
 
 

@@ -552,9 +552,7 @@ def enforced_access(enforcers: Iterable[Enforcement], enclave: str, domain: int)
         def of(keys: Iterable[str]) -> NameSet:
             return NameSet.union(_topics(key, domain, begin) for key in keys)
 
-        first, *other_sets = (
-            enforcer.passing(remote, *message, of) for message in _USES[writes, begin]
-        )
+        first, *other_sets = (enforcer.passing(remote, *use, of) for use in _USES[writes, begin])
         for names in other_sets:
             first &= names
         return first & names_of_expression(f"{begin}/*{_ENDS[begin]}")

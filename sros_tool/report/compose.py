@@ -250,13 +250,11 @@ def _picture(
     def sides(kind: str, name: str) -> Sequence[bool]:
         known = known_names.matching_names(kind, name) if is_expression(name) else ()
         # What is not drawn under its own name is a part of an action, which has both sides.
-        other_ends = [drawn.get((kind, known_name), (True, True)) for known_name in known]
-        return [any(ends) for ends in zip(drawn[kind, name], *other_ends, strict=True)]
+        of_known = [drawn.get((kind, known_name), (True, True)) for known_name in known]
+        return [any(ends) for ends in zip(drawn[kind, name], *of_known, strict=True)]
 
-    stated_protections = next(
-        (source.protections for source in reversed(sources) if source.protections), ()
-    )
-    demanded = _Demanded(() if governance else stated_protections)
+    stated = next((source.protections for source in reversed(sources) if source.protections), ())
+    demanded = _Demanded(() if governance else stated)
     names = sorted({(edge.kind, edge.name) for edge in edges})
     return Picture(
         title=" and ".join(source.origin.title for source in sources),
@@ -358,9 +356,7 @@ def _domains_of(sources: Sequence[PictureSource]) -> dict[str, str]:
             continue
         for enclave in enclaves:
             ranges[enclave] += ((part.first or 0, part.last or 0) for part in domains.ranges)
-    known = {
-        enclave: str(DomainSet.of(*domain_ranges)) for enclave, domain_ranges in ranges.items()
-    }
+    known = {enclave: str(DomainSet.of(*pairs)) for enclave, pairs in ranges.items()}
     return known | dict.fromkeys(everywhere, "")
 
 
@@ -398,8 +394,8 @@ def _marked_rights(
     for key in {**sides[0], **sides[1]}:
         one, other = sides[0].get(key), sides[1].get(key)
         if one and other:
-            marked_by = tuple(sorted({*one.by, *other.by})) if one.by and other.by else ()
-            edges.append(one if allowed_by else replace(one, by=marked_by))
+            by = tuple(sorted({*one.by, *other.by})) if one.by and other.by else ()
+            edges.append(one if allowed_by else replace(one, by=by))
         elif one:
             edges.append(replace(one, mark=OverlaySide.FIRST))
         elif other:
@@ -616,10 +612,8 @@ def _edges_of(rights: Collection[Right], known_names: Known) -> list[Edge]:
         by = stated.name if is_expression(stated.name) else ""
         for reached in known_names.names_to_draw(stated):
             # A wildcard drawn as a name is treated like an exact name.
-            stated_name = "" if reached == by else by
-            topics[stated.enclave, stated.kind, stated.right, reached][stated.qualifier].add(
-                stated_name
-            )
+            wild = "" if reached == by else by
+            topics[stated.enclave, stated.kind, stated.right, reached][stated.qualifier].add(wild)
     whole: dict[tuple[str, str, Qualifier], dict[tuple[str, str], set[str]]] = defaultdict(dict)
     edges = []
     for (enclave, kind, right, name), by_qualifier in topics.items():

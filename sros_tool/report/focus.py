@@ -94,10 +94,8 @@ def focused_picture(
         left_out = f"; what passes between the {routers} Zenoh routers is not considered"
         focuses = tuple(replace(focus, sentence=f"{focus.sentence}{left_out}") for focus in focuses)
     if system.is_partial:
-        title_clause = f"of the enclaves in {picture.title}, "
-        focuses = tuple(
-            replace(focus, sentence=f"{title_clause}{focus.sentence}") for focus in focuses
-        )
+        scope = f"of the enclaves in {picture.title}, "
+        focuses = tuple(replace(focus, sentence=f"{scope}{focus.sentence}") for focus in focuses)
     picture = system.with_shortest_paths(replace(picture, focus=focuses))
     flow = FocusFlow.of(picture)
     edges = tuple(edge for edge in picture.edges if flow.has(edge))
@@ -139,9 +137,7 @@ class FocusFlow:
     @classmethod
     def of(cls, picture: Picture) -> FocusFlow:
         """Return the flow of information of a picture that has a focus."""
-        focused_enclaves = frozenset(
-            focus.name for focus in picture.focus if focus.kind == _ENCLAVE
-        )
+        focused = frozenset(focus.name for focus in picture.focus if focus.kind == _ENCLAVE)
         wanted = [(focus.kind, focus.name) for focus in picture.focus if focus.kind != _ENCLAVE]
         targets = frozenset(
             (name.kind, name.name)
@@ -155,7 +151,7 @@ class FocusFlow:
             for hops_of, near, far in (
                 (
                     before,
-                    (focus.name,) if focus.name in focused_enclaves else focus.senders,
+                    (focus.name,) if focus.name in focused else focus.senders,
                     focus.influencing,
                 ),
                 (after, focus.receivers, focus.influenced),
@@ -169,7 +165,7 @@ class FocusFlow:
             # Those that are denied a name, or that use a part of an action, belong to it.
             if (edge.kind, edge.name) in targets:
                 (before if edge.sends else after).setdefault(edge.enclave, 1)
-        flow = cls(focused_enclaves, targets, before, after, {})
+        flow = cls(focused, targets, before, after, {})
         ends = defaultdict[tuple[str, str], tuple[set[int], set[int]]](lambda: (set(), set()))
         for edge in picture.edges:
             for side in (0, 1):
@@ -239,10 +235,8 @@ class _System:
         enclaves = {enclave.path for enclave in picture.enclaves}
         in_domains: dict[DomainSet | None, list[Right]] = defaultdict(list)
         for source in sources:
-            for domains, rights_there in (source.in_domains or {None: source.rights}).items():
-                in_domains[domains] += (
-                    right for right in rights_there if right.enclave in enclaves
-                )
+            for domains, rights in (source.in_domains or {None: source.rights}).items():
+                in_domains[domains] += (right for right in rights if right.enclave in enclaves)
         self._rights = [right for rights in in_domains.values() for right in rights]
         self._domains = {enclave.path: enclave.domains for enclave in picture.enclaves}
         self._governance: Governance | None = next(
@@ -374,10 +368,10 @@ class _System:
         for right in self._rights:
             if right.kind == kind and matches(right.name, name):
                 by_right[right.enclave, right.right].append(right)
-        for (enclave, place), rights in by_right.items():
+        for (enclave, verb), rights in by_right.items():
             qualifier = DENY if any(right.qualifier is DENY for right in rights) else ALLOW
             by = sorted({right.name for right in rights if right.qualifier is qualifier})
-            yield Edge(enclave, kind, name, place, qualifier, tuple(by))
+            yield Edge(enclave, kind, name, verb, qualifier, tuple(by))
 
     def _name(self, kind: str, name: str) -> Name:
         protection = protection_of(self._governance, kind, name)

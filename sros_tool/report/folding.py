@@ -408,8 +408,8 @@ class _Draft:
         """Return how many other units of its family have rights to names of each unit."""
         pairs = {
             (unit, owner)
-            for _kind, units, symbol in self._seen
-            if isinstance(symbol, Edge) and (owner := self._of.get(symbol.enclave)) is not None
+            for _kind, units, part in self._seen
+            if isinstance(part, Edge) and (owner := self._of.get(part.enclave)) is not None
             for unit in units
             if unit != owner
             and self._units[unit].family == self._units[owner].family
@@ -520,7 +520,7 @@ class _Draft:
         for n in sorted(set(self._of.values()), key=self._unit_name_order):
             families[self._units[n].family].append(n)
 
-        def key(edge: Edge, unit: int, other: int) -> object:
+        def key(edge: Edge, unit: int, other_unit: int) -> object:
             name = self._text(edge.name)
             rest = replace(edge, name="", by=())
             return (
@@ -537,7 +537,7 @@ class _Draft:
                     if self._is_counted(unit, other_unit):
                         units_by_key[key(edge, unit, other_unit)].add(other_unit)
 
-        def several(edge: Edge, unit: int, other: int, position: int) -> str:
+        def several(edge: Edge, unit: int, other_unit: int, position: int) -> str:
             family = self._units[other_unit].family
             named, all_of = units_by_key[key(edge, unit, other_unit)], families[family]
             if not named or sorted(named) == sorted(
@@ -567,8 +567,8 @@ class _Draft:
     def _folded_names(self, edges: Sequence[Edge]) -> Iterator[Name]:
         for kind, shown in sorted({(edge.kind, edge.name) for edge in edges}):
             real = self._names.get((kind, shown), (shown,))[0]
-            if use := self._names_of.get((kind, real)):
-                yield replace(use, name=shown, namespace=namespace_of(shown))
+            if name := self._names_of.get((kind, real)):
+                yield replace(name, name=shown, namespace=namespace_of(shown))
 
     def _folded_enclaves(self, differing_parts: Set[Edge | str]) -> Iterator[PicturedEnclave]:
         differing = {part if isinstance(part, str) else part.enclave for part in differing_parts}
@@ -619,16 +619,16 @@ class _Draft:
             and self._inside.get(n) != self._inside[usual]
         }
         seen: dict[int, dict[object, Edge | str]] = {n: {} for n in (*near.keys(), *near.values())}
-        for kind, units, symbol in self._seen:
+        for kind, units, part in self._seen:
             for unit in seen.keys() & set(units):
-                seen[unit].setdefault((kind, self._symbols_around(units, unit)), symbol)
+                seen[unit].setdefault((kind, self._symbols_around(units, unit)), part)
         different: list[DifferentUnit] = []
         differing_parts: set[Edge | str] = set()
         for n in sorted(near, key=self._unit_name_order):
-            own_symbols, near_symbols = seen[n], seen[near[n]]
-            if _are_alike(own_symbols, near_symbols):
-                more = [symbol for key, symbol in own_symbols.items() if key not in near_symbols]
-                fewer = [symbol for key, symbol in near_symbols.items() if key not in own_symbols]
+            own_parts, near_parts = seen[n], seen[near[n]]
+            if _are_alike(own_parts, near_parts):
+                more = [part for key, part in own_parts.items() if key not in near_parts]
+                fewer = [part for key, part in near_parts.items() if key not in own_parts]
                 differing_parts.update(more)
                 only = dict.fromkeys(self._in_words(more, n))
                 missing = dict.fromkeys(self._in_words(fewer, n, near[n]))
@@ -654,14 +654,14 @@ class _Draft:
         def word(named: int, position: int) -> str:
             return self._label(unit if named == replaced else named, position)
 
-        enclaves = {drawn_part for drawn_part in drawn if isinstance(drawn_part, str)}
-        for drawn_part in drawn:
-            if isinstance(drawn_part, str):
-                yield f"enclave {self._owner(drawn_part).fill(word)}"
-            elif drawn_part.enclave not in enclaves:
-                deny = "" if drawn_part.qualifier is ALLOW else "DENY "
-                enclave = self._owner(drawn_part.enclave).fill(word)
-                yield f"{enclave} {deny}{drawn_part.right} {self._text(drawn_part.name).fill(word)}"
+        enclaves = {part for part in drawn if isinstance(part, str)}
+        for part in drawn:
+            if isinstance(part, str):
+                yield f"enclave {self._owner(part).fill(word)}"
+            elif part.enclave not in enclaves:
+                deny = "" if part.qualifier is ALLOW else "DENY "
+                enclave = self._owner(part.enclave).fill(word)
+                yield f"{enclave} {deny}{part.right} {self._text(part.name).fill(word)}"
 
 
 def _classes(views: Sequence[Counter[object]], before: Sequence[int]) -> dict[int, list[int]]:

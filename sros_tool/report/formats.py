@@ -508,10 +508,8 @@ def _link_label(picture: Picture, link: Link) -> str:
     if link.differs:
         text += ": not for the equal units"
     if picture.overlay and link.mark is not OverlaySide.BOTH:
-        text_lines = (
-            picture.overlay.first if link.mark is OverlaySide.FIRST else picture.overlay.second
-        )
-        text += f": {text_lines}"
+        side = picture.overlay.first if link.mark is OverlaySide.FIRST else picture.overlay.second
+        text += f": {side}"
     return text
 
 

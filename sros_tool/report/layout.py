@@ -395,9 +395,9 @@ class _Draft:
         notes += self._notes.get(node, ())
         notes += [
             f"{reach} {counted(self._looking[node, right], 'name')}: see {tag}"
-            for (second_id, right), tag in self._tags.items()
+            for (tagged, right), tag in self._tags.items()
             for reach in (_REACHES[right],)
-            if second_id == node and SENDS[right] is sends
+            if tagged == node and SENDS[right] is sends
         ]
         lines = wrapped_name(label, SIDE_LETTERS)
         return Card(
@@ -598,13 +598,11 @@ def linked_cards(cards: Mapping[str, Card], links: Sequence[Link]) -> tuple[Link
     """Return the links with their ends spread along the edges of the cards."""
     ports: dict[tuple[str, bool], list[tuple[float, int]]] = defaultdict(list)
     for number, link in enumerate(links):
-        for source_card, target_card, out in (
+        for near, far, out in (
             (link.source, link.target, True),
             (link.target, link.source, False),
         ):
-            ports[source_card, out].append(
-                (cards[target_card].y + cards[target_card].height / 2, number)
-            )
+            ports[near, out].append((cards[far].y + cards[far].height / 2, number))
     where: dict[tuple[int, bool], int] = {}
     for (card, out), ends in ports.items():
         box = cards[card]

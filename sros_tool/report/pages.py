@@ -248,7 +248,7 @@ def _demo_head(result: Json, made: str) -> str:
     good, skipped = _number_as_expected(rows), sum(row["observed"] == _SKIPPED for row in rows)
     not_tried = sum(len(_untried_attempts(scenario)) for scenario in result["scenarios"])
     opened = sum(bool(row.get("open_because")) and not row.get("open_here") for row in rows)
-    tried_here = sum(bool(row.get("open_here")) for row in rows)
+    open_here = sum(bool(row.get("open_here")) for row in rows)
     where = (
         "in a separate network namespace"
         if result["own_network"]
@@ -268,7 +268,7 @@ def _demo_head(result: Json, made: str) -> str:
         ),
         ("", str(sum(bool(row.get("defence_removed")) for row in rows)), "with a defence removed"),
         ("warning" if opened else "", str(opened), "known to be open"),
-        ("error", str(tried_here), "open in this keystore"),
+        ("error", str(open_here), "open in this keystore"),
         ("", str(skipped), "skipped"),
         ("", str(result.get("left_out", 0)), "left out"),
         ("error", str(not_tried), "not tried, but needed for a proof"),

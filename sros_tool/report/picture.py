@@ -403,10 +403,8 @@ class Requirements(NamedTuple):
             return (holds,)
         number = len(self.violations)
         more = (f"{number - _SAID} more do not hold",) if number > _SAID else ()
-        violation_sentences = (
-            f"Violated: {violation.text}" for violation in self.violations[:_SAID]
-        )
-        return (*violation_sentences, *more, *((holds,) if self.hold else ()))
+        violated = (f"Violated: {violation.text}" for violation in self.violations[:_SAID])
+        return (*violated, *more, *((holds,) if self.hold else ()))
 
 
 class EqualUnits(NamedTuple):
@@ -650,15 +648,13 @@ def joined_by_senders(bundles: Iterable[Bundle]) -> tuple[Bundle, ...]:
 
     Denials and differences stay separate, because users look for them.
     """
-    similar_bundles: dict[tuple[object, ...], list[Bundle]] = defaultdict(list)
+    by_senders: dict[tuple[object, ...], list[Bundle]] = defaultdict(list)
     for bundle in bundles:
         plain = all(map(is_plain, bundle.ties))
         senders = frozenset((tie.node, tie.right) for tie in bundle.ties if tie.sends)
-        ties_if_separate = None if plain and senders else bundle.ties
-        similar_bundles[
-            bundle.kind, bundle.protection, senders, ties_if_separate, bundle.lacks
-        ].append(bundle)
-    return tuple(_joined_bundles(bundles) for bundles in similar_bundles.values())
+        apart = None if plain and senders else bundle.ties
+        by_senders[bundle.kind, bundle.protection, senders, apart, bundle.lacks].append(bundle)
+    return tuple(_joined_bundles(bundles) for bundles in by_senders.values())
 
 
 def _joined_bundles(bundles: Sequence[Bundle]) -> Bundle:

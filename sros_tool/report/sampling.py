@@ -100,11 +100,11 @@ def sample_of(
         equal[number, frozenset(named[n])].append(n)
     unread, left_out = [], set()
     for first, *further in equal.values():
-        if further_named := [n for n in further[:-1] if units[n].name not in wanted_names]:
-            members = tuple(units[n].name for n in further_named)
-            number = sum(len(enclaves[n]) for n in further_named)
+        if unread_units := [n for n in further[:-1] if units[n].name not in wanted_names]:
+            members = tuple(units[n].name for n in unread_units)
+            number = sum(len(enclaves[n]) for n in unread_units)
             unread.append(UnreadUnits(units[first].what, members, number, units[first].name))
-            left_out |= {*further_named}
+            left_out |= {*unread_units}
     chosen = tuple(path for path in paths if names.of.get(path) not in left_out)
     return SampledKeystore(keystore, chosen, tuple(unread), names, frozenset(left_out))
 
@@ -142,7 +142,7 @@ def _digest_of(
     ]
     if len(hidden) < len(enclaves):
         return ""
-    return hashlib.sha256(b"".join(sorted(digest.digest() for digest in hidden))).hexdigest()
+    return hashlib.sha256(b"".join(sorted(masked.digest() for masked in hidden))).hexdigest()
 
 
 def _without_unit_names(text: str, unit: DrawnUnit, names: UnitNames) -> str:

@@ -673,9 +673,7 @@ def _attach_to_known_enclave(finding: PicturedFinding, known: Set[str]) -> Pictu
 
 
 def _without_paths(finding: PicturedFinding, places: Mapping[str, str]) -> PicturedFinding:
-    text, remedy = (
-        _without_path(text_with_paths, places) for text_with_paths in (finding.text, finding.remedy)
-    )
+    text, remedy = (_without_path(text, places) for text in (finding.text, finding.remedy))
     return replace(finding, text=text, remedy=remedy)
 
 

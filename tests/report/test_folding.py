@@ -139,10 +139,13 @@ def test_robots_that_name_each_other_are_equal_by_how_many(tmp_path: Path) -> No
 
 def test_equal_units_may_name_one_of_another_kind(tmp_path: Path) -> None:
     others = {f"/e{n}/follower": group("topics", "subscribe", "/r2/odom") for n in range(1, 4)}
+    others |= {f"/s{n}/arm": group("topics", "publish", f"/s{n}/pose") for n in range(1, 9)}
+    others |= {f"/v{n}/viewer": group("topics", "subscribe", "/s2/pose") for n in range(1, 4)}
     folding = Folding.of(picture_of(tmp_path, fleet(others)))
     label = "/{1 of r1…r12}/odom"
     assert ("/{e1…e3}/follower", "subscribe", label) in drawn(folding)
     assert "/r2/odom" in folding.names["topics", label]
+    assert ("/{v1…v3}/viewer", "subscribe", "/{1 of s1…s8}/pose") in drawn(folding)
 
 
 def test_robots_of_a_fleet_whose_namespaces_have_other_names(tmp_path: Path) -> None:

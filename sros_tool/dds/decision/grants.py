@@ -53,16 +53,14 @@ def other_fitting_enclaves(
             having.setdefault(part, set()).add(name)
     fitting_others = {}
     for name, subject in certified.items():
-        subject_of_enclave = certified_text(traits, subject)
-        several = [
-            having.get(plain(part), set()) for part in _SEPARATORS.split(subject_of_enclave) if part
-        ]
+        text = certified_text(traits, subject)
+        several = [having.get(plain(part), set()) for part in _SEPARATORS.split(text) if part]
         fitting = set.intersection(*sorted(several, key=len)) if several else set()
         other_holders = tuple(
             holder
             for holder in sorted(fitting - {name})
             if any(
-                same_subject(traits.subjects, granted_subject.strip(), subject_of_enclave)
+                same_subject(traits.subjects, granted_subject.strip(), text)
                 for granted_subject in granted[holder]
             )
         )
@@ -75,10 +73,8 @@ def certified_text(traits: VendorTraits, subject: str) -> str:
     """Return the subject of a certificate as the vendor compares it."""
     if traits.escapes_subjects:
         return "".join(
-            character
-            if character.isascii()
-            else "".join(f"\\{octet:02X}" for octet in character.encode())
-            for character in subject
+            letter if letter.isascii() else "".join(f"\\{octet:02X}" for octet in letter.encode())
+            for letter in subject
         )
     if traits.longest_subject is None:
         return subject

@@ -402,9 +402,7 @@ CYCLONE_DDS = _releases("Cyclone DDS")
 
 WHOLE_PRODUCTS = {
     f"all-{vendor.value}": tuple(
-        tested_vendor
-        for tested_vendor in TESTED
-        if tested_vendor.traits.product == vendor.traits.product
+        release for release in TESTED if release.traits.product == vendor.traits.product
     )
     for vendor in PRINCIPAL
 }
