@@ -842,12 +842,8 @@ def _vendors(vendor: str, distribution: str) -> tuple[str, ...]:
     return selected_vendors(vendor, named if vendor != ZENOH else ())
 
 
-def _policy(policy_or_path: AnyPath | Policy) -> Policy:
-    return (
-        read_policy(policy_or_path)
-        if isinstance(policy_or_path, str | PathLike)
-        else policy_or_path
-    )
+def _policy(source: AnyPath | Policy) -> Policy:
+    return read_policy(source) if isinstance(source, str | PathLike) else source
 
 
 def _keyring(

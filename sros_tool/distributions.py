@@ -183,19 +183,11 @@ def selected_vendors(vendor: str, distributions: Sequence[Distribution]) -> tupl
     Raises:
         UsageError: a distribution does not ship the vendor.
     """
-    if not vendor or not distributions:
-        chosen = [
-            vendor_of_distribution
-            for known in distributions
-            for vendor_of_distribution in known.vendors
-        ]
-        return (
-            (vendor,)
-            if vendor
-            else tuple(
-                dict.fromkeys(vendor_of_distribution.value for vendor_of_distribution in chosen)
-            )
-        )
+    if not vendor:
+        every = (dds.value for known in distributions for dds in known.vendors)
+        return tuple(dict.fromkeys(every))
+    if not distributions:
+        return (vendor,)
     shipped = (known.shipped_vendor_product(Vendor(vendor)).vendor.value for known in distributions)
     return tuple(dict.fromkeys(shipped))
 

@@ -280,14 +280,14 @@ def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
     publish = _all_topics(rule.publish)
     subscribe = _all_topics(rule.subscribe)
     rights: list[RosRight] = []
-    for kind, right, candidate_names in _candidates(publish, subscribe):
-        names = dds_names(right, candidate_names)
+    for kind, right, name in _candidates(publish, subscribe):
+        names = dds_names(right, name)
         if all(map(publish.get, names.publish)) and all(map(subscribe.get, names.subscribe)):
             continue  # all topics already belong to an action
         if all(map(publish.__contains__, names.publish)) and all(
             map(subscribe.__contains__, names.subscribe)
         ):
-            rights.append(RosRight(qualifier, right, kind, candidate_names))
+            rights.append(RosRight(qualifier, right, kind, name))
             if kind != "topics":
                 for topic in names.publish:
                     publish[topic] = True

@@ -395,10 +395,8 @@ def _present_key(folder: Folder, name: str, files: Mapping[str, bytes]) -> Publi
     if KEY_URI_FILE in files or folder.state(f"{place}/{KEY_URI_FILE}"):
         if (data := _content(folder, f"{place}/{REQUEST}")) is not None:
             return load_request(data, f"of enclave {name}").public_key
-        certificate_data = _content(folder, f"{place}/{CERTIFICATE_FILE}") or files.get(
-            CERTIFICATE_FILE, b""
-        )
-        return load_certificates(certificate_data, CERTIFICATE_FILE)[0].public_key()  # type: ignore[return-value]
+        pem = _content(folder, f"{place}/{CERTIFICATE_FILE}") or files.get(CERTIFICATE_FILE, b"")
+        return load_certificates(pem, CERTIFICATE_FILE)[0].public_key()  # type: ignore[return-value]
     raise KeystoreError(
         f"the key of enclave {name} {KEY_NOT_HERE}",
         "",
@@ -447,13 +445,11 @@ def _list_alone(folder: Folder, name: str, files: Mapping[str, bytes], now: date
     with suppress(SrosError, OSError):
         _check_place(folder, place)
         authorities = files.get(IDENTITY_CA_FILE, b"")
-        same_authorities = _content(folder, f"{place}/{IDENTITY_CA_FILE}") == authorities
+        same_cas = _content(folder, f"{place}/{IDENTITY_CA_FILE}") == authorities
         path, sent = f"{place}/{CRL_FILE}", files.get(CRL_FILE, b"")
         newest = newest_list(sent, authorities)
         expiry = next_update(newest) if newest else None
-        fits = (
-            same_authorities and _had_certificate(folder, name) and _content(folder, path) != sent
-        )
+        fits = same_cas and _had_certificate(folder, name) and _content(folder, path) != sent
         valid = newest and last_update(newest) <= now and (expiry is None or now < expiry)
         if fits and valid:
             change.write[path] = sent
@@ -531,11 +527,9 @@ def _commit_lists(folder: Path, changes: Iterable[_Change]) -> None:
     """Write the new revocation lists of enclaves whose identity CAs stay, if there is room."""
     lists = []
     for change in changes:
-        crl_files = {
-            path: data for path, data in change.write.items() if path.endswith(f"/{CRL_FILE}")
-        }
-        if crl_files and not any(path.endswith(f"/{IDENTITY_CA_FILE}") for path in change.write):
-            lists.append(_Change(write=crl_files))
+        crls = {path: data for path, data in change.write.items() if path.endswith(f"/{CRL_FILE}")}
+        if crls and not any(path.endswith(f"/{IDENTITY_CA_FILE}") for path in change.write):
+            lists.append(_Change(write=crls))
     with suppress(SrosError, OSError):
         if lists:
             _commit(folder, lists)

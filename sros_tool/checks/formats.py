@@ -149,16 +149,15 @@ def findings_markdown(chosen_findings: ChosenFindings, fleet: Fleet | None = Non
     """
     shown_by = "which `sros check` shows"
     groups = folded_findings(group_by_cause(chosen_findings.shown), fleet)
-    listed = bounded_list(
-        (_markdown_item(group, other_robots) for group, other_robots in groups), _MOST, shown_by
-    )
+    items = (_markdown_item(group, others) for group, others in groups)
+    listed = bounded_list(items, _MOST, shown_by)
     title = f"### Findings: {plain(chosen_findings.summary())}"
     return "\n\n".join(part for part in (title, listed) if part) + "\n"
 
 
-def _markdown_item(findings: Sequence[Finding], other_robots: str) -> str:
+def _markdown_item(findings: Sequence[Finding], others: str) -> str:
     lines = _finding_lines(findings[0]) if len(findings) == 1 else _cause_lines(findings)
-    return "<br>".join((*lines, *([code(other_robots)] if other_robots else [])))
+    return "<br>".join((*lines, *([code(others)] if others else [])))
 
 
 def _cause_lines(findings: Sequence[Finding]) -> Iterator[str]:

@@ -1030,9 +1030,9 @@ def _check_rules(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
 def _statement_findings(statement: _Statement, rules: Rules) -> Iterator[Finding]:
     denial = statement.right._replace(qualifier=DENY)
     if denials := rules.covering_rights(denial):
-        denies_all = set(parts(denial)) == set(denials)
+        is_same_right = set(parts(denial)) == set(denials)
         shown = ", ".join(sorted({f"{by.right} {by.name}" for by in denials}))
-        if denies_all:
+        if is_same_right:
             text = f"{statement.right.describe()} is allowed here and denied in the same enclave"
             yield statement.found(CONTRADICTION, text)
         else:
@@ -1270,11 +1270,7 @@ def _robots_in_unknown_groups(named: Collection[str], fleet: Fleet) -> str:
         for group in sorted({*robot.groups} - groups):
             close = get_close_matches(group, groups) if len(fleet.groups[group]) < 2 else []
             letters = _NUMBER.sub("", group)
-            if meant := sorted(
-                similar_group
-                for similar_group in close
-                if _NUMBER.sub("", similar_group) != letters
-            ):
+            if meant := sorted(name for name in close if _NUMBER.sub("", name) != letters):
                 clauses.append(f"{robot.name} (group {group}: perhaps {first_few(meant, 2)})")
         if not (robot.groups or for_all):
             clauses.append(f"{robot.name} (in no group)")
@@ -1305,8 +1301,8 @@ def _robots_on_one_domain(
     """
     seen = {robot.domain: robot for robot in other_robots or ()}
     for robot in robots:
-        enclaves = (seen.get(robot.domain), seen.get(None))
-        for other_robot in seen.values() if robot.domain is None else enclaves:
+        candidates = (seen.get(robot.domain), seen.get(None))
+        for other_robot in seen.values() if robot.domain is None else candidates:
             if other_robot:
                 return other_robot, robot
         if other_robots is None:

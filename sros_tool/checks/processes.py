@@ -185,10 +185,12 @@ def _file_findings(process: Process, *, now: datetime, zone: tzinfo) -> Iterator
         text = f"it started at {iso(process.started)}; {', '.join(newer)} of {name} changed later"
         yield PROCESS_OUTDATED.found(process.label, text)
     ends = {
-        file: window.not_after for file, window in loaded.windows.items() if window.not_after < now
+        document: window.not_after
+        for document, window in loaded.windows.items()
+        if window.not_after < now
     }
     if ends:
-        expired = ", ".join(f"{file} at {iso(end)}" for file, end in ends.items())
+        expired = ", ".join(f"{document} at {iso(end)}" for document, end in ends.items())
         remedy = _NEW_AUTHORITY if ends.keys() & set(_AUTHORITIES.values()) else ""
         yield PROCESS_EXPIRED.found(process.label, f"of {name} expired: {expired}", remedy=remedy)
     yield from _local_time_findings(process, loaded, now, zone)
@@ -212,11 +214,7 @@ def newer_files(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
         files = tuple(file for file in files if file.name in _LOADED_BY_ZENOH)
         files += (process.configuration,) if process.configuration else ()
     newer = [e.name for e in files if e.changed and e.changed > process.started]
-    gone = [
-        missing_file
-        for missing_file in enclave.lacking
-        if any(missing_file == file.name for file in files)
-    ]
+    gone = [name for name in enclave.lacking if any(name == file.name for file in files)]
     yield from (_plain_path(file) for file in newer)
     yield from (f"{file} (removed)" for file in gone)
     if not newer and not gone:
@@ -289,9 +287,9 @@ def _last_entry(entries: Sequence[Entry], kind: str) -> Entry | None:
     return next((entry for entry in reversed(entries) if entry.what == kind), None)
 
 
-def _recorded_window(kind: str, entry: Entry) -> Mapping[str, Window]:
+def _recorded_window(description: str, entry: Entry) -> Mapping[str, Window]:
     with suppress(SrosError, ValueError):
-        return {kind: Window(parse_iso(entry.not_before), parse_iso(entry.not_after))}
+        return {description: Window(parse_iso(entry.not_before), parse_iso(entry.not_after))}
     return {}
 
 
@@ -884,12 +882,8 @@ def other_folder_findings(processes: Iterable[Process], folder: Path) -> Iterato
     """Yield a finding for each process that runs in an enclave of ``folder`` from another one."""
     for process in processes:
         assert process.enclave
-        process_folder = _plain_path(process.enclave.keystore)
-        other = (
-            f"'{process_folder}' of its own file system"
-            if process_folder == str(folder)
-            else f"'{process_folder}'"
-        )
+        root = _plain_path(process.enclave.keystore)
+        other = f"'{root}' of its own file system" if root == str(folder) else f"'{root}'"
         name = plain(f"/{process.enclave.name.strip('/')}", _LONGEST_PATH)
         text = f"{name} from {other}, not from '{folder}'"
         yield PROCESS_OTHER_FOLDER.found(process.label, text)
@@ -969,15 +963,11 @@ def _unseen_process_findings(running: RunningProcesses) -> Iterator[Finding]:
         if process.speaks:
             text = f"it speaks ROS 2, and cannot be looked at: {process.why}"
             yield PROCESS_NOT_SEEN.found(process.label, text, remedy=remedy)
-    silent_processes = [process for process in running.unseen if not process.speaks]
+    doubtful = [process for process in running.unseen if not process.speaks]
     reasons = [running.hidden] if running.hidden else []
-    if silent_processes:
-        why = ", ".join(sorted({process.why for process in silent_processes})[:3])
-        count = (
-            f"{len(silent_processes)} processes"
-            if len(silent_processes) > 1
-            else silent_processes[0].label
-        )
+    if doubtful:
+        why = ", ".join(sorted({process.why for process in doubtful})[:3])
+        count = f"{len(doubtful)} processes" if len(doubtful) > 1 else doubtful[0].label
         reasons.append(f"{count} that may or may not be nodes ({why})")
     if running.container:
         text = f"{len(running.processes)} of them speak ROS 2"

@@ -88,8 +88,7 @@ VULNERABILITIES = FindingKind(
     "runtime` looks at the libraries that processes have loaded.",
     "Advisories in the OSV format: those of sros, and of --advisories FILE.",
     "Take new vulnerabilities into account before the update. Against vulnerabilities that no "
-    "release fixes, keep "
-    "strangers out of the network.",
+    "release fixes, keep strangers out of the network.",
     prominent=True,
 )
 NOT_MEASURED = FindingKind(

@@ -147,7 +147,7 @@ def _library_findings(
 ) -> Iterator[Finding]:
     """Yield one finding for each library; ``users`` maps it to clauses on where it is used."""
     used = shipped_advisories() if advisories is None else advisories
-    clause_by_text: dict[str, str] = {}
+    place_by_text: dict[str, str] = {}
     for library, clauses in users.items():
         if not any(advisory.product == library.product for advisory in used):
             continue
@@ -165,7 +165,7 @@ def _library_findings(
             described = _counted_vulnerabilities(known.known, library.version)
             if known.unclear:
                 described += f". {_unclear(known.unclear)}"
-            if (first := clause_by_text.setdefault(f"{name}: {described}", place)) != place:
+            if (first := place_by_text.setdefault(f"{name}: {described}", place)) != place:
                 described = f"with the same vulnerabilities as {first}"
             text = f"{place}{by}, {described}"
             yield kind.found(name, text, remedy=_remedy(kind, library))

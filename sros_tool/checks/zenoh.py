@@ -432,13 +432,11 @@ def _denial_findings(document: ConfigurationDocument) -> Iterator[Finding]:
         if not denials:
             continue
         limit.spend(_COMPARISON * len(access.subjects))
-        other_subjects = [
-            other_subject for other_subject in access.subjects if other_subject.overlaps(subject)
-        ]
+        overlapping = [other for other in access.subjects if other.overlaps(subject)]
         for rule in denials:
             for kind, text in (
                 (DENY_IN_WILDCARD, _wildcard_that_circumvents(rule, subject, access, limit)),
-                (DENY_OVERRULED, _overruling_subject(rule, other_subjects, access, limit)),
+                (DENY_OVERRULED, _overruling_subject(rule, overlapping, access, limit)),
             ):
                 if text and (kind.id, rule.id) not in reported:
                     reported.add((kind.id, rule.id))
@@ -453,15 +451,15 @@ def _wildcard_that_circumvents(
     for flow, message in product(rule.flows, rule.messages):
         if message not in _WITH_WILDCARDS:
             continue
-        equal_rules = _rules_for(rules, flow, message)
-        denied = _keys(equal_rules, allows=False)
+        applying = _rules_for(rules, flow, message)
+        denied = _keys(applying, allows=False)
         for key in rule.key_expressions:
             if access.allows_by_default:
                 passing = [(widest_expression(key), "the default")]
             else:
                 passing = [
                     (wide, f"rule {allowing.id}")
-                    for allowing in equal_rules
+                    for allowing in applying
                     if allowing.allows
                     for wide in allowing.key_expressions
                     if _values_intersect(wide, key, limit)

@@ -116,13 +116,13 @@ def print_plan(root: Path, changes: Sequence[Change]) -> None:
     """
     import logging
 
-    every_enclave = logging.getLogger("sros_tool").isEnabledFor(logging.INFO)
+    is_verbose = logging.getLogger("sros_tool").isEnabledFor(logging.INFO)
     plan: dict[str, list[str]] = {}
     for change in changes:
         plan.setdefault(change.action, []).append(change.path)
     for action, paths in plan.items():
-        shown = paths if every_enclave else list(_change_lines(root, paths))
-        if len(shown) > MAX_NAMES and not every_enclave:
+        shown = paths if is_verbose else list(_change_lines(root, paths))
+        if len(shown) > MAX_NAMES and not is_verbose:
             places = [str(root / path) for path in paths]
             shown_files = first_few(places, _NAMES_SHOWN)
             echo(f"would {action} {counted(len(paths), 'file')}: {shown_files} (-v lists all)")

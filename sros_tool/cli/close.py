@@ -55,8 +55,7 @@ def _run(words: Sequence[str], shows_output: bool) -> tuple[int, str, str]:
     "duration",
     metavar="DURATION",
     help="Watch the robot for DURATION, such as 5m, even if it was watched before. [default: "
-    "until the ROS "
-    "graph stops changing]",
+    "until the ROS graph stops changing]",
 )
 @click.option(
     "--domain", "domain_text", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or 0]"
@@ -236,12 +235,9 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
 
 def _nodes(policy: Policy, enclave: str) -> str:
     """Return a clause on the nodes of an enclave, if it has several; "" otherwise."""
-    policy_enclave = policy.enclave(enclave)
-    nodes = (
-        [f"{node.ns.rstrip('/')}/{node.node}" for node in policy_enclave.all_profiles()]
-        if policy_enclave
-        else []
-    )
+    stated = policy.enclave(enclave)
+    profiles = stated.all_profiles() if stated else ()
+    nodes = [f"{profile.ns.rstrip('/')}/{profile.node}" for profile in profiles]
     return f", for the nodes {enumerated(sorted(nodes))}" if len(nodes) > 1 else ""
 
 

@@ -751,10 +751,8 @@ def keyring(
     """
     from sros_tool.keystore.issuing.keyring import Keyring, absolute_place
 
-    keys_by_role = {"identity": identity, "permissions": permissions}
-    places = {
-        role: keys_by_role[role] or os.environ.get(name, "") for role, name in _KEY_PLACES.items()
-    }
+    named = {"identity": identity, "permissions": permissions}
+    places = {role: named[role] or os.environ.get(name, "") for role, name in _KEY_PLACES.items()}
     return Keyring(
         _Secrets(encrypt),
         {role: absolute_place(place) for role, place in places.items() if place},
@@ -965,10 +963,10 @@ def echo_folded(groups: Iterable[tuple[Finding, ...]], fleet: Fleet | None = Non
     """Print findings; those that differ only in one robot or one enclave are printed once."""
     from sros_tool.checks.formats import folded_findings
 
-    for group, other_robots in folded_findings(groups, fleet):
+    for group, others in folded_findings(groups, fleet):
         echo_findings(group)
-        if other_robots:
-            echo(f"    {other_robots}")
+        if others:
+            echo(f"    {others}")
 
 
 def finding_lines(finding: Finding) -> list[str]:

@@ -692,20 +692,9 @@ def _table_lines(compared: Comparison) -> Iterator[str]:
         (answer.vendor.title, "", answer, " (as documented)" if answer.as_documented else "")
         for answer in compared.vendors or ()
     ]
-    for explanation in compared.distributions or ():
-        remark = (
-            ""
-            if explanation.measured
-            else f" (assumed to decide as {explanation.decided_as.title})"
-        )
-        rows.append(
-            (
-                explanation.shipped.distribution.title,
-                f"  {explanation.release}",
-                explanation.answer,
-                remark,
-            )
-        )
+    for reply in compared.distributions or ():
+        remark = "" if reply.measured else f" (assumed to decide as {reply.decided_as.title})"
+        rows.append((reply.shipped.distribution.title, f"  {reply.release}", reply.answer, remark))
     widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
     for name, release, answer, remark in rows:
         row = f"{name:{widths[0]}}{release:{widths[1]}}"
@@ -1043,11 +1032,11 @@ def _followed_lines(followed: FollowedReach) -> Iterator[str]:
 
     reach = followed.reach
     where = "" if followed.domain is None else f" in domain {followed.domain}"
-    for title, paths in (
+    for clause, paths in (
         ("can influence", reach.influences),
         ("can learn from", reach.learns_from),
     ):
-        yield f"{reach.enclave} {title} {counted(len(paths), 'enclave')}{where}"
+        yield f"{reach.enclave} {clause} {counted(len(paths), 'enclave')}{where}"
         in_order = sorted(paths.items(), key=lambda item: (len(item[1]), item[0]))
         lines = ((name, f"  {path_text(path)}") for name, path in in_order)
         yield from folded(followed.fleet, lines)
@@ -1078,9 +1067,9 @@ def _show_log(
     print_notes(explained.notes)
     if not explained.findings:
         lines = text.count("\n") + (not text.endswith("\n")) if text else 0
-        expected_line = "looks like a message of DDS Security, or of a denial by Zenoh"
+        clause = "looks like a message of DDS Security, or of a denial by Zenoh"
         echo(
-            f"none of {counted(lines, 'line')} {expected_line}: {_text_without_findings(text)}"
+            f"none of {counted(lines, 'line')} {clause}: {_text_without_findings(text)}"
             if lines
             else "the log is empty: it says nothing about its node. `sros check runtime` on that "
             "machine says how its processes run",
@@ -1095,15 +1084,14 @@ def _text_without_findings(log: str) -> str:
     """Return what a log without a message of security shows, and what to do next."""
     from sros_tool.runtime.vendor_log import SECURITY_DIRECTORY
 
-    directory_match = SECURITY_DIRECTORY.search(log)
-    if directory_match is None:
+    match = SECURITY_DIRECTORY.search(log)
+    if match is None:
         return (
             "no line says 'Found security directory': on DDS, its nodes ran open, or it is not the "
             "whole log. `sros check runtime` on that machine says how its processes run"
         )
     return (
-        f"a node ran in '{directory_match['folder']}'. Where its peers refuse it, "
-        "it often logs nothing: "
+        f"a node ran in '{match['folder']}'. Where its peers refuse it, it often logs nothing: "
         "explain the log of the other node, too. Both logs can be empty if the CAs, a revocation "
         "list, the governance or the domains of both ends do not fit: `sros check FOLDER OTHER` "
         "finds this in their keystores or exports. Both can also be empty if a clock is wrong: "

@@ -342,14 +342,14 @@ def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
         line += _outcome_numbers(asked, REQUEST_OUTCOMES, would)
     yield line
     by_outcome = sorted(collected.robots, key=lambda robot: MESSAGE_OUTCOMES.index(robot.outcome))
-    texts_by_outcome: dict[str, dict[str, str]] = {}
+    similar_texts: dict[str, dict[str, str]] = {}
     for robot in by_outcome:
         why = (f"{robot.outcome}: {robot.why}",) if robot.why else ()
         for text in (*why, *robot.remarks):
             unnamed = _without_robot_name(text, robot.robot)
-            texts_by_outcome.setdefault(_DURATION.sub("", unnamed), {})[robot.robot] = unnamed
+            similar_texts.setdefault(_DURATION.sub("", unnamed), {})[robot.robot] = unnamed
     names = [robot.robot for robot in collected.robots]
-    for texts in texts_by_outcome.values():
+    for texts in similar_texts.values():
         yield f"{_robot_names(texts, names)}: {_joined_durations(texts)}"
     for name, request in sorted(
         requests, key=lambda request: REQUEST_OUTCOMES.index(request[1].outcome)

@@ -327,10 +327,10 @@ def _created_lines(result: Creation) -> Iterator[str]:
         if not (rights.lost_text() or rights.gained_text())
     }
     signed_again = [name for name in result.changed if name in unchanged]
-    new_names = [name for name in result.changed if name not in unchanged]
+    replaced = [name for name in result.changed if name not in unchanged]
     for names, text in (
         (result.created, "created enclave {}"),
-        (new_names, "replaced the permissions of enclave {}"),
+        (replaced, "replaced the permissions of enclave {}"),
         (signed_again, "signed the permissions of enclave {} again, with the same rights"),
         (result.completed, "completed enclave {}"),
     ):

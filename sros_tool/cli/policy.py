@@ -205,8 +205,8 @@ def _print_added(merged: Merged) -> None:
     else:
         for right in rights_shown:
             echo(f"  {right}", err=True)
-    if rights_of_every_node := count - len(rights_shown):
-        echo(f"  and {counted(rights_of_every_node, 'right')} that every node needs", err=True)
+    if left_out := count - len(rights_shown):
+        echo(f"  and {counted(left_out, 'right')} that every node needs", err=True)
 
 
 def _check_includes(policy: Path, output: Path, document: bytes) -> None:
@@ -386,14 +386,8 @@ def enclave_lines(difference: SourcesDifference, fleet: Fleet | None) -> list[st
     from sros_tool.fleet.robots import folded
 
     sides = [
-        [
-            (enclave_domains.enclave, f"- {enclave_domains.enclave} in domain {enclave_domains.a}")
-            for enclave_domains in difference.domains
-        ],
-        [
-            (enclave_domains.enclave, f"+ {enclave_domains.enclave} in domain {enclave_domains.b}")
-            for enclave_domains in difference.domains
-        ],
+        [(pair.enclave, f"- {pair.enclave} in domain {pair.a}") for pair in difference.domains],
+        [(pair.enclave, f"+ {pair.enclave} in domain {pair.b}") for pair in difference.domains],
     ]
     sides += [
         [

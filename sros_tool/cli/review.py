@@ -396,12 +396,12 @@ def _sentence(result: Review, step: ReviewStep) -> str:
 
 def _sentences(result: Review, steps: Sequence[ReviewStep]) -> Iterator[tuple[ReviewStep, str]]:
     """Yield each step with its result as a clause, which repeats no error of an earlier step."""
-    sentence_begin = ""
+    earlier = ""
     for step in steps:
         sentence = _sentence(result, step)
-        if isinstance(step.content, SrosError) and sentence in sentence_begin:
+        if isinstance(step.content, SrosError) and sentence in earlier:
             sentence = "could not be decided, for the same reason"
-        sentence_begin += "\n".join((sentence, *map(result.with_shown_paths, _lines_to_read(step))))
+        earlier += "\n".join((sentence, *map(result.with_shown_paths, _lines_to_read(step))))
         yield step, sentence
 
 
@@ -445,8 +445,8 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
         ):
             singly = ((finding,) for finding in chosen.shown)
             return [
-                f"{_finding_line(finding)}{other_robots and f' ({other_robots})'}"
-                for (finding, *_), other_robots in folded_findings(singly, step.fleet)
+                f"{_finding_line(finding)}{others and f' ({others})'}"
+                for (finding, *_), others in folded_findings(singly, step.fleet)
             ]
     return []
 

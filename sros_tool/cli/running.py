@@ -356,10 +356,10 @@ def run(
             "",
             "Name its path, or set up its environment first (ROS: `. /opt/ros/jazzy/setup.sh`).",
         )
-    command_words = tuple(command)
+    words = tuple(command)
     if not no_ros_args:
-        command = list(with_enclave(command_words, name))
-    if (added := " ".join(command[len(command_words) :])) and not policy:
+        command = list(with_enclave(words, name))
+    if (added := " ".join(command[len(words) :])) and not policy:
         echo(
             f"added {added}, so that the ROS graph shows the enclave (--no-ros-args: do not)",
             err=True,
@@ -371,10 +371,7 @@ def run(
     elif secured.needs_pin and pin is not None:
         environment[_FAST_DDS_PIN] = pin
     print_notes(
-        [
-            *secured.notes,
-            *(() if policy else other_node_notes(root, name, command_words, now=now())),
-        ]
+        [*secured.notes, *(() if policy else other_node_notes(root, name, words, now=now()))]
     )
     names_it = enclave_argument(command) == name or _is_demo(command)
     if not names_it:

@@ -369,26 +369,21 @@ def _configuration_lines(
         obeys = ", by rules that bind only itself" if rights.self_limiting else ""
         yield f"{_subject_text(rights)}{obeys}"
         for right in VERBS:
-            stated = [stated_right for stated_right in rights.rights if stated_right.right == right]
-            for stated_right in stated:
-                domain = "" if stated_right.domain == "0" else f" (domain {stated_right.domain})"
-                lacks = (
-                    f" (of no use without {', '.join(stated_right.lacks)})"
-                    if stated_right.lacks
-                    else ""
-                )
-                yield f"  may {VERBS[right]} {stated_right.name}{domain}{lacks}"
+            for stated in (stated for stated in rights.rights if stated.right == right):
+                domain = "" if stated.domain == "0" else f" (domain {stated.domain})"
+                lacks = f" (of no use without {', '.join(stated.lacks)})" if stated.lacks else ""
+                yield f"  may {VERBS[right]} {stated.name}{domain}{lacks}"
         yield from _key_lines("may also", rights.unsaid)
         yield from _key_lines("is denied, if no wildcard is used,", rights.denied)
 
 
-def _key_lines(kind: str, pairs: Sequence[tuple[str, str]]) -> Iterator[str]:
+def _key_lines(clause: str, pairs: Sequence[tuple[str, str]]) -> Iterator[str]:
     from sros_tool.checks.zenoh import VERBS
 
     for right, word in VERBS.items():
         keys = [key for of, key in pairs if of == right]
         if keys:
-            yield f"  {kind} {word} the keys {first_few(keys, _MOST_KEYS)}"
+            yield f"  {clause} {word} the keys {first_few(keys, _MOST_KEYS)}"
 
 
 def _kind(document: ConfigurationDocument) -> str:

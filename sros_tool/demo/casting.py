@@ -250,9 +250,7 @@ class _Enclaves(NamedTuple):
 
     def rows(self) -> Iterator[Row]:
         """Yield a row for each enclave with faulty or revoked files, up to `_MOST_FAULTY`."""
-        rows = [
-            revoked_enclave_row(name, has_own_list) for name, has_own_list in self.revoked.items()
-        ]
+        rows = [revoked_enclave_row(name, by_own) for name, by_own in self.revoked.items()]
         rows += [faulty_enclave_row(name, why) for name, why in self.faulty.items()]
         yield from rows[:_MOST_FAULTY]
 
@@ -292,13 +290,13 @@ def _read_enclaves(keystore: OpenedKeystore, now: datetime, domain: int) -> _Enc
     for name in keystore.names:
         state = keystore.enclave(name, now=now, domain=domain)
         faults = [problem for problem in state.problems if problem.fault is not Fault.REVOKED]
-        has_own_fault = len(faults) < len(state.problems)
+        by_own_list = len(faults) < len(state.problems)
         if any(fault.fault in (Fault.FILE_UNREADABLE, Fault.FILE_NO_FILE) for fault in faults):
             unreadable.append(name)
         elif KEY_FILE not in state.files and (state.key_on_robot or state.token):
             elsewhere.append(name)
-        elif has_own_fault or (state.certificate and state.certificate.serial_number in serials):
-            revoked[name] = has_own_fault
+        elif by_own_list or (state.certificate and state.certificate.serial_number in serials):
+            revoked[name] = by_own_list
         elif faults and all(fault.fault is Fault.PERMISSIONS_DOMAIN for fault in faults):
             other_domain.append(name)
         elif reason := str(faults[0]) if faults else _strange_authority(keystore, state):
@@ -474,7 +472,7 @@ def _widest_enclaves(
             if not _allows_name(grant, right, name, named=True)
             or _allows_name(grant, right, DENIED_TOPIC)
         ]
-        tried = {cast[part] for part in competing_parts if part in cast}
+        tried = {cast[other] for other in competing_parts if other in cast}
         width = {enclave: _width(rights[enclave], right, name) for enclave in unnamed}
         free = [enclave for enclave in unnamed if enclave not in tried]
         if not free:

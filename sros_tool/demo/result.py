@@ -813,9 +813,9 @@ def _summary(result: DemoResult) -> str:
 def _left_out_clauses(result: DemoResult) -> Iterator[str]:
     """Yield clauses on rows and enclaves that were not tried."""
     skipped = [row for row in result.rows if row.observed is RowStatus.SKIPPED]
-    if skipped_rows := sum(1 for row in skipped if row.applies):
-        yield f"{skipped_rows} skipped"
-    if strange := len(skipped) - skipped_rows:
+    if applicable := sum(1 for row in skipped if row.applies):
+        yield f"{applicable} skipped"
+    if strange := len(skipped) - applicable:
         yield f"{strange} that {'does' if strange == 1 else 'do'} not apply to this keystore"
     if result.left_out:
         yield f"{result.left_out} left out with --only"

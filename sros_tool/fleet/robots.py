@@ -573,10 +573,7 @@ def _robots_text(fleet: Fleet, names: Sequence[str], folding: _Folding) -> str:
     """Return a list of robots in words, such as "r1, r2 and 3 more robots"."""
     if folding.pairs:
         sources = list(dict.fromkeys(pair.split()[0] for pair in names))
-        if {*names} == {
-            f"{first_source} and {second_source}"
-            for first_source, second_source in permutations(sources, 2)
-        }:
+        if {*names} == {f"{first} and {second}" for first, second in permutations(sources, 2)}:
             return f"{_robots_text(fleet, sources, _Folding(''))}, each with every other"
         return f"{len(names)} pairs of robots, such as {names[0]}"
     own = folding.own

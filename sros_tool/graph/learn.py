@@ -502,8 +502,7 @@ _SHOWN = 5
 _TEXTS = {
     "ambiguous": "nodes with the same name run in several enclaves, and the graph does not show "
     "which node runs in which enclave, so each of these enclaves gets the rights of all these "
-    "nodes; "
-    "to tell them apart, start one node at a time under --watch: {}",
+    "nodes; to tell them apart, start one node at a time under --watch: {}",
     "changing-name": "nodes whose name changes with every start have a profile with a wildcard: {}",
     "half-service": "left out, because only the request or the reply of these services was "
     "observed; observe again with a longer --spin-time: {}",
@@ -849,10 +848,10 @@ def write(plan: Draft) -> None:
 
 def _check(plan: Draft) -> None:
     try:
-        learned_rights = policy_rights(read_policy(plan.path, plan.document))
-        if plan.least <= learned_rights <= plan.most:
+        written = policy_rights(read_policy(plan.path, plan.document))
+        if plan.least <= written <= plan.most:
             return
-        why = f"The written policy would differ in {min(learned_rights ^ plan.least, key=order)}."
+        why = f"The written policy would differ in {min(written ^ plan.least, key=order)}."
     except DocumentError as error:
         why = f"{error}"
     raise PolicyError(

@@ -192,9 +192,9 @@ def _first_covering_rule(domain: DomainRule) -> Callable[[str], TopicRule | None
     return rule_for
 
 
-def _equal(rule: TopicRule, second: TopicRule) -> bool:
+def _equal(first: TopicRule, second: TopicRule) -> bool:
     return all(
-        getattr(rule, attribute.name) == getattr(second, attribute.name)
+        getattr(first, attribute.name) == getattr(second, attribute.name)
         for attribute in attributes(TopicRule)
     )
 

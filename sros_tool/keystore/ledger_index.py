@@ -216,10 +216,8 @@ class LedgerIndex:
         if not parts:
             return _split(b"\n".join(filter(None, buckets)))
         texts = [part.encode("utf-8", "surrogatepass") for part in parts]
-        matching = [data for data in buckets if any(text in data for text in texts)]
-        return [
-            name for name in _split(b"\n".join(matching)) if any(part in name for part in parts)
-        ]
+        hits = [data for data in buckets if any(text in data for text in texts)]
+        return [name for name in _split(b"\n".join(hits)) if any(part in name for part in parts)]
 
     def bucket(self, bucket: int) -> tuple[bytes, bytes]:
         """Return the names and the postings in a bucket, verified.
@@ -424,8 +422,4 @@ def _connect(path: Path, mode: str, *, is_new: bool = False) -> sqlite3.Connecti
 
 def merged_postings(postings: Iterable[Iterable[Posting]]) -> Sequence[Posting]:
     """Return postings of several terms in the order of their lines, each line once."""
-    return sorted(
-        {
-            posting.number: posting for term_postings in postings for posting in term_postings
-        }.values()
-    )
+    return sorted({posting.number: posting for of_term in postings for posting in of_term}.values())

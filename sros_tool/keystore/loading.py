@@ -482,10 +482,7 @@ def _list_faults(
     )
     if refusal is None:
         return
-    crl, file = next(
-        (revocation_list for revocation_list in lists if revocation_list[0] is refusal.list),
-        lists[0],
-    )
+    crl, file = next((pair for pair in lists if pair[0] is refusal.list), lists[0])
     if refusal.obstacle is Obstacle.REVOKED:
         yield Problem(CERTIFICATE_FILE, f"it is revoked by {file}", Fault.REVOKED)
         return

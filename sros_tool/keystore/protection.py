@@ -121,9 +121,9 @@ class _Raising:
             return
         for topic in topics:
             self._refuse_partial_overlap(topic, protection)
-        states = set(deciding.values())
-        number = states.pop()
-        if number is not None and not states and self._is_for_topics(number, topics):
+        numbers = set(deciding.values())
+        number = numbers.pop()
+        if number is not None and not numbers and self._is_for_topics(number, topics):
             self._named[number] = replace(self._named[number], protection=needed)
         else:
             self._added.append(NamedProtection(protection.kind, protection.name, needed))
@@ -207,13 +207,13 @@ def less_protected(
     """
     domains = [_DomainRules(rule) for rule in governance.domain_access_rules]
     for protection in stated_protections:
-        weaker_levels = [
+        levels = [
             level
             for topic in protected_topics(protection.kind, protection.name)
             for rules in domains
             for level in rules.levels(topic)
         ]
-        least = min(weaker_levels, key=_strength, default=protection.level)
+        least = min(levels, key=_strength, default=protection.level)
         if _strength(least) < _strength(protection.level):
             yield protection, least
 

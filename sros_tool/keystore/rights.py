@@ -432,12 +432,12 @@ def _keystore_rights(
     for name in names:
         file = enclave_path(root, name) / PERMISSIONS_FILE
         try:
-            permissions, scope = reader.permissions(file, name)
+            granted, scope = reader.permissions(file, name)
         except SrosError as error:
             reader.sound = False
             reader.notes.append(Note("rights.unreadable", f"{name}: {error}"))
             continue
-        rights |= permissions
+        rights |= granted
         enclaves.update(scope)
         if foreign := sorted(set(scope) - {name}):
             text = f"{name}: its permissions are for {', '.join(foreign)}, and DDS refuses them."
@@ -749,14 +749,14 @@ def _stated_domains(source: RightsSource) -> dict[str, str]:
     if source.kind == "zenoh":
         return {}
     ranges: dict[str, list[tuple[int, int]]] = defaultdict(list)
-    all_rights = set()
+    unlimited = set()
     for domains, rights in rights_by_domains(source).items():
         for enclave in {right.enclave for right in rights}:
             if domains is None:
-                all_rights.add(enclave)
+                unlimited.add(enclave)
             else:
                 ranges[enclave] += ((part.first or 0, part.last or 0) for part in domains.ranges)
-    return {name: str(DomainSet.of(*of)) for name, of in ranges.items() if name not in all_rights}
+    return {name: str(DomainSet.of(*of)) for name, of in ranges.items() if name not in unlimited}
 
 
 def _unanswered_rights(

@@ -356,16 +356,14 @@ def _entries(values: list[der.Value]) -> Iterator[_TolerantEntry]:
     damaged = False
     for value in values:
         serial, date, *rest = _sequence(value)
-        entries = _read(_sequence(rest[0]) if rest else [], _parse_in_entry, _LOOSE_OF_ENTRIES)
+        extensions = _read(_sequence(rest[0]) if rest else [], _parse_in_entry, _LOOSE_OF_ENTRIES)
         if damaged:
-            entries = x509.Extensions([])
-        elif any(
-            is_unread(extension) and extension.oid in _DECODED_OF_ENTRIES for extension in entries
-        ):
+            extensions = x509.Extensions([])
+        elif any(is_unread(e) and e.oid in _DECODED_OF_ENTRIES for e in extensions):
             damaged = True
-            entries = x509.Extensions([])
+            extensions = x509.Extensions([])
         moment = _date(date) or datetime.min.replace(tzinfo=UTC)
-        yield _TolerantEntry(der.integer(serial), moment, entries)
+        yield _TolerantEntry(der.integer(serial), moment, extensions)
 
 
 _DECODED_OF_ENTRIES = (CRLEntryExtensionOID.CERTIFICATE_ISSUER, CRLEntryExtensionOID.CRL_REASON)

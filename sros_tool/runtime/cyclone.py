@@ -259,7 +259,7 @@ class Participant:
             raise self._dds_error(handle, f"cannot create a {kind} on {topic}")
         return handle
 
-    def _dds_error(self, code: int, action: str, *, secured: bool = False) -> DdsError:
+    def _dds_error(self, code: int, fault: str, *, secured: bool = False) -> DdsError:
         from sros_tool.runtime.vendor_log import participant_refusal
 
         messages = self._library.log.messages()
@@ -268,8 +268,8 @@ class Participant:
             secured and bool(participant_refusal("\n".join(messages)))
         )
         if refused:
-            return SecurityRefusedError(action, reason)
-        return DdsError(action, reason, _MORE_PARTICIPANTS if "participant index" in reason else "")
+            return SecurityRefusedError(fault, reason)
+        return DdsError(fault, reason, _MORE_PARTICIPANTS if "participant index" in reason else "")
 
 
 _MORE_PARTICIPANTS = (

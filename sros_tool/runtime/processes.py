@@ -499,14 +499,14 @@ def installed_dds(top: Path = Path("/")) -> tuple[MappedLibrary, ...]:
 
     Environment variables are not used: in a login by ssh they do not name the folder of ROS.
     """
-    products = (
+    libraries = (
         (folder / name, _PRODUCTS[match[1].encode()])
         for pattern in _LIBRARY_FOLDERS
         for folder in top.glob(pattern)
         for name in _names_in(folder)
         if (match := _LIBRARY_FILE.match(name))
     )
-    files = {(file.resolve(), product) for file, product in products if file.is_file()}
+    files = {(file.resolve(), product) for file, product in libraries if file.is_file()}
     return tuple(
         MappedLibrary(product, _version(str(file)), str(file)) for file, product in sorted(files)
     )

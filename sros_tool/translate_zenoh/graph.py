@@ -68,10 +68,10 @@ def announced_nodes(rules: Iterable[AccessRule], enclave: str) -> AnnouncedNodes
     nodes: dict[bool, list[str]] = {True: [], False: []}
     for rule in rules:
         if rule.messages == _ANNOUNCING:
-            own_tokens = [_NODE if rule.allows else _EVERY_KIND, _part(enclave)]
+            own_chunks = [_NODE if rule.allows else _EVERY_KIND, _part(enclave)]
             for key in rule.key_expressions:
                 chunks = key.split("/")
-                if chunks[0] == GRAPH and chunks[5:7] == own_tokens:
+                if chunks[0] == GRAPH and chunks[5:7] == own_chunks:
                     nodes[rule.allows].append("/".join((chunks[1], *chunks[7:9])))
     return AnnouncedNodes(tuple(nodes[True]), tuple(nodes[False]))
 

@@ -145,18 +145,18 @@ class AccessControl:
 
     def decide(self, remote: Remote, flow: Flow, message: Message, key: str) -> AccessDecision:
         """Return the decision that `Enforcement.decide` makes with the file of these rules."""
-        own_subjects = None if remote.common_name is None else self._by_name.get(remote.common_name)
-        if own_subjects is None:
-            stated = any(rights.rules for rights in self.remotes)
+        rights = None if remote.common_name is None else self._by_name.get(remote.common_name)
+        if rights is None:
+            stated = any(of_remote.rules for of_remote in self.remotes)
             return AccessDecision(False, (), (), _NO_SUBJECT if stated else _NO_RULE_AT_ALL)
         applying = [
             (rule.allows, name)
-            for name, rule in self._with_ids(own_subjects)
+            for name, rule in self._with_ids(rights)
             if rule.flow is flow
             and message in rule.messages
             and _include(rule.key_expressions, key)
         ]
-        return _decide_by_rules(applying, (own_subjects.common_name,))
+        return _decide_by_rules(applying, (rights.common_name,))
 
     def allowed_keys(self, common_name: str, flow: Flow, message: Message) -> tuple[str, ...]:
         """Return the key expressions that rules allow; denials are not subtracted."""
@@ -321,7 +321,7 @@ class RightsBetween:
             TooManyExpressions: the shared rights need too many key expressions.
         """
         mine = self._mirrored[own_name]
-        denied = [own_name for own_name in mine if not own_name.rule.allows]
+        denied = [rule_of_peer for rule_of_peer in mine if not rule_of_peer.rule.allows]
         meeting: dict[_Place, list[tuple[tuple[Message, ...], RuleKeys]]] = {}
         for remote, theirs in self._rules.items():
             shared: dict[_Place, tuple[str, ...]] = {}
@@ -337,10 +337,8 @@ class RightsBetween:
                     if are_apart and keys.is_plain and other_keys.is_plain:
                         continue
                     if common_keys := keys.common(other_keys):
-                        place_and_messages = (place[0], messages, True)
-                        shared[place_and_messages] = _added_keys(
-                            shared.get(place_and_messages, ()), common_keys
-                        )
+                        common = (place[0], messages, True)
+                        shared[common] = _added_keys(shared.get(common, ()), common_keys)
             for place, rule, _ in (
                 *(rule_of_peer for rule_of_peer in theirs if not rule_of_peer.rule.allows),
                 *denied,

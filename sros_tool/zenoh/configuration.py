@@ -388,17 +388,16 @@ class RenderedReader:
             sections = _SECTIONS.fullmatch(control)
             if not mark or not sections:
                 return None
-            configuration, rights = (
-                self._parse_without_rules(beginning),
-                self._rendered_rights(sections),
-            )
+            configuration = self._parse_without_rules(beginning)
+            rights = self._rendered_rights(sections)
             settings = configuration.settings
             if settings is not SettingsEdition.FEW and _control(rights, once=True) == control:
                 settings = SettingsEdition.RULES_ONCE
             elif _control(rights, once=False) != control:
                 return None
             remotes = tuple(
-                RemoteRights(right.name, tuple(map(self._rule, right.rules))) for right in rights
+                RemoteRights(rendered.name, tuple(map(self._rule, rendered.rules)))
+                for rendered in rights
             )
             return replace(configuration, access_control=AccessControl(remotes), settings=settings)
         except (ValueError, KeyError, IndexError, TypeError, RecursionError):

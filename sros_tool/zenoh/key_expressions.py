@@ -352,20 +352,17 @@ def _common_parts(
 
     @cache
     def common_sequences_from(in_first: int, in_second: int) -> frozenset[tuple[str, ...]]:
-        left, right = (
-            first_sequence[in_first : in_first + 1],
-            second_sequence[in_second : in_second + 1],
-        )
+        left = first_sequence[in_first : in_first + 1]
+        right = second_sequence[in_second : in_second + 1]
         if not left and not right:
             return frozenset({()})
         sequences: set[tuple[str, ...]] = set()
         first, second = (members[0] if members else "" for members in (left, right))
         if first == many == second:
             # One of them stands for no more than the other, which goes on.
-            for common_rest in common_sequences_from(
-                in_first + 1, in_second
-            ) | common_sequences_from(in_first, in_second + 1):
-                sequences.add(common_rest if common_rest[:1] == (many,) else (many, *common_rest))
+            tails = common_sequences_from(in_first + 1, in_second)
+            for tail in tails | common_sequences_from(in_first, in_second + 1):
+                sequences.add(tail if tail[:1] == (many,) else (many, *tail))
         elif many in (first, second):
             sequences |= (
                 common_sequences_from(in_first + 1, in_second)
@@ -378,14 +375,10 @@ def _common_parts(
                     if first == many
                     else common_sequences_from(in_first + 1, in_second)
                 )
-                sequences |= {
-                    (member, *common_rest) for member in meet(first, second) for common_rest in more
-                }
+                sequences |= {(member, *tail) for member in meet(first, second) for tail in more}
         elif left and right:
             more = common_sequences_from(in_first + 1, in_second + 1)
-            sequences |= {
-                (member, *common_rest) for member in meet(first, second) for common_rest in more
-            }
+            sequences |= {(member, *tail) for member in meet(first, second) for tail in more}
         if len(sequences) > _MOST_COMMON:
             raise TooManyExpressions
         return frozenset(sequences)

@@ -344,9 +344,9 @@ def _chunks(first: str, first_chunks: tuple[str, ...], kinds: frozenset[frozense
     choices.append(tuple(chosen))
     wanted = [chunk for kind in kinds for chunk in kinds_of_first[kind]]
     for letter in sorted({*wanted[0]}.intersection(*wanted[1:]).difference(ANY_PART)):
-        common = common_chunks(first, f"{ANY_PART}{letter}{ANY_PART}")
-        if len(common) == 1 and are_allowed(_kinds(common[0], first_chunks)):
-            choices.append(common)
+        shared = common_chunks(first, f"{ANY_PART}{letter}{ANY_PART}")
+        if len(shared) == 1 and are_allowed(_kinds(shared[0], first_chunks)):
+            choices.append(shared)
     return min(choices, key=len)
 
 

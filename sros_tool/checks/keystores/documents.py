@@ -669,8 +669,8 @@ def governance_findings(
         for kind, text in _rule_findings(rule, vendors):
             # A template may choose open topics; no template chooses to lose messages, or a rule
             # that does nothing.
-            is_own = kind in (SIGNED_PAYLOAD, UNREACHABLE_TOPIC_RULE)
-            by = "" if is_own else keystore.accepts(kind, _Chosen(kind, text, domains, vendors))
+            flaw = kind in (SIGNED_PAYLOAD, UNREACHABLE_TOPIC_RULE)
+            by = "" if flaw else keystore.accepts(kind, _Chosen(kind, text, domains, vendors))
             yield kind.found(subject, text, file, accepted=by)
         for part in rule.domains.ranges:
             kind = GOVERNANCE_DOMAIN_RANGE if part.last is not None else GOVERNANCE_OPEN_RANGE
@@ -734,10 +734,7 @@ def _topic_rules(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
     if not any(covers(expression, ROS_DISCOVERY_TOPIC) for expression in expressions):
         yield NO_TOPIC_RULE, f"no topic rule matches {ROS_DISCOVERY_TOPIC}"
     elif "*" not in expressions:
-        of_ros = all(
-            any(covers(expression, expression_of_ros) for expression in expressions)
-            for expression_of_ros in _OF_ROS
-        )
+        of_ros = all(any(covers(wide, topic) for wide in expressions) for topic in _OF_ROS)
         yield NO_OTHER_TOPIC_RULE if of_ros else NO_TOPIC_RULE, "there is no rule for *"
     names = Names(expressions)
     first = {expression: index for index, expression in reversed([*enumerate(expressions)])}

@@ -367,17 +367,11 @@ def _revocation_list_findings(
                 yield REVOKED_BY_NEWER_LIST.found(
                     summary.name, f"{of}, and revokes this enclave", folder
                 )
-            elif (
-                summary.list_number >= 0 or not keystore.crl
-            ):  # another check reports a missing list
-                own_list = (
-                    f"has number {summary.list_number}"
-                    if summary.list_number >= 0
-                    else "is missing"
-                )
-                yield OLDER_LIST.found(
-                    summary.name, f"its list {own_list}, {of}", f"{folder}/{CRL_FILE}"
-                )
+            # Another check reports a missing list.
+            elif (number := summary.list_number) >= 0 or not keystore.crl:
+                own_list = f"has number {number}" if number >= 0 else "is missing"
+                text = f"its list {own_list}, {of}"
+                yield OLDER_LIST.found(summary.name, text, f"{folder}/{CRL_FILE}")
 
 
 def _ledger_findings(

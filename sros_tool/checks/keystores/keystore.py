@@ -141,7 +141,7 @@ def keystore_findings(
     stated = {} if vendors else _stated_distributions(keystore, names)
     deciding = {name: _vendors_of(each) for name, each in stated.items()}
     if stated:
-        union = {vendor for vendors_of_one in deciding.values() for vendor in vendors_of_one}
+        union = {vendor for of_enclave in deciding.values() for vendor in of_enclave}
         asked = asked if len(stated) < len(names) else asked_vendors(tuple(union))
     about_authorities = list(check_authorities(keystore))
     first, common = _governing(keystore, names)
@@ -162,21 +162,14 @@ def keystore_findings(
                 stated.get(name, ()),
             )
             enclave = evaluation.enclave
-            enclave_findings = list(
-                _enclave_findings(enclave, wanted, common, deciding.get(name, asked))
-            )
+            findings = list(_enclave_findings(enclave, wanted, common, deciding.get(name, asked)))
             if not waits_for_answer(enclave.folder):
-                shared = (
-                    []
-                    if any(finding.kind is DIFFERS for finding in enclave_findings)
-                    else about_governance
-                )
-                enclave_findings += check_vendors(
-                    evaluation, [*about_authorities, *shared, *enclave_findings]
-                )
+                differs = any(finding.kind is DIFFERS for finding in findings)
+                shared = [] if differs else about_governance
+                findings += check_vendors(evaluation, [*about_authorities, *shared, *findings])
             if not on_robot and name not in wanted:  # a policy knows more exactly of its nodes
-                enclave_findings = with_start_finding(evaluation, enclave_findings)
-            found += enclave_findings
+                findings = with_start_finding(evaluation, findings)
+            found += findings
             if each := summary_of(enclave):
                 issued.append(each)
             grant = enclave.state.grant

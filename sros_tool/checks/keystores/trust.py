@@ -182,9 +182,9 @@ def _refused_roles(
         tuple(
             role
             for role in roles
-            if not (first_target.accepts(other, role) and other.accepts(first_target, role))
+            if not (party.accepts(other, role) and other.accepts(party, role))
         )
-        for first_target, other in product(parties, other_parties)
+        for party, other in product(parties, other_parties)
     )
     return min(pairs, key=len, default=())
 
@@ -308,7 +308,7 @@ class _Governed:
 
 def _domains_meet(domain_sets: Sequence[DomainSet], other_sets: Sequence[DomainSet]) -> bool:
     pairs = list(product(domain_sets, other_sets))
-    return not pairs or any((first_target & other).ranges for first_target, other in pairs)
+    return not pairs or any((domains & other).ranges for domains, other in pairs)
 
 
 class _Incompatibility(NamedTuple):
@@ -381,7 +381,7 @@ _MOST_SHOWN = 3
 def _differences_between(
     own_governance: Governance, other: Governance
 ) -> tuple[Mismatch, tuple[tuple[str, str, str], ...]]:
-    """Return which communication fails between two targets, and the settings with both values."""
+    """Return which communication fails under two documents, and the settings with both values."""
     disturbed = mismatch(other, own_governance)
     if not disturbed:
         return disturbed, ()

@@ -284,9 +284,9 @@ def _refusal_findings(
 def _is_named(cause: RefusalCause, known_findings: Iterable[Finding]) -> bool:
     """Return whether a known finding already names the cause of a refusal."""
     wanted = _NAMED_BY.get(cause.reason, frozenset())
-    enclave_finding = f"enclave.{cause.reason}"
+    fault_id = f"enclave.{cause.reason}"
     return any(
-        finding.id in wanted or (finding.id == enclave_finding and _file(finding) == cause.file)
+        finding.id in wanted or (finding.id == fault_id and _file(finding) == cause.file)
         for finding in known_findings
     )
 
@@ -474,7 +474,7 @@ def with_start_finding(
             titles = evaluation.titles([participant.vendor for participant in running])
             where += f"on {' and '.join(titles)} "
         finding = NO_NODE.found(enclave.name, f"{where}{worst}", enclave.file(PERMISSIONS_FILE))
-        return [*(finding for finding in known_findings if not worst.explains(finding)), finding]
+        return [*(known for known in known_findings if not worst.explains(known)), finding]
     return [*known_findings]
 
 

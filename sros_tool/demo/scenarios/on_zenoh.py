@@ -981,8 +981,8 @@ def _earlier_file_row(
         expected,
         "only this file decides what its own process may do"
         if defence_removed
-        else "a session file limits only other enclaves; their files decide what this enclave may "
-        "do",
+        else "a session file limits only other enclaves; their files decide what "
+        "this enclave may do",
         hears("listener", guest.name),
         (*_topic_pair(keystore), guest),
         _CHATTER,

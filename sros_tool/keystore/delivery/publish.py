@@ -333,10 +333,9 @@ class _Keys:
             KeystoreError: a key is missing, or is not the one that the root metadata names.
         """
         first = not self.roots.versions
-        if first and (existing_keys := [role for role in _ROLES if self._path(role).exists()]):
+        if first and (roles := [role for role in _ROLES if self._path(role).exists()]):
             raise KeystoreError(
-                f"'{self._root}' has the {existing_keys[0]} key for publishing, "
-                f"but no {FLEET_ROOT}",
+                f"'{self._root}' has the {roles[0]} key for publishing, but no {FLEET_ROOT}",
                 "This file says which keys robots trust.",
                 f"Restore {FLEET_ROOT} from a backup.",
             )
@@ -630,11 +629,9 @@ class _Run:
         for robot in recorded_fleet(self.keystore).robots:
             with suppress(SrosError):
                 if received := last_confirmation(self.keystore.root, robot):
-                    confirmation = received.confirmation
-                    problems = confirmation.problems or ()
-                    if (confirmation.release or 0) > last or any(
-                        OF_SAME_NUMBER in e for e in problems
-                    ):
+                    sent = received.confirmation
+                    problems = sent.problems or ()
+                    if (sent.release or 0) > last or any(OF_SAME_NUMBER in e for e in problems):
                         return True
         return False
 

@@ -530,15 +530,14 @@ def _check_key(
     An enclave that already shares its key with another enclave is renewed, with a note.
     """
     remedy = "Create a new key on the robot, with `sros create_request` in another folder."
-    is_same_key = (
+    certificate = (
         present_certificate
         if present_certificate and present_certificate.public_key() == request.public_key
         else None
     )
-    known_keys.refuse_revoked(
-        request.public_key, f"the request for {request.name}", remedy, is_same_key
-    )
-    if not is_same_key:
+    holder = f"the request for {request.name}"
+    known_keys.refuse_revoked(request.public_key, holder, remedy, certificate)
+    if not certificate:
         known_keys.refuse_shared_key(request.public_key, request.name, remedy)
 
 

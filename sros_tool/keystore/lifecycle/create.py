@@ -317,9 +317,9 @@ def generate_artifacts(
     if create is None or not new_keystore:
         with change:
             _prepare_change(change, domain, fleet, patterns, wanted, protections)
-            created_again = _revoked_before(change, wanted, enclaves, fleet)
+            notes = _revoked_before(change, wanted, enclaves, fleet)
             ended = dict(_expired_enclaves(change, wanted.keys() - {*enclaves}))
-            created_again = [*created_again, *ended.values()]
+            notes = [*notes, *ended.values()]
             if ended:
                 wanted = {name: wanted[name] for name in wanted if name not in ended}
             rights = write_enclaves(
@@ -330,7 +330,7 @@ def generate_artifacts(
                 places=places,
                 progress=progress,
             )
-        change.notes = [*created_again, *change.notes]
+        change.notes = [*notes, *change.notes]
         return creation(change, rights)
     domains = domains or _domains_of(fleet, domain)
     check_domain(domains, domain, root)

@@ -241,18 +241,14 @@ def lasting_text(root: Path, replaced_rights: Sequence[ReplacedRights]) -> str:
     names = [rights.enclave for rights in lasting]
     if len(names) == 1:
         lost, kept = f"{names[0]}: the rights that it lost", "its earlier permissions and its key"
-        processes, enclaves_text = "its processes", "this enclave"
+        processes, owner = "its processes", "this enclave"
     else:
         lost = f"{first_few(names, _ENCLAVES_SHOWN)}: the rights that they lost"
-        kept, processes, enclaves_text = (
-            "earlier permissions and keys",
-            "their processes",
-            "these enclaves",
-        )
+        kept, processes, owner = "earlier permissions and keys", "their processes", "these enclaves"
     which = " ".join(map(quote, names)) if len(names) <= _ENCLAVES_SHOWN else "ENCLAVE..."
     others = "" if len(names) <= _ENCLAVES_SHOWN else " (or with --robot NAME, or --all)"
     return (
         f"{lost} {work} for whoever kept {kept}, and in {processes} until they are restarted. To "
         f"end that, run `sros renew {quote(str(root))} {which} --revoke-old`{others}, and restart "
-        f"all processes, first those of {enclaves_text}."
+        f"all processes, first those of {owner}."
     )

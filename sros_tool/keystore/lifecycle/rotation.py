@@ -144,12 +144,8 @@ def read_rotation(keystore: OpenedKeystore) -> Rotation:
             issuing = (
                 replacement.old if rotation.stage is RotationStage.DISTRIBUTE else replacement.new
             )
-            present_digests = [
-                digest(certificate) for certificate in keystore.certificates_of(replacement.file)
-            ]
-            if present_digests[0] != issuing or not {replacement.old, replacement.new} <= set(
-                present_digests
-            ):
+            digests = [*map(digest, keystore.certificates_of(replacement.file))]
+            if digests[0] != issuing or not {replacement.old, replacement.new} <= set(digests):
                 raise ValueError
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise KeystoreError(

@@ -518,11 +518,11 @@ class _Updater:
 
     def _reissue(self, names: Sequence[str], progress: Progress | None) -> list[_Reissued]:
         before, after = self._present.settings, self._goal.settings
-        same_permissions = (before.default_permissions, before.short_lived) == (
+        same_settings = (before.default_permissions, before.short_lived) == (
             after.default_permissions,
             after.short_lived,
         )
-        if same_permissions and not self._permissions:
+        if same_settings and not self._permissions:
             return []
 
         closes = before.default_permissions == EVERYTHING != after.default_permissions
@@ -533,8 +533,8 @@ class _Updater:
             try:
                 state = read_credentials(keystore, name)
                 done = self._reissue_one(state)
-                same_permissions = done is None or not done.rights.lost
-                if closes and same_permissions and allows_everything(state.grant):
+                keeps_rights = done is None or not done.rights.lost
+                if closes and keeps_rights and allows_everything(state.grant):
                     return _KeptOpen(name, done)
                 return done
             except CaServiceError:
@@ -542,16 +542,13 @@ class _Updater:
             except SrosError as error:
                 return UnreadableEnclave(name, error)
 
-        enclaves = self._writer.for_each(names, work, progress).values()
-        unreadable = tuple(
-            enclave for enclave in enclaves if isinstance(enclave, UnreadableEnclave)
-        )
+        results = self._writer.for_each(names, work, progress).values()
+        unreadable = tuple(result for result in results if isinstance(result, UnreadableEnclave))
         refuse_unreadable(unreadable, "updated")
-        opened = [kept_open for kept_open in enclaves if isinstance(kept_open, _KeptOpen)]
+        opened = [kept_open for kept_open in results if isinstance(kept_open, _KeptOpen)]
         self._kept_open = tuple(kept_open.name for kept_open in opened)
         reissued = [
-            kept_open.reissued if isinstance(kept_open, _KeptOpen) else kept_open
-            for kept_open in enclaves
+            result.reissued if isinstance(result, _KeptOpen) else result for result in results
         ]
         return [document for document in reissued if isinstance(document, _Reissued)]
 

@@ -538,8 +538,8 @@ class Transaction:
         if self._new_root:
             return []
         # What costs as much as the keystore has enclaves is left to who looks at all of them.
-        is_complete = self._adopts or "enclaves" in self.__dict__
-        changed = None if is_complete else self.changed_folders()
+        looks_at_all = self._adopts or "enclaves" in self.__dict__
+        changed = None if looks_at_all else self.changed_folders()
         return [path for path in _open_keys(self.root, changed) if not self.is_staged(path)]
 
     def _finish(self) -> None:
