@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from sros_tool.policy.merge import Merged
     from sros_tool.policy.model import StatedProtection
     from sros_tool.policy.rights import RightsDifference
-    from sros_tool.proof.growth import Gain, Growth, NewReach
+    from sros_tool.proof.growth import DroppedDenial, Gain, Growth, NewReach
     from sros_tool.proof.sources import AccessSource
 
 
@@ -272,8 +272,8 @@ def diff_policy(
     decided. sros assumes that a policy is signed with a governance that controls all access. If A
     is a policy, a keystore B that protects less than the template production counts as giving more
     access; a policy B never lowers the protection. The last line says what is assumed and what is
-    left out, such as dates. A DENY that B lacks is reported only if B allows names of it; `sros
-    review` also reports the others.
+    left out, such as dates. "!" marks a DENY that B lacks, of names that B does not allow: it gives
+    no access, so that the exit status is 0, but `sros review` fails for it.
 
     Example:
       $ sros diff_policy robot.xml keystore
@@ -812,11 +812,15 @@ def _show_new_access(
     if form == "json":
         print_json(NewAccess(ComparedSide.of(before), ComparedSide.of(after), growth))
     elif form == "markdown":
-        echo_document(access_markdown(before, after, growth))
+        echo_document(access_markdown(before, after, growth, growth.dropped_denials))
     else:
-        for line in (*added_lines(before, after, growth), *_removed_lines(before, after, growth)):
+        for line in (
+            *added_lines(before, after, growth),
+            *_removed_lines(before, after, growth),
+            *dropped_lines(after, growth.dropped_denials),
+        ):
             echo(line)
-        echo(access_summary(growth), err=True)
+        echo(access_summary(growth, growth.dropped_denials), err=True)
     if form != "json":
         print_notes((*before.notes, *after.notes))
     return int(bool(growth))
@@ -911,8 +915,25 @@ def _reach_lines(head: AccessSource, reach: Sequence[NewReach]) -> list[str]:
     return lines
 
 
-def access_summary(growth: Growth) -> str:
-    """Return the added access and reach of a change in one sentence."""
+def dropped_lines(head: AccessSource, dropped: Iterable[DroppedDenial]) -> list[str]:
+    """Return a line for each DENY that is dropped or narrowed; lines of robots are merged."""
+    from sros_tool.fleet.robots import folded
+
+    lines = []
+    for right, name, moved_from in dropped:
+        if moved_from:
+            text = f"has a node of {moved_from} without its DENY {right.describe()}"
+            text += f" for names such as {name}" if name else ""
+        else:
+            text = f"DENY {right.describe()} is gone"
+            text += f" for names such as {name}" if name else ""
+        text += f": other policies may allow {'them' if name else 'it'} now"
+        lines.append((right.enclave, f"! {right.enclave} {text}"))
+    return list(folded(head.fleet, lines))
+
+
+def access_summary(growth: Growth, dropped: Collection[DroppedDenial]) -> str:
+    """Return the added access and reach of a change, and its dropped denials, in one sentence."""
     from sros_tool.dds.decision.vendors import joined_titles
 
     worlds = ", ".join(joined_titles(growth.worlds))
@@ -926,6 +947,7 @@ def access_summary(growth: Growth) -> str:
         if clauses
     )
     gone = f"; {_count(len(growth.removed), 'right')} gone" if growth.removed else ""
+    gone += f"; {counted(len(dropped), 'DENY', 'DENYs')} gone" if dropped else ""
     if not growth:
         return f"nobody gets more access, and nothing is protected less ({worlds}){gone}{basis}"
     parts = []
@@ -946,18 +968,22 @@ def _count(number: int, noun: str) -> str:
     return f"1 {noun} is" if number == 1 else f"{number} {noun}s are"
 
 
-def access_markdown(base: AccessSource, head: AccessSource, growth: Growth) -> str:
-    """Return the added and removed access of a change as Markdown."""
+def access_markdown(
+    base: AccessSource, head: AccessSource, growth: Growth, dropped: Collection[DroppedDenial]
+) -> str:
+    """Return the added and removed access of a change, and its dropped denials, as Markdown."""
     from sros_tool.markdown import bounded_list, code, plain
 
     shown_by = "which `sros diff_policy --no-new-access` shows"
-    parts = [f"### New access: {plain('yes' if growth else 'none')}", plain(access_summary(growth))]
+    summary = access_summary(growth, dropped)
+    parts = [f"### New access: {plain('yes' if growth else 'none')}", plain(summary)]
     added, removed = added_lines(base, head, growth), _removed_lines(base, head, growth)
     renamed = [line for line in added if line.startswith("~")]
     for title, lines in (
         ("renamed", renamed),
         ("added", added[len(renamed) :]),
         ("removed", removed),
+        ("denials gone", dropped_lines(head, dropped)),
     ):
         if lines:
             parts.append(f"**{len(lines)} {title}**")

@@ -30,7 +30,7 @@ from sros_tool.wording import counted
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
     from sros_tool.proof.repository import Repository
-    from sros_tool.proof.review import AccessChange, Review, ReviewRequest, ReviewStep, RightsChange
+    from sros_tool.proof.review import Review, ReviewRequest, ReviewStep, RightsChange
 
     _PathsType = click.ParamType[tuple[str, ...]]
 else:  # generic from click 8.2 on
@@ -361,9 +361,8 @@ def _sentence(result: Review, step: ReviewStep) -> str:
     match step.content:
         case ChosenFindings() as chosen:
             return chosen.summary()
-        case AccessChange(growth=growth, undenied=undenied):
-            dropped = f"; {counted(len(undenied), 'DENY', 'DENYs')} gone" if undenied else ""
-            return access_summary(growth) + dropped
+        case AccessChange(growth=growth, dropped=dropped):
+            return access_summary(growth, dropped)
         case RightsChange(compared=compared, absolute=absolute, relative=relative):
             added, gone = len(compared.rights.only_second), len(compared.rights.only_first)
             clauses = [
@@ -380,8 +379,8 @@ def _sentence(result: Review, step: ReviewStep) -> str:
             ]
             return ", ".join(clauses)
         case DroppedRequirements(count=count, chosen=chosen):
-            dropped = counted(count, "requirement")
-            return f"{dropped} dropped or changed, checked as before the change: {chosen.summary()}"
+            requirements = counted(count, "requirement")
+            return f"{requirements} dropped or changed, checked as before the change: {chosen.summary()}"
         case ExpiryCheck(due=due, unreadable=unreadable, lasting=count) as expiry:
             unread = f", {len(unreadable)} cannot be read" if unreadable else ""
             left_out = expiry.short_lived_text()
@@ -426,6 +425,7 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
     from sros_tool.checks.registry import ChosenFindings
     from sros_tool.cli.policy import (
         added_lines,
+        dropped_lines,
         enclave_lines,
         folded_differences,
         unanswered_lines,
@@ -433,8 +433,8 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
     from sros_tool.proof.review import AccessChange, DroppedRequirements, RightsChange
 
     match step.content:
-        case AccessChange(before=before, after=after, growth=growth) as change:
-            return [*added_lines(before, after, growth), *_undenied_lines(change)]
+        case AccessChange(before=before, after=after, growth=growth, dropped=dropped):
+            return [*added_lines(before, after, growth), *dropped_lines(after, dropped)]
         case RightsChange(before=before, after=after, compared=compared):
             unanswered = unanswered_lines(compared, after.fleet)
             differing = folded_differences(before, after, compared.rights, ("BASE", "HEAD"))
@@ -459,19 +459,6 @@ def _finding_line(finding: Finding) -> str:
     line = f"{finding.place}: {finding.severity.word}: {subject}{finding.text} [{finding.id}]"
     places = finding.related if finding.kind is DROPPED else ()
     return line + "".join(f" ({place.text}: {place})" for place in places)
-
-
-def _undenied_lines(change: AccessChange) -> Iterator[str]:
-    """Yield a line for each DENY that is dropped or narrowed."""
-    from sros_tool.fleet.robots import folded
-
-    lines = []
-    for right, name in change.undenied:
-        gone = f"gone for names such as {name}: other policies may allow them now"
-        text = f"! {right.enclave} DENY {right.describe()} is "
-        text += gone if name else "gone: other policies may allow it now"
-        lines.append((right.enclave, text))
-    return folded(change.after.fleet, lines)
 
 
 def _absolute_lines(change: RightsChange) -> Iterator[str]:
@@ -571,9 +558,8 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
     match step.content:
         case ChosenFindings() as chosen:
             return findings(chosen) if chosen.shown else ""
-        case AccessChange(before=before, after=after, growth=growth) as change:
-            gone = bounded_list(map(code, _undenied_lines(change)), 6000, shown_by)
-            return "\n\n".join(filter(None, (access_markdown(before, after, growth), gone)))
+        case AccessChange(before=before, after=after, growth=growth, dropped=dropped):
+            return access_markdown(before, after, growth, dropped)
         case RightsChange(before=before, after=after, compared=compared) as change:
             parts = [rights_markdown(before, after, compared)] if compared else []
             if lines := list(_absolute_lines(change)):

@@ -48,9 +48,18 @@ from sros_tool.names import (
     node_of_service,
     service_of,
 )
-from sros_tool.policy.model import ALLOW, Source
-from sros_tool.policy.patterns import literal_prefix
-from sros_tool.policy.rights import KIND_OF, Right, renamed_enclaves
+from sros_tool.policy.model import ALLOW, DENY, Profile, Source
+from sros_tool.policy.patterns import common_name, literal_prefix
+from sros_tool.policy.rights import (
+    KIND_OF,
+    Right,
+    Rules,
+    folded,
+    parts,
+    profile_rights,
+    renamed_enclaves,
+    unfolded,
+)
 from sros_tool.proof.protection import (
     added_crossing,
     contradiction,
@@ -151,9 +160,23 @@ class GainedProtection(NamedTuple):
     """The protection in HEAD."""
 
 
+class DroppedDenial(NamedTuple):
+    """A DENY of BASE of which HEAD neither denies nor allows all names.
+
+    It gives no access, but users who merge the policy with others may rely on it.
+    """
+
+    denial: Right
+    """The denied right, of the enclave that lacks the denial in HEAD."""
+    name: str
+    """Example of a name that is no longer denied; empty if HEAD denies none of the names."""
+    moved_from: str
+    """The enclave that denied it in BASE, if another enclave has its node in HEAD; or empty."""
+
+
 @shows(
     *("new_access", "worlds", "domains", "assumed", "left_out", "not_compared", "added", "reach"),
-    *("reach_known", "less_protection", "removed", "more_protection"),
+    *("reach_known", "less_protection", "dropped_denials", "removed", "more_protection"),
 )
 @dataclass(frozen=True, slots=True)
 class Growth:
@@ -183,6 +206,8 @@ class Growth:
     """Parts that are not compared on purpose."""
     not_compared: tuple[str, ...]
     """Parts that could not be compared; if nothing is new, this is an error with exit status 2."""
+    dropped_denials: tuple[DroppedDenial, ...]
+    """Denials that HEAD drops or narrows without allowing their names; they are no new access."""
 
     @property
     def new_access(self) -> bool:
@@ -328,6 +353,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
         tuple(_assumptions(base, head)),
         tuple(_left_out_texts(base, head)),
         unclear,
+        tuple(_dropped_denials(base, head)),
     )
 
 
@@ -1065,6 +1091,53 @@ def _reached_with_hops(edges: _Edges, start: str) -> dict[str, Hop]:
                 reached[neighbour] = hop
                 row.append(neighbour)
     return reached
+
+
+# ── denials ────────────────────────────────────────────────────────────────────────────────
+
+
+def _dropped_denials(before: AccessSource, after: AccessSource) -> Iterator[DroppedDenial]:
+    """Yield denials that ``after`` drops or narrows, and denials that a node left behind."""
+    denials = {right for right in unfolded(before.rights) if right.qualifier is DENY}
+    if not denials:
+        return
+    stated = Rules(after.rights)
+    left = {right.enclave for right in after.rights} | after.permissions.keys()
+    owed = defaultdict(set, {"": {denial for denial in denials if denial.enclave in left}})
+    old_enclaves, new_enclaves = map(_enclaves_of_nodes, (before, after))
+    for node, profiles in old_enclaves.items():
+        for path in new_enclaves.get(node, {}).keys() - profiles:
+            for old_path, profile in profiles.items():
+                rights = unfolded(profile_rights(path, profile))
+                owed[old_path].update(right for right in rights if right.qualifier is DENY)
+    for old_path, denied in owed.items():
+        names = {part: undenied_name(part, stated) for part in denied}
+        for right in sorted(folded(part for part, name in names.items() if name)):
+            part = parts(right)[0]
+            name = (names[part] or "").removesuffix(part.name.removeprefix(right.name))
+            yield DroppedDenial(right, name if stated.overlaps(right) else "", old_path)
+
+
+def _enclaves_of_nodes(side: AccessSource) -> dict[tuple[str, str], dict[str, Profile]]:
+    """Map namespace and name of each node in policies to its enclaves, with its profiles there."""
+    enclaves: dict[tuple[str, str], dict[str, Profile]] = defaultdict(dict)
+    for path, enclave in side.enclaves.items():
+        for profile in enclave.all_profiles():
+            node = profile.ns.strip("/"), profile.node
+            others = enclaves[node][path].groups if path in enclaves[node] else ()
+            enclaves[node][path] = replace(profile, groups=(*others, *profile.groups))
+    return enclaves
+
+
+def undenied_name(denied: Right, stated: Rules) -> str | None:
+    """Return a name that ``denied``, no action, denies and ``stated`` neither denies nor allows."""
+    if stated.cover(denied):
+        return None
+    allowed = stated.overlapping(denied._replace(qualifier=ALLOW))
+    if denied.kind == "dds":  # has no ROS name to search for
+        return None if allowed else denied.name
+    names = [right.name for right in (*allowed, *stated.overlapping(denied))]
+    return common_name([denied.name], names)
 
 
 # ── what a side does not state ─────────────────────────────────────────────────────────────

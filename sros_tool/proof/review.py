@@ -37,16 +37,13 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import RightsSource, SourcesDifference, compare_sources
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Profile
-from sros_tool.policy.patterns import common_name
 from sros_tool.policy.rights import (
     PlacedRight,
     Right,
     Rules,
-    folded,
     parts,
     placed_rights,
     policy_rights,
-    unfolded,
 )
 from sros_tool.proof.commit_files import (
     CommitFiles,
@@ -58,7 +55,7 @@ from sros_tool.proof.commit_files import (
     users_of,
 )
 from sros_tool.proof.findings import requirement_findings
-from sros_tool.proof.growth import Growth, compare_access
+from sros_tool.proof.growth import DroppedDenial, Growth, compare_access, undenied_name
 from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
 from sros_tool.proof.requirements import (
     FleetSource,
@@ -118,16 +115,12 @@ class ReviewRequest:
 
 @dataclass(frozen=True, slots=True)
 class AccessChange:
-    """Access that HEAD allows and BASE does not.
-
-    ``undenied`` are denials that HEAD drops or narrows without allowing their names, each with a
-    name if HEAD still denies others: users who merge the policy with others may rely on them.
-    """
+    """Access that HEAD allows and BASE does not, and denials that HEAD drops or narrows."""
 
     before: AccessSource
     after: AccessSource
     growth: Growth
-    undenied: tuple[tuple[Right, str], ...]
+    dropped: tuple[DroppedDenial, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -738,10 +731,12 @@ class _Review:
         self, before: AccessSource, after: AccessSource, moving: Sequence[PlacedRight] = ()
     ) -> tuple[int, Content]:
         growth = compare_access(before, after)
-        undenied = tuple(_undenied(before, after))
-        undenied += tuple((moved.right, "") for moved in moving if moved.right.qualifier is DENY)
-        status = _FOUND if growth or undenied else _OK
-        return status, AccessChange(before, after, growth, undenied)
+        dropped = growth.dropped_denials
+        dropped += tuple(
+            DroppedDenial(moved.right, "", "") for moved in moving if moved.right.qualifier is DENY
+        )
+        status = _FOUND if growth or dropped else _OK
+        return status, AccessChange(before, after, growth, dropped)
 
     @staticmethod
     def _rights(
@@ -929,38 +924,12 @@ def _fixed_or_moving_names(before: AccessSource, after: AccessSource) -> Iterato
     for placed, moved in of_before:
         here, elsewhere = (
             placed.right.qualifier is DENY
-            and any(_undenied_name(part, rules) for part in parts(right))
+            and any(undenied_name(part, rules) for part in parts(right))
             for right, rules in ((placed.right, now), (moved, now_elsewhere))
         )
         if elsewhere and not here:
             same = (denial for denial in denials if Rules([denial.right]).overlaps(placed.right))
             yield from islice(same, 1)
-
-
-def _undenied(before: AccessSource, after: AccessSource) -> Iterator[tuple[Right, str]]:
-    """Yield denials of which ``after`` neither denies nor allows all names (`AccessChange`)."""
-    stated = Rules(after.rights)
-    left = {right.enclave for right in after.rights} | after.permissions.keys()
-    names = {
-        part: _undenied_name(part, stated)
-        for part in unfolded(before.rights)
-        if part.qualifier is DENY and part.enclave in left
-    }
-    for right in sorted(folded(part for part, name in names.items() if name)):
-        part = parts(right)[0]
-        name = (names[part] or "").removesuffix(part.name.removeprefix(right.name))
-        yield right, name if stated.overlaps(right) else ""
-
-
-def _undenied_name(denied: Right, stated: Rules) -> str | None:
-    """Return a name that ``denied``, no action, denies and ``stated`` neither denies nor allows."""
-    if stated.cover(denied):
-        return None
-    allowed = stated.overlapping(denied._replace(qualifier=ALLOW))
-    if denied.kind == "dds":  # has no ROS name to search for
-        return None if allowed else denied.name
-    names = [right.name for right in (*allowed, *stated.overlapping(denied))]
-    return common_name([denied.name], names)
 
 
 def _moved_rights(enclave: Enclave) -> Iterator[tuple[PlacedRight, Right]]:

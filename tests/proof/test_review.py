@@ -179,6 +179,36 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
         "  ! /c DENY publish topic /*/erase is gone for names such as /a/erase: other policies may "
         "allow them now\n  ! /c DENY publish topic /stop is gone: other policies may allow it now"
     ) in ended.out
+    sides = f"git:{change.base}:second.xml", "second.xml"
+    compared = sros("diff_policy", "--no-new-access", *sides, cwd=change.folder)
+    denials = [line.strip() for line in ended.out.splitlines() if line.startswith("  ! ")]
+    assert [line for line in compared.out.splitlines() if line.startswith("! ")] == denials
+    assert "; 2 DENYs gone" in compared.err
+
+
+def test_a_denial_that_a_node_leaves_behind_is_gone(change: Change) -> None:
+    """An enclave that gets a node, and has its access already, has to deny what was denied."""
+    denies = '<services request="DENY"><service>/*erase</service></services>'
+    other = policy_text({"/d": publish("/x")}).replace('node="n"', 'node="m"')
+    one, both = (policy_text({"/a": "", **more}) for more in ({}, {"/c": publish("/x") + denies}))
+    change.base = change.commit({"robot.xml": both, "second.xml": other})
+    line = "! /d has a node of /c without its DENY request service /*erase: other policies may"
+
+    def review_of(text: str, node: str, rights: str) -> Ended:
+        profile = f'<profile ns="/" node="{node}">{rights}</profile>'
+        moved = other.replace("</profiles>", f"{profile}</profiles>")
+        change.commit({"robot.xml": text, "second.xml": moved})
+        return change.review("--policy", "robot.xml\nsecond.xml")
+
+    for text, node, rights, lines in (
+        (one, "n", "", [f"  {line} allow it now"]),
+        (both.replace('node="n"', 'node="k"'), "n", "", [f"  {line} allow it now"]),
+        (one, "n", denies, []),
+        (one, "k", "", []),
+    ):
+        ended = review_of(text, node, publish("/x") + rights)
+        assert [e for e in ended.out.splitlines() if e.startswith("  !")] == lines, ended
+        assert "/d publish" not in ended.out
 
 
 def test_a_name_has_a_line_only_if_it_is_new_in_another_namespace(change: Change) -> None:
