@@ -379,8 +379,8 @@ def _sentence(result: Review, step: ReviewStep) -> str:
             ]
             return ", ".join(clauses)
         case DroppedRequirements(count=count, chosen=chosen):
-            requirements = counted(count, "requirement")
-            return f"{requirements} dropped or changed, checked as before the change: {chosen.summary()}"
+            kind = f"{counted(count, 'requirement')} dropped or changed"
+            return f"{kind}, checked as before the change: {chosen.summary()}"
         case ExpiryCheck(due=due, unreadable=unreadable, lasting=count) as expiry:
             unread = f", {len(unreadable)} cannot be read" if unreadable else ""
             left_out = expiry.short_lived_text()
