@@ -528,7 +528,8 @@ class ComparedFleet(NamedTuple):
     status: FleetStatus
     outdated_dds: Sequence[str]
     """Robots with a DDS that has known vulnerabilities which a later release of the same major
-    version fixes, sorted by name; if there are any, the exit status is 1."""
+    version fixes, sorted by name; with ``--fail-on vulnerabilities``, the exit status is 1 if there
+    are any."""
     findings: Sequence[Finding]
     """Findings on known vulnerabilities of the robots' DDS, as those of ``sros check runtime``."""
 
@@ -548,7 +549,15 @@ class ComparedFleet(NamedTuple):
 @click.option(
     "--no-advisories",
     is_flag=True,
-    help="Leave known vulnerabilities of the robots' DDS out of the output and the exit status.",
+    help="Leave known vulnerabilities of the robots' DDS out of the output.",
+)
+@click.option(
+    "--fail-on",
+    type=click.Choice(["delivery", "vulnerabilities"]),
+    default="delivery",
+    show_default=True,
+    help="What makes the exit status 1: only the delivery of files, or also a DDS with known "
+    "vulnerabilities that a later release fixes.",
 )
 @output_option("Replace FILE atomically instead of printing.")
 @dry_run_option
@@ -561,6 +570,7 @@ def _status(
     html: bool,
     advisories: Path | None,
     no_advisories: bool,
+    fail_on: str,
     output: Path | None,
     dry_run: bool,
     as_json: bool,
@@ -573,8 +583,9 @@ def _status(
     after a restart. Confirmations by the Ansible collection and `sros agent` say which restarts
     are due, confirmations by `sros fleet report` do not. A robot without a recent confirmation is
     offline. Robots with the same state share a line. A robot that reports a release which was never
-    published is shown even if its files are current. The last line counts the known vulnerabilities
-    of the robots' DDS, by the advisories of sros; --robot and --advisories list them.
+    published is shown even if its files are current. The first line also counts the robots whose
+    DDS has known vulnerabilities that a later release of the same major version fixes, by the
+    advisories of sros; --robot and --advisories list them.
 
     sros counts the revocation list as in force on a robot if the robot has the list, and its
     confirmation says that no restart is due. A robot does not report which earlier files a process
@@ -594,9 +605,8 @@ def _status(
 
     The exit status is 0 if every robot that is not revoked has confirmed the files that it should
     have, no restart is due, no agent reports a problem, and robots still accept what was
-    published. Otherwise it is 1. The exit status is also 1 if a robot has a DDS with known
-    vulnerabilities that a later release of the same major version fixes (with --no-advisories,
-    this does not count).
+    published. Otherwise it is 1. With --fail-on vulnerabilities, it is also 1 if a robot has a DDS
+    to upgrade.
     """
     from sros_tool.checks.vulnerabilities import is_fixed_later, robot_findings
     from sros_tool.keystore.fleet_status import fleet_status
@@ -607,8 +617,10 @@ def _status(
         raise UsageError("--json, --prometheus and --html exclude each other", "", "Choose one.")
     if as_json and output:
         raise UsageError("--json takes no --output", "", "Leave one of them out.")
-    if no_advisories and (advisories or prometheus):
-        other = "--advisories" if advisories else "--prometheus"
+    on_vulnerabilities = fail_on == "vulnerabilities"
+    if no_advisories and (advisories or prometheus or on_vulnerabilities):
+        other = "--prometheus" if prometheus else "--fail-on vulnerabilities"
+        other = "--advisories" if advisories else other
         raise UsageError(f"{other} and --no-advisories exclude each other", "", "Choose one.")
     moment = now()
     oldest = parse_duration(max_age) if max_age is not None else None
@@ -631,7 +643,7 @@ def _status(
         if dds and any(is_fixed_later(library, known) for library in dds.libraries)
     ]
     compared = ComparedFleet(moment, status, outdated, list(robot_findings(reported, known)))
-    exit_status = 0 if status.complete and not outdated else 1
+    exit_status = 0 if status.complete and not (outdated and on_vulnerabilities) else 1
     if as_json:
         print_json(compared)
         return exit_status
@@ -691,7 +703,9 @@ def _lines(
     """
     status = compared_fleet.status
     counts = ", ".join(f"{number} {_state_text(state)}" for state, number in status.counts.items())
-    yield f"{counted(len(status.robots), 'robot')}: {counts}"
+    outdated = len(compared_fleet.outdated_dds)
+    upgrade = f"; {outdated} with a DDS to upgrade (known vulnerabilities)" if outdated else ""
+    yield f"{counted(len(status.robots), 'robot')}: {counts}{upgrade}"
     yield from _facts(compared_fleet)
     rows = list(_rows(compared_fleet, robots))
     widths = [max(len(row[column]) for row in rows) for column in range(4)] if rows else []
@@ -1010,10 +1024,10 @@ def _dds_count_lines(compared_fleet: ComparedFleet) -> Iterator[str]:
     status, outdated = compared_fleet.status, compared_fleet.outdated_dds
     if outdated:
         robots = _robot_names(outdated, status.names, status.groups)
-        only = "the exit status is 1 only because " if status.complete else ""
         yield (
-            f"{only}a later release fixes known vulnerabilities in the DDS of {robots}; "
-            f"`sros fleet status {quote(str(status.keystore))} --robot {outdated[0]}` lists them"
+            f"a later release fixes known vulnerabilities in the DDS of {robots}; "
+            f"`sros fleet status {quote(str(status.keystore))} --robot {outdated[0]}` lists them, and "
+            "--fail-on vulnerabilities makes the exit status 1"
         )
     elif list(_dds_findings(compared_fleet)):
         severities = Counter(finding.severity.word for finding in compared_fleet.findings)
