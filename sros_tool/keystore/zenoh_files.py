@@ -258,7 +258,7 @@ def _out_of_date(configuration: Configuration, file: str, name: str, state: Open
     if not is_session or state.grant is None:
         return ""
     control = configuration.access_control
-    domains = joined_domains(state.grant, domains_of(control))
+    domains = _joined_domains(state.grant, domains_of(control))
     # Only the keystore knows which nodes a policy names: here it is what the permissions CA signed.
     nodes = nodes_in_rules((rule for remote in control.remotes for rule in remote.rules), name)
     try:
@@ -845,7 +845,7 @@ class _RightsReader:
         return grant
 
     def _domains_of_grant(self, grant: Grant) -> tuple[int, ...]:
-        domains = joined_domains(grant, self._domains)
+        domains = _joined_domains(grant, self._domains)
         if not domains:
             raise KeystoreError("its permissions are for no domain of the network")
         return domains
@@ -1088,7 +1088,7 @@ def _grant_for(
     return index if isinstance(index, Refusal) else permissions.grants[index]
 
 
-def joined_domains(grant: Grant, domains: Iterable[int]) -> tuple[int, ...]:
+def _joined_domains(grant: Grant, domains: Iterable[int]) -> tuple[int, ...]:
     """Return the ROS domains, out of ``domains``, that an enclave may join by its permissions."""
     allowed = grant.domains()
     return tuple(domain for domain in domains if domain in allowed)
