@@ -6,7 +6,7 @@
 - robots: `deployment`, `fleet`
 - processes: `running`, `close`, `demo`
 - policies: `policy`, `review`, `view`
-- robots that run: `observing`
+- robots that run: `observing`, `audit`
 - answers: `explain`, `check`
 
 All share `common`; `changed` prints what changes a keystore.  `ros2` has the same

@@ -86,7 +86,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         "check": VerbEntry("check", "Is it right? A policy, a keystore, and what runs here."),
         "review": VerbEntry("review", "May this change of policies and keystores be merged?"),
         "metrics": VerbEntry("check", "What should Prometheus alert on?"),
-        "audit": VerbEntry("observing", "What would a policy deny to the robot that runs now?"),
+        "audit": VerbEntry("audit", "What would a policy deny to the robot that runs now?"),
         "doctor": VerbEntry("check", "Does the DDS on this machine enforce security?"),
     },
     "Running": {

@@ -1,0 +1,280 @@
+"""The verb `audit`: try a policy on the running robot without denying anything."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from sros_tool.cli.common import (
+    PATH,
+    check_output,
+    distro_option,
+    dry_run_option,
+    fleet_option,
+    force_option,
+    json_option,
+    keystore_from_environment,
+    local_zone,
+    now,
+    print_json,
+    print_notes,
+    save,
+    verb,
+)
+from sros_tool.cli.observing import (
+    Watching,
+    check_duration,
+    observe,
+    observer_environment,
+    observing_options,
+    why_no_node_was_observed,
+)
+from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.errors import UnavailableError, UsageError
+from sros_tool.terminal import echo
+from sros_tool.values import file_change
+from sros_tool.wording import counted
+
+if TYPE_CHECKING:
+    from sros_tool.distributions import Distribution
+    from sros_tool.explain.audit import Audit, AuditedEnclaves
+    from sros_tool.fleet.robots import Fleet
+    from sros_tool.graph.observation import Observation
+
+
+@verb("audit", cls=Watching)
+@click.argument("sources", metavar="[POLICY...|KEYSTORE]", type=PATH, nargs=-1)
+@observing_options("Run the observer in this enclave, if the robot is already secured.")
+@click.option(
+    "--vendor",
+    type=click.Choice([vendor.value for vendor in Vendor]),
+    metavar="VENDOR",
+    help=f"Decide as this DDS vendor does: {', '.join(vendor.value for vendor in Vendor)}. "
+    "[default: the vendor of this machine's RMW]",
+)
+@distro_option(
+    "Decide as the DDS of this ROS 2 distribution does, such as lyrical: its default, or the one "
+    "of $RMW_IMPLEMENTATION or --vendor. [default: $ROS_DISTRO]"
+)
+@click.option(
+    "--patch",
+    type=PATH,
+    metavar="FILE",
+    help="Write the missing rights to FILE, as a policy for merge_policy.",
+)
+@click.option(
+    "--partial",
+    is_flag=True,
+    help="Exit with 0 if nothing is denied, even if some nodes were not seen or not judged.",
+)
+@fleet_option("The robots that the placeholders of POLICY stand for.")
+@force_option
+@dry_run_option
+@json_option
+def audit(
+    sources: tuple[Path, ...],
+    watch: str | None,
+    spin_time: float | None,
+    domain: str | None,
+    enclave: str | None,
+    keystore: Path | None,
+    vendor: str | None,
+    distro: Distribution | None,
+    patch: Path | None,
+    partial: bool,
+    fleet_file: Path | None,
+    force: bool,
+    dry_run: bool,
+    as_json: bool,
+) -> int:
+    """Report what policies or a keystore would deny to the nodes that are running now.
+
+    Nothing is denied: DDS has no permissive mode, so sros observes the ROS graph and decides about
+    every endpoint as the DDS vendor would. A node is looked up in the enclave that the graph shows,
+    or else in the enclave whose profiles name it. Observes until the graph stops changing; use
+    --watch to see what nodes do only later. Several policies count as one. The default is the
+    keystore of $ROS_SECURITY_KEYSTORE.
+
+    Example:
+      $ sros audit robot.xml
+      /talker publish topic /status (/talker): no rule allows publish rt/status
+      1 right would be denied to 2 nodes with 47 endpoints, on Fast DDS 2.14
+      to allow what is denied, add --patch missing.xml to this command: ...
+      $ sros audit robot.xml --watch 1h --patch missing.xml
+      watching for 3600 s, or until Ctrl-C; then the result is shown
+      denied: /talker publish topic /status (/talker): no rule allows ...
+      ...
+      wrote 'missing.xml'; add it: sros merge_policy robot.xml missing.xml ...
+      $ sros merge_policy robot.xml missing.xml --in-place
+      $ sros audit keystore --distro lyrical
+
+    Exit status: 0 if nothing would be denied and every node of POLICY or KEYSTORE was seen; 1 if
+    something would be denied; also 1, unless --partial is given, if a node was not seen, something
+    could not be judged, or the graph kept changing; 2 if the audit could not be done.
+    """
+    from sros_tool.explain import audit as audits
+    from sros_tool.fleet.fleet_file import read_fleet
+    from sros_tool.keystore.participant import JoinContext
+    from sros_tool.runtime.rmw import chosen_vendor
+    from sros_tool.runtime.variables import ENCLAVE, domain_from
+
+    check_duration(watch, spin_time)
+    sources = sources or (keystore_from_environment(),)
+    environment = observer_environment(enclave, keystore, domain)
+    if force and patch is None:
+        raise UsageError("--force is for --patch only", "", "Leave it out.")
+    if patch is not None:
+        check_output(patch, force=force)
+    if not (vendor or distro):
+        from sros_tool.distributions import unknown_distribution
+
+        print_notes(unknown_distribution(os.environ))
+    variables = {**os.environ, **environment}
+    enclaves = audits.audited_enclaves(
+        sources,
+        chosen_vendor(vendor, distro, variables)[0],
+        JoinContext(domain_from(variables) or 0, now(), local_zone(os.environ)),
+        read_fleet(fleet_file) if fleet_file else None,
+    )
+    observer = environment.get(ENCLAVE, "")
+
+    def judge(observation: Observation) -> Audit:
+        return audits.audit(observation, enclaves, observer)
+
+    reported: set[str] = set()
+
+    def report(observation: Observation) -> None:
+        # Nodes of the policy may still appear: no line says yet that one of them is meant.
+        for key, line in replace(judge(observation), unseen=()).lines().items():
+            if key not in reported:
+                reported.add(key)
+                echo(f"denied: {line}", err=True)
+
+    then = "the result is shown"
+    snapshot, rmw = observe(environment, watch, spin_time, report, then=then)
+    audited = judge(snapshot.everything)
+    kept_changing = snapshot.seconds if not snapshot.settled else 0
+    fine = audited.allowed and (partial or (audited.complete and not kept_changing))
+    if not audited.observation.nodes:
+        raise UnavailableError(
+            "there is nothing to audit: no node was observed",
+            why_no_node_was_observed(environment, snapshot.seconds, rmw, enclave),
+        )
+    existed = patch is not None and patch.exists()
+    written = _write_patch(audited, patch, dry_run=dry_run)
+    if as_json:
+        from sros_tool.explain.audit import AuditResult, RefusedEnclave
+
+        refused = sorted(audited.refused.items())
+        print_json(
+            AuditResult(
+                sources[0],
+                sources[1:],
+                enclaves.what,
+                enclaves.vendor,
+                enclaves.context.domain,
+                fine,
+                denied=audited.denied,
+                refused=[RefusedEnclave(name, reason) for name, reason in refused],
+                unseen=audited.unseen,
+                unjudged=audited.unjudged,
+                observation=audited.observation,
+                settled=snapshot.settled,
+                partial=partial,
+                patch=patch if written else None,
+                dry_run=dry_run,
+                changes=file_change(patch, existed=existed) if patch and written else (),
+                notes=(*audited.notes, *audited.missing.notes),
+            )
+        )
+    else:
+        _show(audited, enclaves, kept_changing)
+    print_notes((*audited.notes, *audited.missing.notes))
+    if audited.allowed and not fine:
+        echo(_NOT_ALL, err=True)
+    if written:
+        one_policy = enclaves.what == "policy" and len(sources) == 1
+        policy = shlex.quote(str(sources[0])) if one_policy else "POLICY"
+        command = f"add it: sros merge_policy {policy} {shlex.quote(str(patch))} --in-place"
+        by_hand = (
+            _advice_to_add_by_hand(sources, read_fleet(fleet_file), audited) if fleet_file else ""
+        )
+        echo(f"{written}; {by_hand or command}", err=True)
+    elif patch is None and audited.missing.profiles:
+        echo(_TO_ALLOW, err=True)
+    elif patch is not None:
+        stays = f"; the earlier '{patch}' stays" if existed else ""
+        patch_remark = "no patch is needed" if audited.allowed else _NO_PATCH
+        echo(patch_remark + stays, err=True)
+    return 0 if fine else 1
+
+
+_NOT_ALL = (
+    "the exit status is 1, because something was not seen or could not be decided: --watch finds "
+    "nodes that start later, and --partial accepts this"
+)
+_TO_ALLOW = (
+    "to allow what is denied, add --patch missing.xml to this command: it writes missing rights "
+    "as a policy, and names the command that adds them"
+)
+_NO_PATCH = "no patch was written: no added right would allow what is denied"
+
+
+def _write_patch(audited: Audit, patch: Path | None, *, dry_run: bool) -> str:
+    """Write missing rights to ``patch``; return a clause about it, "" if no right is missing."""
+    from sros_tool.graph.learn import render
+
+    if patch is None or not audited.missing.profiles:
+        return ""
+    document = render(audited.missing)
+    if dry_run:
+        return f"would {'replace' if patch.exists() else 'write'} '{patch}'"
+    return save(patch, document)
+
+
+def _advice_to_add_by_hand(sources: Sequence[Path], fleet: Fleet, audited: Audit) -> str:
+    """Return where to add the missing rights to policies with placeholders, "" without them."""
+    from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.policy.document import join_policies, read_policy
+
+    stated = join_policies([read_policy(source, placeholders=True) for source in sources])
+    policy = FleetPolicy(stated, fleet)
+    if policy.policy() == stated:
+        return ""
+    missing = dict.fromkeys(profile.enclave for profile in audited.missing.profiles)
+    of = dict.fromkeys(policy.stated(name)[0] for name in missing if name in policy)
+    places = [f"{enclave.source} ({enclave.path})" for enclave in of] or [str(sources[0])]
+    return f"add its rights by hand, with placeholders, at {', '.join(places)}"
+
+
+# ── output ──────────────────────────────────────────────────────────────────────────────
+
+
+def _show(audited: Audit, enclaves: AuditedEnclaves, changing_seconds: float) -> None:
+    """Print denied rights, unseen nodes and a verdict that says what the audit did not cover."""
+    for line in (*audited.lines().values(), *(f"not seen: {node}" for node in audited.unseen)):
+        echo(line)
+    problems = [counted(len(audited.denied), "right")] if audited.denied else []
+    problems += [counted(len(audited.refused), "whole enclave")] if audited.refused else []
+    verdict = f"{' and '.join(problems) or 'nothing'} would be denied to "
+    verdict += f"{counted(len(audited.observation.nodes), 'node')} with "
+    verdict += (
+        f"{counted(audited.observation.endpoint_count, 'endpoint')}, on {enclaves.vendor.title}"
+    )
+    if audited.unseen:
+        number, of = len(audited.expected), len(audited.expected) - len(audited.unseen)
+        seen = f"{of} of {counted(number, 'node')} of the {enclaves.what}"
+        verdict = f"only {seen} {'was' if 1 in (of, number) else 'were'} seen: {verdict}"
+    if audited.unjudged:
+        verdict += f"; not judged: {', '.join(audited.unjudged)}"
+    if changing_seconds:
+        verdict += f"; the ROS graph kept changing for {changing_seconds:.0f} s"
+    echo(verdict, err=True)
+    if any(denied_right.by_rule for denied_right in audited.denied):
+        echo("some rights are denied by a DENY, which no added right overrides", err=True)
