@@ -66,9 +66,11 @@ from sros_tool.keystore.issuing.tokens import place_in
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
+    GOVERNANCE_FILE,
     IDENTITY_CA_FILE,
     KEY_FILE,
     KEY_URI_FILE,
+    PERMISSIONS_FILE,
     ROUTER_FILE,
     enclave_folder,
     enclave_path,
@@ -88,6 +90,12 @@ from sros_tool.xml import read_bytes
 
 _TOLERANCE = timedelta(minutes=2)
 _LOOK_SECONDS = 0.2
+_TRUST_FILES = tuple(
+    file
+    for file in CONFIRMED_FILES
+    if file not in (CERTIFICATE_FILE, PERMISSIONS_FILE, GOVERNANCE_FILE)
+)
+"""Files of an enclave that are not its own documents."""
 _REPLACED_LIST = "replaced.crl.pem"
 _REPLACED_FOR = timedelta(days=30)
 """How long the agent sends a revocation list that a release replaced by a list that revokes
@@ -181,7 +189,7 @@ class _Round:
         boot = self._machine.boot()
         if self._machine.restarted or before.boot != boot:
             # After a start of the machine no process has files of before; what is seen counts.
-            self._state = replace(before, due=(), boot=boot)
+            self._state = replace(before, due=(), list_due=(), boot=boot)
         if self._machine.restarted:
             self._state = replace(self._state, files=self._digests(self._enclaves()))
         proven = self._proven_moment()
@@ -203,9 +211,12 @@ class _Round:
             restarted = self._restart(names, opened)
         seen = self._look_after(restarted, names)
         self._problems += [f"{problem}." for problem in seen.problems]
-        due = enclaves_to_restart(self._state.due, seen)
+        due = enclaves_to_restart(self._state.due, seen.states, complete=seen.complete)
         unseen = tuple(name for name in due if seen.states[name] is RunningFiles.NOT_SEEN)
-        self._state = replace(self._state, due=due, unseen=unseen)
+        list_due = enclaves_to_restart(
+            self._state.list_due, seen.list_states, complete=seen.complete
+        )
+        self._state = replace(self._state, due=due, unseen=unseen, list_due=list_due)
         asked = self._renewals(names)
         arrived = self._confirm(names, opened, seen, clock, asked)
         problems = tuple(dict.fromkeys(self._problems))
@@ -439,20 +450,34 @@ class _Round:
     def _note_due(self, changed: Iterable[str], names: Iterable[str]) -> None:
         """Note the restarts that are due: also for files that somebody else changed."""
         before, files = self._state.files, self._digests(names)
-        changed_enclaves = {name for name, digest in files.items() if before.get(name) != digest}
-        due = ({*self._state.due, *changed} & files.keys()) | changed_enclaves
-        self._state = replace(self._state, due=tuple(sorted(due)), files=files)
+        due = {*self._state.due, *changed} & files.keys()
+        list_due = {*self._state.list_due} & files.keys()
+        for name, digests in files.items():
+            before_all, _, before_trust = before.get(name, "").partition(" ")
+            all_files, _, trust = digests.partition(" ")
+            if before_all != all_files:
+                due.add(name)
+                if before_trust != trust:
+                    list_due.add(name)
+        self._state = replace(
+            self._state, due=tuple(sorted(due)), list_due=tuple(sorted(list_due)), files=files
+        )
 
     def _digests(self, names: Iterable[str]) -> dict[str, str]:
-        """Return a digest of the files of each enclave, all but the key."""
+        """Return two digests of the files of each enclave: of all but the key, and without its own
+        documents, which say nothing of whom else it trusts.
+        """
         with Folder(self._folder) as opened:
             return {
-                name: hashlib.sha256(
-                    " ".join(
-                        _sha256(opened, f"{enclave_folder(name)}/{file}") or "-"
-                        for file in CONFIRMED_FILES
-                    ).encode()
-                ).hexdigest()
+                name: " ".join(
+                    hashlib.sha256(
+                        " ".join(
+                            _sha256(opened, f"{enclave_folder(name)}/{file}") or "-"
+                            for file in files
+                        ).encode()
+                    ).hexdigest()
+                    for files in (CONFIRMED_FILES, _TRUST_FILES)
+                )
                 for name in names
             }
 
@@ -482,7 +507,7 @@ class _Round:
         ]
         done = restart_units(
             settings,
-            enclaves_to_restart(self._state.due, seen),
+            enclaves_to_restart(self._state.due, seen.states, complete=seen.complete),
             routers=routers,
             unusable={
                 name: enclave.problem
@@ -545,9 +570,14 @@ class _Round:
             dds=processes.dds,
             unreadable=self._unreadable,
         )
+        restart, crl_restart = (
+            tuple(sorted({*names, *processes.elsewhere}))
+            for names in (self._state.due, self._state.list_due)
+        )
         confirmation = replace(
             confirmation,
-            restart=tuple(sorted({*self._state.due, *processes.elsewhere})),
+            restart=restart,
+            crl_restart=None if crl_restart == restart else crl_restart,
             sequence=sequence,
             release=self._state.release,
             expiry={name: _expiry(opened_enclaves.get(name)) for name in names},

@@ -14,6 +14,7 @@ from typing import NamedTuple
 from sros_tool.agent.settings import AgentSettings
 from sros_tool.checks.processes import (
     PROCESS_OUTDATED,
+    may_lack_list,
     newer_files,
     other_folder_findings,
     process_findings,
@@ -28,6 +29,7 @@ from sros_tool.keystore.confirmation import (
 )
 from sros_tool.runtime.processes import (
     Process,
+    ProcessEnclave,
     ProcessTable,
     RunningProcesses,
     installed_dds,
@@ -50,6 +52,9 @@ class EnclaveProcesses(NamedTuple):
     states: Mapping[str, RunningFiles]
     """The files that the processes of each enclave have loaded, of those that run from the folder.
     """
+    list_states: Mapping[str, RunningFiles]
+    """The same of the revocation list and the CAs alone: ``current`` also if only the enclave's own
+    documents are newer than a process."""
     elsewhere: tuple[str, ...]
     """The enclaves of the folder in which a process runs from another folder: a restart of a unit
     does not help there.
@@ -80,7 +85,8 @@ def look_at_processes(
     by_enclave: dict[str, list[Process]] = {}
     for process in own_processes:
         by_enclave.setdefault(_enclave_of(process), []).append(process)
-    states = {name: _state(by_enclave.get(name, ())) for name in names}
+    states = {name: _state(by_enclave.get(name, ()), _is_outdated) for name in names}
+    list_states = {name: _state(by_enclave.get(name, ()), may_lack_list) for name in states}
     other_processes = [
         process
         for process in running.processes
@@ -109,6 +115,7 @@ def look_at_processes(
     )
     return EnclaveProcesses(
         states,
+        list_states,
         tuple(sorted({*map(_enclave_of, elsewhere)})),
         complete,
         problems,
@@ -136,21 +143,27 @@ def _is_of(process: Process, folder: Path) -> bool:
     return named and not _folder_is_known(process)
 
 
-def _state(processes: Iterable[Process]) -> RunningFiles:
+def _is_outdated(process: Process, enclave: ProcessEnclave) -> bool:
+    return any(newer_files(process, enclave))
+
+
+def _state(
+    processes: Iterable[Process], is_outdated: Callable[[Process, ProcessEnclave], bool]
+) -> RunningFiles:
     seen = False
     for process in processes:
         if process.enclave is None or process.enclave.problem:
             continue
-        if any(newer_files(process, process.enclave)):
+        if is_outdated(process, process.enclave):
             return RunningFiles.EARLIER
         seen = True
     return RunningFiles.CURRENT if seen else RunningFiles.NOT_SEEN
 
 
 def enclaves_to_restart(
-    due_enclaves: Iterable[str], processes: EnclaveProcesses
+    due_enclaves: Iterable[str], states: Mapping[str, RunningFiles], *, complete: bool
 ) -> tuple[str, ...]:
-    """Return the enclaves whose processes have to be restarted.
+    """Return the enclaves whose processes have to be restarted, by the states of all enclaves.
 
     A restart is done when the processes of the enclave were seen with the installed files, or when
     all processes of the machine were seen and none is in the enclave.
@@ -158,13 +171,9 @@ def enclaves_to_restart(
     return tuple(
         sorted(
             name
-            for name, state in processes.states.items()
+            for name, state in states.items()
             if state is RunningFiles.EARLIER
-            or (
-                name in set(due_enclaves)
-                and state is RunningFiles.NOT_SEEN
-                and not processes.complete
-            )
+            or (name in set(due_enclaves) and state is RunningFiles.NOT_SEEN and not complete)
         )
     )
 

@@ -43,8 +43,10 @@ class AgentState:
     the number of the last message.  ``latest`` is the latest moment that has certainly passed:
     verified documents begin to be valid then.  ``due`` are the enclaves whose processes were not
     yet seen with the installed files, since the start ``boot`` of the machine (see `boot_id`); of
-    those in ``unseen``, no process was seen.  ``files`` maps enclaves to a digest of their files at
-    the end of the last round: other files, whoever wrote them, make a restart due.  ``fetched`` and
+    those in ``unseen``, no process was seen.  ``list_due`` are the enclaves whose processes may
+    lack the revocation list.  ``files`` maps enclaves to two digests of their files at the end of
+    the last round, as text, of all files and of all but its own documents: other files, whoever
+    wrote them, make a restart due.  ``fetched`` and
     ``sent`` tell when the source and the inbox were last reached.  ``repaired`` is a sentence on
     files that were not those of the release and were replaced, at ``repaired_at``.
     """
@@ -55,6 +57,7 @@ class AgentState:
     latest: datetime | None = None
     due: tuple[str, ...] = ()
     unseen: tuple[str, ...] = ()
+    list_due: tuple[str, ...] = ()
     boot: str = ""
     fetched: datetime | None = None
     sent: datetime | None = None
@@ -102,7 +105,8 @@ def _state_from(value: Any) -> AgentState:
             value[moment] = parse_iso(_text(value[moment]))
     value["boot"] = _text(value["boot"])
     value["repaired"] = _text(value.get("repaired", ""))
-    for names in ("due", "unseen"):
+    value.setdefault("list_due", value["due"])
+    for names in ("due", "unseen", "list_due"):
         value[names] = tuple(check_enclave_name(_text(name)) for name in value[names])
     value["files"] = {
         check_enclave_name(_text(name)): _text(text)

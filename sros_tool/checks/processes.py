@@ -222,6 +222,18 @@ def newer_files(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
         yield from (f"'{_plain_path(file)}' (its place or mode)" for file in moved[:1])
 
 
+def may_lack_list(process: Process, enclave: ProcessEnclave) -> bool:
+    """Return whether a process may have loaded another revocation list, or other CAs.
+
+    If only the enclave's own documents are newer than the process, it has loaded the same list.
+    """
+    moved = any(moment > process.started for moment in enclave.moved.values())
+    return moved or not {*newer_files(process, enclave)} <= _OWN_FILES
+
+
+_OWN_FILES = {CERTIFICATE_FILE, KEY_FILE, PERMISSIONS_FILE, GOVERNANCE_FILE}
+
+
 def _unread_file_findings(process: Process, enclave: ProcessEnclave) -> Iterator[Finding]:
     unread = [f"{file.name} ({file.problem})" for file in enclave.files if file.problem]
     if unread:

@@ -239,7 +239,7 @@ def _unit(text: str) -> Unit:
 @click.option(
     "--restarted", is_flag=True,
     help="With --once: all processes were restarted since the last round, also those that the "
-    "agent cannot see.",
+    "agent cannot see. It does not count for files that this round installs.",
 )  # fmt: skip
 @json_option
 def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool) -> int:
@@ -270,7 +270,7 @@ def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool
     if once:
         with agent_lock(folder):
             done = _round(folder, read_settings(folder), restarted=restarted)
-        _show(folder, done, as_json=as_json)
+        _show(folder, done, restarted=restarted, as_json=as_json)
         return int(bool(done.problems))
     while True:
         try:
@@ -294,17 +294,17 @@ def _round(folder: Path, settings: AgentSettings, *, restarted: bool = False) ->
     return run_round(folder, settings, machine)
 
 
-def _show(folder: Path, finished_round: Round, *, as_json: bool) -> None:
+def _show(folder: Path, finished_round: Round, *, restarted: bool = False, as_json: bool) -> None:
     if as_json:
         print_json(finished_round)
         return
-    for line in _round_lines(folder, finished_round):
+    for line in _round_lines(folder, finished_round, restarted=restarted):
         echo(visible_line(line))
     for problem in finished_round.problems:
         echo(visible_line(problem), err=True)
 
 
-def _round_lines(folder: Path, finished_round: Round) -> Iterator[str]:
+def _round_lines(folder: Path, finished_round: Round, *, restarted: bool) -> Iterator[str]:
     release = f"release {finished_round.release}" if finished_round.release else "no release"
     changes = (
         [f"changed {counted(len(finished_round.changed), 'enclave')}"]
@@ -320,6 +320,11 @@ def _round_lines(folder: Path, finished_round: Round) -> Iterator[str]:
     if finished_round.fetched:
         no_change = "nothing changed" if finished_round.problems else "nothing new"
     yield f"{release}: {', '.join(changes) or no_change}"
+    if restarted and finished_round.unseen:
+        yield (
+            "--restarted does not count for files that came in this round, after the restart: "
+            f"those of {first_few(finished_round.unseen, _MOST_SHOWN)}"
+        )
     yield from _due_lines(folder, finished_round.restart, finished_round.unseen)
     if finished_round.requests:
         yield f"asked for renewal of {counted(finished_round.requests, 'enclave')}"

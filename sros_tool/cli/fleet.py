@@ -588,9 +588,9 @@ def _status(
     advisories of sros; --robot and --advisories list them.
 
     sros counts the revocation list as in force on a robot if the robot has the list, and its
-    confirmation says that no restart is due. A robot does not report which earlier files a process
-    has loaded. So after any change of files, sros counts the list as in force only once the
-    processes were restarted.
+    confirmation says that no process has to restart for it. `sros agent` tells processes that lack
+    the list from those that lack only new permissions, governance or certificates of their own; in
+    other confirmations, every due restart counts.
 
     Example:
       $ sros fleet status keystore
@@ -1026,8 +1026,8 @@ def _dds_count_lines(compared_fleet: ComparedFleet) -> Iterator[str]:
         robots = _robot_names(outdated, status.names, status.groups)
         yield (
             f"a later release fixes known vulnerabilities in the DDS of {robots}; "
-            f"`sros fleet status {quote(str(status.keystore))} --robot {outdated[0]}` lists them, and "
-            "--fail-on vulnerabilities makes the exit status 1"
+            f"`sros fleet status {quote(str(status.keystore))} --robot {outdated[0]}` lists them, "
+            "and --fail-on vulnerabilities makes the exit status 1"
         )
     elif list(_dds_findings(compared_fleet)):
         severities = Counter(finding.severity.word for finding in compared_fleet.findings)

@@ -65,7 +65,17 @@ CONFIRMED_FILES = (
 _CERTIFICATE_FILES = (CERTIFICATE_FILE, IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
 
 _KEYS = {"format", "robot", "time", "files"}
-_OF_AGENT = ("sequence", "release", "expiry", "running", "clock", "problems", "requests", "crl")
+_OF_AGENT = (
+    "crl_restart",
+    "sequence",
+    "release",
+    "expiry",
+    "running",
+    "clock",
+    "problems",
+    "requests",
+    "crl",
+)
 """Keys that only `sros agent` writes."""
 _OPTIONAL_KEYS = {"certificates", "restart", "dds", *_OF_AGENT}
 _CLOCK_TOLERANCE = timedelta(minutes=1)
@@ -166,7 +176,9 @@ class Confirmation:
     The other parts come from `sros agent`, and are None in a confirmation of another program.
     ``sequence`` is higher in each message of a robot.  ``release`` is the number of the release
     that is installed; 0 for none.  ``expiry`` and ``running`` map enclaves to when their files
-    expire, and to what their processes have loaded.  ``problems`` are short sentences, and
+    expire, and to what their processes have loaded.  ``crl_restart`` are the enclaves of
+    ``restart`` whose processes may not have loaded the revocation list, if not all of them: the
+    others lack only their own new documents.  ``problems`` are short sentences, and
     ``requests`` signing requests (PEM) for certificates that expire.  ``crl`` is the newest
     revocation list (PEM) on the robot, if it may differ from the list that was published last: a
     keystore that was restored from a backup learns from it what it has revoked since.
@@ -186,6 +198,7 @@ class Confirmation:
     problems: tuple[str, ...] | None = None
     requests: tuple[str, ...] | None = None
     crl: str | None = None
+    crl_restart: tuple[str, ...] | None = None
 
     def enclaves(self) -> tuple[str, ...]:
         """Return the names of the enclaves in the confirmation, sorted."""
@@ -650,7 +663,7 @@ def _restart_from(value: Any, label: str) -> tuple[str, ...]:
         DocumentError: the value is not a list of such names.
     """
     if not isinstance(value, list):
-        raise _invalid_confirmation_error(label, "its restart is not a list")
+        raise _invalid_confirmation_error(label, "its restart or crl_restart is not a list")
     return tuple(sorted({_enclave_from(name, label) for name in value}))
 
 
@@ -758,6 +771,7 @@ _AGENT_READERS: Mapping[str, Callable[[Any, str], Any]] = {
     "problems": _problems_from,
     "requests": _requests_from,
     "crl": _crl_from,
+    "crl_restart": _restart_from,
 }
 
 

@@ -253,11 +253,11 @@ class RobotStatus:
     """The files that the processes of each enclave of the robot have loaded, by its last
     confirmation; null if the confirmation does not tell."""
     crl_in_force: bool | None
-    """Whether the robot has the current revocation list, says that no process may run with earlier
-    files (``restart`` is empty), and is not ``offline``; false if this is not known, or the
+    """Whether the robot has the current revocation list, says that no process may run with an
+    earlier one or with earlier CAs, and is not ``offline``; false if this is not known, or the
     keystore is older than its robots; null if the keystore has no list, or the robot has no
-    enclave. Robots do not say which of their earlier files a process has, so a restart for other
-    files counts, too."""
+    enclave. `sros agent` knows the processes that lack only new permissions, governance or
+    certificates of their own; for other robots, any restart that is due counts."""
     expiry: Mapping[Annotated[str, Words(_EXPIRING)], datetime]
     """The first expiry of the files that the robot confirmed, by kind, in UTC, from the ledger."""
     dds: RobotDds | None
@@ -600,6 +600,14 @@ class _ComparedRobot(NamedTuple):
             return None
         earlier = {name for name, files in (running or {}).items() if files == RunningFiles.EARLIER}
         return tuple(sorted(earlier | ({*(due or ())} & {*self.enclaves})))
+
+    def crl_restart(self) -> tuple[str, ...] | None:
+        """Return the enclaves whose processes may lack the revocation list; None if not reported.
+
+        Robots of earlier releases say only which enclaves have to restart, whatever changed.
+        """
+        due = self.confirmed.crl_restart if self.confirmed else None
+        return self.restart() if due is None else tuple(sorted({*due} & {*self.enclaves}))
 
 
 def _compare_robots(root: Path, fleet: Fleet, robots: Sequence[Robot]) -> list[_ComparedRobot]:
@@ -1058,7 +1066,9 @@ def _status(
         different,
         restart,
         compared_robot.running(),
-        has_list and restart == () if known.has_list and compared_robot.enclaves else None,
+        has_list and compared_robot.crl_restart() == ()
+        if known.has_list and compared_robot.enclaves
+        else None,
         {kind: file.window.not_after for kind, file in validity.items()},
         confirmed.dds if confirmed else None,
         confirmed.problems if confirmed else None,

@@ -498,6 +498,30 @@ def test_a_restart_is_due_until_the_processes_were_seen_with_the_new_files(
     assert r1.round().restart == ()
 
 
+def test_other_permissions_leave_the_revocation_list_in_force(home: Home, r1: Robot) -> None:
+    """A process that started before them has the list, if it started after the list came."""
+    r1.unseen, r1.release = True, home.revoked
+    r1.round()
+    assert r1.message().crl_restart is None, "the list is due wherever a restart is"
+    r1.restarted = True
+    r1.round()
+    r1.restarted, r1.started = False, {"/r1/b": moment() + timedelta(seconds=0.02)}
+    time.sleep(0.04)
+    r1.release = home.release({**home.revoked.files, **governance_again(home)}, 4)
+    for running in ("/r1/b",), ():
+        r1.started = {name: r1.started[name] for name in running}
+        assert r1.round().restart == ("/r1/b",)
+        assert r1.message().crl_restart == ()
+    r1.started = {"/r1/b": moment() - timedelta(hours=1)}
+    r1.round()
+    assert r1.message().crl_restart is None, "a process that started before the list lacks it"
+    r1.started = {}
+    (r1.folder / "enclaves/r1/b" / CRL_FILE).write_text("x")
+    r1.release = None
+    r1.round()
+    assert r1.message().crl_restart is None
+
+
 def test_a_look_at_the_processes_has_its_own_time(r1: Robot) -> None:
     """A process seems to start earlier by what passes between the time and the look."""
     before, now = time.monotonic(), moment()

@@ -14,6 +14,7 @@ import pytest
 
 from sros_tool.keystore.reader import read_certificate
 from sros_tool.pki.certificates import validity_of
+from sros_tool.runtime.processes import ProcessTable, RunningProcesses, UnseenProcess
 from tests.cli.test_json import Seen
 from tests.support.harness import Ended, copy_of, policy_text, publish, snapshot, sros
 
@@ -140,6 +141,19 @@ def test_renewal_without_anybody_at_the_robot(world: World) -> None:
     assert after.public_key() == before.public_key()
     assert "asked for" not in done.out
     world.run("verify", "robot").ok()
+
+
+def test_what_is_said_restarted_has_no_files_of_the_same_round(world: World) -> None:
+    """They came after the restart, so that its processes have the files of before."""
+    unseen = RunningProcesses((), (UnseenProcess(9, ("x",), "it is closed", speaks=False),))
+    world.monkeypatch.setattr(ProcessTable, "look", lambda *_: unseen)
+    world.run(*INIT).ok()
+    world.agent("--restarted").ok()
+    world.run("renew", "ks", "/r1/a").ok()
+    world.run("fleet", "publish", "ks", "pub").ok()
+    early = world.agent("--restarted").ok().out
+    assert "came in this round, after the restart: those of /r1/a\nrestart due: /r1/a\n" in early
+    assert "restart" not in world.agent("--restarted").ok().out
 
 
 def test_a_robot_that_was_away_for_a_month_goes_on(world: World) -> None:

@@ -414,6 +414,22 @@ def test_a_restart_that_is_due(field: Field) -> None:
     assert "processes of /r1/base may run with earlier files" in page
 
 
+def test_other_permissions_leave_the_list_in_force(field: Field) -> None:
+    """Only on robots whose list changed, or that do not say what changed, is it not in force."""
+    field.run("revoke", "ks", "--robot", "r3")
+    for name, changed in (
+        ("r1", {"restart": ["/r1/base"], "crl_restart": []}),
+        ("r2", {"restart": ["/r2/base"]}),
+    ):
+        field.run("distribute_key", "ks", "--robot", name, name, "--force")
+        field.send(name, **{"restart": (), **changed})
+    robots = field.status()["robots"]
+    assert [robots[name]["state"] for name in ("r1", "r2")] == ["restart", "restart"]
+    assert [robots[name]["crl_in_force"] for name in ("r1", "r2")] == [True, False]
+    field.send("r1", restart=["/r1/base"], crl_restart=["/r1/base"])
+    assert not field.status()["robots"]["r1"]["crl_in_force"]
+
+
 def test_a_robot_that_fetches_is_offline_after_a_day(field: Field) -> None:
     """A robot that confirms by plays is not, unless somebody asks for it."""
     hours = timedelta(hours=1)
