@@ -8,6 +8,7 @@ import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+from itertools import islice
 from pathlib import Path, PurePosixPath
 from shlex import quote
 from typing import TYPE_CHECKING
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore
     from sros_tool.keystore.zenoh_files import OpenedZenoh
     from sros_tool.pki.token import TokenUri
+    from sros_tool.policy.model import Policy
+    from sros_tool.policy.rights import NodeName
     from sros_tool.zenoh.configuration import Configuration
 
 RMWS = (
@@ -697,21 +700,21 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
             or the policy has the node in no enclave or in several.
         PolicyError: the policy cannot be read.
     """
-    from sros_tool.names import is_expression
+    from sros_tool.names import check_namespace, is_expression
     from sros_tool.policy.document import read_policy
     from sros_tool.runtime.environment import possible_nodes
 
     nodes = possible_nodes(command)
-    if not nodes:
-        raise UsageError(
-            f"the command '{command[0]}' names no node",
-            "The policy assigns enclaves to node names, and `--ros-args -r __node:=NAME` sets "
-            "the name.",
-            "Start a launch file with `ros2 launch --secured KEYSTORE POLICY ...`, which finds the "
-            "enclave of each of its nodes, and this command in an enclave of its own: `sros run "
-            "KEYSTORE ENCLAVE -- COMMAND`.",
-        )
     policy = read_policy(file)
+    if not nodes:
+        raise _unnamed_node_error(policy, command)
+    for ns, _ in nodes.values():
+        if ns != check_namespace(ns):
+            raise UsageError(
+                f"the namespace {ns!r} ends with '/'",
+                "ROS starts no node in it.",
+                f"Write `-r __ns:={quote(check_namespace(ns))}`.",
+            )
     found = {tuple(e.path for e in policy.enclaves_of_node(*node)) for node in nodes.values()}
     if "" not in nodes or len(found) > 1:
         raise _unknown_node_error(command, nodes, [*found])
@@ -745,6 +748,32 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
     raise UsageError(f"the policy '{file}' has the node {full} {where}", why, remedy)
 
 
+def _unnamed_node_error(policy: Policy, command: Sequence[str]) -> UsageError:
+    """Return the error for a command that does not name its node.
+
+    A rule for a node (``-r talker:a:=b``) does not tell that the process has this node.
+    """
+    from sros_tool.runtime.environment import rules_of_nodes, started_nodes
+
+    *_, (ns, _) = started_nodes(command)
+    remedy = (
+        "Start a launch file with `ros2 launch --secured KEYSTORE POLICY ...`, which finds the "
+        "enclave of each of its nodes, and this command in an enclave of its own: `sros run "
+        "KEYSTORE ENCLAVE -- COMMAND`."
+    )
+    for name in rules_of_nodes(command):
+        enclaves = policy.enclaves_of_node(ns or "/", name)
+        if len(enclaves) == 1:
+            run = f"`sros run KEYSTORE {quote(enclaves[0].path)} -- COMMAND`"
+            remedy = f"If the process has the node {_full_name(ns, name)}, as a rule says: {run}."
+    return UsageError(
+        f"the command '{command[0]}' names no node",
+        "The policy assigns enclaves to node names, and `--ros-args -r __node:=NAME` sets the "
+        "name.",
+        remedy,
+    )
+
+
 def _unknown_node_error(
     command: Sequence[str], nodes: Mapping[str, tuple[str, str]], found: Sequence[tuple[str, ...]]
 ) -> UsageError:
@@ -770,21 +799,19 @@ def other_node_notes(
 ) -> tuple[Note, ...]:
     """Return a note if a command gives its nodes a name that the enclave's permissions lack.
 
-    A command that names no namespace counts as one for "/", if it certainly starts nodes.  If
-    the ledger lacks the permissions, sros knows only nodes that offer their standard services: then
-    it returns a note only if the permissions have the name in another namespace.
+    A command that names no namespace counts as one for "/", if it certainly starts nodes.  Where
+    its rules depend on the node's own name, the note is for a command that gives only such names.
+    If the ledger lacks the permissions, sros knows only nodes that offer their standard services:
+    then it returns a note only if the permissions have the name in another namespace.
     """
     from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.rights import RecordedRights
-    from sros_tool.names import is_expression
-    from sros_tool.policy.patterns import overlap
     from sros_tool.policy.rights import nodes_from_text, nodes_of_rights
-    from sros_tool.runtime.environment import node_rules, starts_nodes
+    from sros_tool.runtime.environment import started_nodes, starts_nodes
     from sros_tool.translate import grant_rights
 
-    ns, name = node_rules(command)
-    of_one_node = any(":__ns:=" in word or ":__node:=" in word for word in command)
-    if of_one_node or not (ns or name or starts_nodes(command)):
+    started = list(started_nodes(command))
+    if started == [("", "")] and not starts_nodes(command):
         return ()
     keystore = OpenedKeystore(root)
     state = keystore.enclave(enclave, now=now)
@@ -793,13 +820,29 @@ def other_node_notes(
         return ()
     known = nodes_of_rights(grant_rights(enclave, grant))
     digest = hashlib.sha256(state.files.get(PERMISSIONS_FILE, b"")).hexdigest()
-    if recorded := RecordedRights(keystore).latest(enclave, digest):
+    recorded = RecordedRights(keystore).latest(enclave, digest)
+    if recorded:
         known += nodes_from_text(recorded.nodes)
-    else:
+    notes = [_other_node_note(enclave, known, *node, all_known=bool(recorded)) for node in started]
+    return tuple(islice(filter(None, notes), 1)) if all(notes) else ()
+
+
+def _other_node_note(
+    enclave: str, known: tuple[NodeName, ...], ns: str, name: str, *, all_known: bool
+) -> Note | None:
+    """Return a note if ``known``, the nodes of an enclave, lack a node.
+
+    "" stands for any namespace or name.  Unless ``known`` are all nodes of the enclave, the note
+    is only for a name that they have in another namespace.
+    """
+    from sros_tool.names import is_expression
+    from sros_tool.policy.patterns import overlap
+
+    if not all_known:
         known = tuple(node for node in known if name and overlap(node.name, name))
     named = [node for node in known if not name or overlap(node.name, name)]
     if not known or any(overlap(node.ns, f"/{ns.strip('/')}") for node in named):
-        return ()
+        return None
     nodes = first_few([_full_name(*node) for node in named or known], 3)
     if named and not ns:
         rule = "NAMESPACE" if is_expression(named[0].ns) else quote(named[0].ns)
@@ -808,7 +851,7 @@ def other_node_notes(
             f"{nodes}: write `-r __ns:={rule}` after --ros-args, unless the program sets its "
             "namespace itself."
         )
-        return (Note("run.other-node", text),)
+        return Note("run.other-node", text)
     started = f"the node {_full_name(ns, name)}" if ns and name else f"a node in the namespace {ns}"
     if not ns:
         started = f"a node with the name {name}"
@@ -817,7 +860,7 @@ def other_node_notes(
         f"permissions of enclave {enclave} are for the node{'s' * (len(known) > 1)} {nodes}. "
         "Correct `__ns:=` or `__node:=`, or name the enclave of this node."
     )
-    return (Note("run.other-node", text),)
+    return Note("run.other-node", text)
 
 
 def _full_name(ns: str, name: str) -> str:

@@ -98,6 +98,10 @@ _EXPRESSION = re.compile(
     r"(?:~(?=/|\Z))?(?:[A-Za-z0-9_/*?]|\[!?[A-Za-z0-9_/]+(?:-[A-Za-z0-9_]+)*\])*\Z"
 )
 _RANGE = re.compile(r"(.)-(.)")
+MAX_NAMESPACE = 245
+"""Maximum length of a node's namespace, in characters (RMW_NAMESPACE_MAX_LENGTH)."""
+MAX_NODE_NAME = 255
+"""Maximum length of a node's name, in characters (RMW_NODE_NAME_MAX_NAME_LENGTH)."""
 _MAX_EXPRESSION = 2000  # characters; the names that an expression can match have at most 255
 
 
@@ -197,7 +201,8 @@ def expression_problem(text: str) -> str:
 def check_namespace(ns: str) -> str:
     """Return the normalised namespace of a profile; raise `InvalidNameError` if it is not valid.
 
-    "" becomes "/", and one trailing slash is dropped.  Wildcards are allowed.
+    "" becomes "/", as in rcl.  One trailing slash is dropped, as in ros2/sros2 (permissions.xsl),
+    though a node cannot have it (rmw_validate_namespace).  Wildcards are allowed.
     """
     text = ns if ns == "/" else ns.removesuffix("/")
     if not text:
@@ -205,9 +210,25 @@ def check_namespace(ns: str) -> str:
     problem = "" if ns == "/" else expression_problem(text)
     if not problem and text[0] not in "/*":
         problem = "A namespace starts with '/'."
+    if not problem and len(text) > MAX_NAMESPACE and not is_expression(text):
+        problem = f"It has {len(text)} characters, more than {MAX_NAMESPACE}."
     if problem:
         raise InvalidNameError(f"{ns!r} is not a valid namespace", problem, "")
     return text
+
+
+def node_name_problem(name: str) -> str:
+    """Return why ROS would refuse the name of a node, as a sentence; "" if it is valid.
+
+    Wildcards are allowed.  Source: rmw_validate_node_name.
+    """
+    if problem := expression_problem(name):
+        return problem
+    if "/" in name or "~" in name:
+        return "A node name has no '/' and no '~'; its namespace goes into ns=."
+    if len(name) > MAX_NODE_NAME and not is_expression(name):
+        return f"It has {len(name)} characters, more than {MAX_NODE_NAME}."
+    return ""
 
 
 def expand(name: str, ns: str, node: str) -> str:

@@ -242,6 +242,10 @@ POLICIES: dict[str, tuple[str | Callable[[], str], str]] = {
     "slash in the node": (GOOD.replace('node="n"', 'node="a/b"'), "not a valid node name"),
     "tilde as the node": (GOOD.replace('node="n"', 'node="~"'), "not a valid node name"),
     "hyphen in the node": (GOOD.replace('node="n"', 'node="a-b"'), "not a valid node name"),
+    "a node name that ROS refuses": (
+        GOOD.replace('node="n"', f'node="{"n" * 256}"'),
+        "It has 256 characters, more than 255",
+    ),
     "relative ns": (GOOD.replace('ns="/"', 'ns="a"'), "starts with '/'"),
     "double slash as ns": (GOOD.replace('ns="/"', 'ns="//"'), "not a valid namespace"),
     "dots in ns": (GOOD.replace('ns="/"', 'ns="/../x"'), "not a valid namespace"),

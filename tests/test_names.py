@@ -72,7 +72,9 @@ def test_namespaces(given_ns: str, ns: str) -> None:
     assert check_namespace(given_ns) == ns
 
 
-@pytest.mark.parametrize("ns", ["a", "//", "/a//", "~", "~/a", "/a b", " /a", "/1", "/..", "/a\n"])
+@pytest.mark.parametrize(
+    "ns", ["a", "//", "/a//", "/" + "a" * 245, "~", "~/a", "/a b", " /a", "/1", "/..", "/a\n"]
+)
 def test_no_namespaces(ns: str) -> None:
     with pytest.raises(InvalidNameError):
         check_namespace(ns)

@@ -645,11 +645,11 @@ def _log_text(log: Path) -> str:
 
 
 def _namespace_and_name(node: str | None) -> tuple[str, str] | None:
-    from sros_tool.names import check_namespace, expression_problem
+    from sros_tool.names import check_namespace, node_name_problem
 
     if node is None:
         return None
     ns, _, name = node.rpartition("/")
-    if problem := expression_problem(name):
+    if problem := node_name_problem(name):
         raise UsageError(f"--node {node!r} is not a node", problem, "Write it as /namespace/name.")
     return check_namespace(ns), name

@@ -32,7 +32,13 @@ from urllib.parse import unquote
 from lxml import etree
 
 from sros_tool.errors import DocumentError, InvalidNameError, Note, PolicyError, UsageError
-from sros_tool.names import check_enclave_name, check_namespace, expand, expression_problem
+from sros_tool.names import (
+    check_enclave_name,
+    check_namespace,
+    expand,
+    expression_problem,
+    node_name_problem,
+)
 from sros_tool.policy.model import (
     PROTECT,
     RIGHTS,
@@ -586,11 +592,10 @@ class _Reader:
             ns = ns.removesuffix("/") if has_placeholder(ns) else checked
         except InvalidNameError as error:
             raise self._invalid_name_error(error, ns, "namespace", element, place) from error
-        if sampled and ("/" in sampled or "~" in sampled or expression_problem(sampled)):
+        if sampled and (problem := node_name_problem(sampled)):
             raise PolicyError(
                 f"{self._place_text(element, place)}: {_short(node)} is not a valid node name",
-                expression_problem(sampled)
-                or "A node name has no '/' and no '~'; its namespace goes into ns=.",
+                problem,
             )
         groups = tuple(
             group

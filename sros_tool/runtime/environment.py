@@ -254,13 +254,20 @@ def possible_nodes(command: Sequence[str]) -> dict[str, tuple[str, str]]:
     return nodes
 
 
-def node_rules(command: Sequence[str]) -> tuple[str, str]:
-    """Return the namespace and the name that a command gives its nodes; "" for what it leaves out.
+def started_nodes(command: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yield namespace and name that a command may give a node; "" for what it leaves out.
 
-    Rules for one of several nodes (``-r talker:__node:=NAME``) are passed over.
+    The last pair is that of a node whose own name no rule names (``-r talker:__node:=NAME``).
     """
     names, namespaces = _node_rules(command)
-    return namespaces.get("", ""), names.get("", "")
+    for own in (*filter(None, dict.fromkeys((*names, *namespaces))), ""):
+        name = next((new for of, new in names.items() if of in ("", own)), own)
+        yield next((ns for of, ns in namespaces.items() if of in ("", name)), ""), name
+
+
+def rules_of_nodes(command: Sequence[str]) -> list[str]:
+    """Return the node names that remapping rules of a command are for (``-r talker:a:=b``)."""
+    return [node for node in dict.fromkeys(node for node, _, _ in _rules(command)) if node]
 
 
 def _node_rules(command: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
@@ -271,6 +278,16 @@ def _node_rules(command: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]
     """
     names: dict[str, str] = {}
     namespaces: dict[str, str] = {}
+    for node, what, value in _rules(command):
+        if value and what in _NODE_RULES:
+            names.setdefault(node, value)
+        elif value and what == _NAMESPACE_RULE:
+            namespaces.setdefault(node, value)
+    return names, namespaces
+
+
+def _rules(command: Sequence[str]) -> Iterator[tuple[str, str, str]]:
+    """Yield the node ("": all), the left and the right side of each remapping rule."""
     of_ros = False
     for before, word in pairwise(("", *command)):
         if word == ROS_ARGS:
@@ -280,11 +297,7 @@ def _node_rules(command: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]
         elif of_ros and before in _REMAP_OPTIONS:
             rule, _, value = word.partition(":=")
             node, _, what = rule.rpartition(":")
-            if value and what in _NODE_RULES:
-                names.setdefault(node, value)
-            elif value and what == _NAMESPACE_RULE:
-                namespaces.setdefault(node, value)
-    return names, namespaces
+            yield node, what, value
 
 
 def _is_ros2_run(command: Sequence[str]) -> bool:

@@ -91,6 +91,17 @@ def test_the_keystore_may_come_from_the_environment(made: Path) -> None:
         ),
         (("-r", "__node:=talker", "-r", "talker:__ns:=/left", "-r", "__ns:=/"), "/left/talker in"),
         (("-r", "__ns:=/left"), "names no node"),
+        (
+            ("-r", "listener:/a:=/b"),
+            "names no node. The policy assigns enclaves to node names, and `--ros-args -r "
+            "__node:=NAME` sets the name. If the process has the node /listener, as a rule "
+            "says: `sros run KEYSTORE /line/listener -- COMMAND`.",
+        ),
+        (("-r", "both:/a:=/b"), "in an enclave of its own"),
+        (
+            ("-r", "__node:=talker", "-r", "__ns:=/left/arm/"),
+            "ends with '/'. ROS starts no node in it. Write `-r __ns:=/left/arm`.",
+        ),
         (("--", "-r", "__node:=talker"), "names no node"),
         (("-p", "__node:=talker"), "names no node"),
         (("-r", "__node:="), "names no node"),
@@ -121,6 +132,10 @@ def test_a_node_that_the_permissions_lack_is_named_before_it_starts(
         (made / "ks", "-r __node:=other", "a node with the name other"),
         (made / "ks", "-r __node:=talker -r __ns:=/left/arm", ""),
         (made / "ks", "-r __node:=hidden", "no namespace"),
+        (made / "ks", "-r talker:__ns:=/right -r __ns:=/right", "the node /right/talker"),
+        (made / "ks", "-r x:__node:=y -r __node:=other", "a node with the name y"),
+        (made / "ks", "-r talker:__ns:=/right", ""),  # it may be for a node that is not there
+        (export, "-r x:__node:=hidden -r __node:=hidden", "no namespace"),
         (made / "ks", "", ""),  # it may be /talker
         (made / "ks", "-r __ns:=/left", ""),
         (export, "-r __node:=hidden -r __ns:=/right", "the node /right/hidden"),
