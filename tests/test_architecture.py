@@ -38,7 +38,7 @@ LAYERS = {
     4: {"reach", "keystore", "graph", "runtime"},
     5: {"checks", "explain", "demo"},
     6: {"proof", "enclave_environment"},
-    7: {"report", "agent", "closing"},
+    7: {"report", "agent", "close"},
     8: {"api", "cli"},
     9: {"launch", "__init__", "__main__"},
 }

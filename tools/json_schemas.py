@@ -79,7 +79,7 @@ VERBS: Mapping[str, str | Shapes] = {
     "review": "sros_tool.proof.review:ReviewResult",
     "verify": "sros_tool.checks.keystores.arrival:VerifiedFolder",
     "audit": "sros_tool.explain.audit:AuditResult",
-    "close": "sros_tool.closing:Closing",
+    "close": "sros_tool.close.state:CloseState",
     "fleet status": "sros_tool.cli.fleet:ComparedFleet",
     "explain": Shapes(
         "What DDS or Zenoh decides, by which rule, and why.",

@@ -29,7 +29,9 @@ from sros_tool.validity import iso
 from sros_tool.wording import counted, enumerated
 
 if TYPE_CHECKING:
-    from sros_tool.closing import ClosedProcess, Closing, OpenRobot
+    from sros_tool.close.processes import ClosedProcess
+    from sros_tool.close.robot import LocalRobot
+    from sros_tool.close.state import CloseState
     from sros_tool.policy.model import Policy
 
 
@@ -124,7 +126,11 @@ def close(
     Exit status: 0 if everything is prepared, the robot is proved closed, or is open again; 1 if
     something is found, is left to do by hand, or does not hold; 2 if it could not be done.
     """
-    from sros_tool import closing
+    from sros_tool.close.apply import apply as apply_security
+    from sros_tool.close.preparation import prepare
+    from sros_tool.close.proof import prove as prove_closed
+    from sros_tool.close.robot import LocalRobot, Shell
+    from sros_tool.close.undo import undo as open_again
 
     if sum((apply, prove, undo)) > 1:
         raise UsageError("--apply, --proof and --undo exclude each other", "", "Choose one.")
@@ -139,10 +145,8 @@ def close(
             f"Run `sros close {shlex.quote(str(folder))} --elsewhere {elsewhere[0]}` first: it is "
             "remembered.",
         )
-    shell = closing.Shell(
-        _run, lambda line: echo(line, err=True), os.environ, now, local_zone(os.environ)
-    )
-    robot = closing.OpenRobot(folder, domain_of(domain_text), shell, without, elsewhere)
+    shell = Shell(_run, lambda line: echo(line, err=True), os.environ, now, local_zone(os.environ))
+    robot = LocalRobot(folder, domain_of(domain_text), shell, without, elsewhere)
     if (apply or prove or undo) and not robot.observed:
         if not folder.is_dir():
             raise UsageError(
@@ -153,13 +157,13 @@ def close(
         name = shlex.quote(str(folder))
         raise UsageError(f"'{folder}' has no watched robot", "", f"Run `sros close {name}` first.")
     if undo:
-        closed = robot.undo(dry_run=dry_run)
+        closed = open_again(robot, dry_run=dry_run)
     elif prove:
-        closed = robot.prove()
+        closed = prove_closed(robot)
     else:
-        closed = robot.prepare(duration, partial=partial, dry_run=dry_run)
+        closed = prepare(robot, duration, partial=partial, dry_run=dry_run)
         if apply and not closed.problems:
-            closed = robot.apply(closed, dry_run=dry_run)
+            closed = apply_security(robot, closed, dry_run=dry_run)
     holds = closed.is_proved(partial=partial)
     if as_json:
         print_json(closed)
@@ -174,9 +178,9 @@ def close(
     return int(bool(closed.problems) or ((apply or prove) and not holds))
 
 
-def _show(robot: OpenRobot, closed: Closing) -> None:
+def _show(robot: LocalRobot, closed: CloseState) -> None:
     """Print on one screen who may do what, how processes are restarted, and what looks wrong."""
-    from sros_tool.closing import access_lines
+    from sros_tool.close.access import access_lines
     from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.policy.document import read_policy
     from sros_tool.reach import unguarded
@@ -241,10 +245,8 @@ def _nodes(policy: Policy, enclave: str) -> str:
     return f", for the nodes {enumerated(sorted(nodes))}" if len(nodes) > 1 else ""
 
 
-def _show_end(robot: OpenRobot, closed: Closing, *, apply: bool, holds: bool) -> None:
+def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool) -> None:
     """Print the answer, its reasons, and what to do next."""
-    from sros_tool.closing import COMMANDS
-
     folder, observed = shlex.quote(str(robot.folder)), closed.observed
     ask = f"sros close {folder} --proof"
     idle = closed.stopped if closed.secured else {*observed.ended}
@@ -276,10 +278,10 @@ def _show_end(robot: OpenRobot, closed: Closing, *, apply: bool, holds: bool) ->
             echo(f"  {command}")
         echo(f"next: these commands, and then {ask}", err=True)
     else:
-        steps = f"stop the robot, start each process by the commands in {robot.start / COMMANDS}"
+        steps = f"stop the robot, start each process by the commands in {robot.commands_file}"
         if closed.secured:
             stop = "" if closed.stopped.issuperset(closed.left) else "stop them, "
-            steps = f"{stop}start them by the first commands in {robot.start / COMMANDS}"
+            steps = f"{stop}start them by the first commands in {robot.commands_file}"
         if not closed.left:
             following = ask
         elif any(name in observed.units for name in closed.left):
@@ -289,7 +291,7 @@ def _show_end(robot: OpenRobot, closed: Closing, *, apply: bool, holds: bool) ->
         echo(f"{_state(closed, apply=apply)}{_until(closed)}; next: {following}", err=True)
 
 
-def _show_undone(robot: OpenRobot, closed: Closing) -> None:
+def _show_undone(robot: LocalRobot, closed: CloseState) -> None:
     """Print what still has to be done until the robot is open."""
     for problem in closed.problems:
         echo(problem)
@@ -308,7 +310,7 @@ def _show_undone(robot: OpenRobot, closed: Closing) -> None:
         echo(f"{state}: sros sees no process in an enclave of this folder{but}", err=True)
 
 
-def _state(closed: Closing, *, apply: bool) -> str:
+def _state(closed: CloseState, *, apply: bool) -> str:
     """Return how far the processes run closed."""
     if not closed.secured:
         not_closed = "nothing was closed" if apply else "nothing is closed yet"
@@ -325,7 +327,7 @@ def _state(closed: Closing, *, apply: bool) -> str:
     return f"the processes run in their enclaves{', except for ' if but else ''}{but}"
 
 
-def _until(closed: Closing) -> str:
+def _until(closed: CloseState) -> str:
     """Return until when the files of closed processes are valid."""
     if not (closed.secured and closed.valid_until):
         return ""

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -15,9 +16,22 @@ from typing import Any
 import pytest
 import yaml
 
-from sros_tool import closing
 from sros_tool.cli import close
-from sros_tool.closing import access_lines, assign, left_alone
+from sros_tool.close import (
+    apply,
+    assignment,
+    drop_ins,
+    proof,
+    running,
+    talk_proof,
+    watch,
+)
+from sros_tool.close.access import access_lines
+from sros_tool.close.assignment import assign, with_command_of_unit
+from sros_tool.close.endpoints import left_alone
+from sros_tool.close.processes import ClosedProcess, ObservedProcesses
+from sros_tool.close.robot import LocalRobot, Shell
+from sros_tool.close.steps import steps
 from sros_tool.explain.audit import DeniedRight
 from sros_tool.graph import observe
 from sros_tool.graph.observation import Endpoint, ObservedNode, make_observation
@@ -159,6 +173,13 @@ class Robot:
         return {process.enclave.name for process in running if process.enclave}
 
 
+def find_origins(
+    monkeypatch: pytest.MonkeyPatch, process_origin: Callable[[int], ProcessOrigin]
+) -> None:
+    for module in (assignment, running, watch):
+        monkeypatch.setattr(module, "process_origin", process_origin)
+
+
 @pytest.fixture
 def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Robot:
     robot = Robot(tmp_path, beside_graph)
@@ -167,16 +188,17 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(observe, "SECURED", settling)
     monkeypatch.setattr(ProcessTable, "look", lambda table, now: robot.look(table, now))
     units = {PID[enclave]: enclave for enclave in PID}
-    monkeypatch.setattr(
-        "sros_tool.closing.process_origin",
+    find_origins(
+        monkeypatch,
         lambda pid: ProcessOrigin(
             robot.units.get(units.get(pid, ""), ""), "/opt", robot.launch, robot.container
         ),
     )
-    monkeypatch.setattr(closing, "_SYSTEMD", tmp_path / "systemd")
-    for number in ("_RESTART_SECONDS", "_START_SECONDS"):
-        monkeypatch.setattr(closing, number, 0.1)
-    monkeypatch.setattr(closing, "_TRIES", 1)
+    for module in (apply, drop_ins):
+        monkeypatch.setattr(module, "SYSTEMD", tmp_path / "systemd")
+    monkeypatch.setattr(apply, "_RESTART_SECONDS", 0.1)
+    monkeypatch.setattr(proof, "_START_SECONDS", 0.1)
+    monkeypatch.setattr(talk_proof, "_TRIES", 1)
     for name in ("ROS_DOMAIN_ID", "RMW_IMPLEMENTATION", "ROS_SECURITY_ENABLE"):
         monkeypatch.delenv(name, raising=False)
     (tmp_path / "systemd").mkdir()
@@ -666,8 +688,8 @@ def test_what_is_interrupted_at_any_step_goes_on(
     run = close._run
     robot.units = UNITS
     policy = robot.folder / "robot/policy.xml"
-    shell = closing.Shell(run, print, os.environ, lambda: datetime.now(UTC), UTC)
-    for step in closing.OpenRobot(robot.folder / "robot", 0, shell).steps(None):
+    shell = Shell(run, print, os.environ, lambda: datetime.now(UTC), UTC)
+    for step in steps(LocalRobot(robot.folder / "robot", 0, shell), None):
 
         def interrupted(words: Any, live: bool, step: Any = step) -> Any:
             is_it = [Path(word).name for word in words if word != "--dry-run"] == [
@@ -689,7 +711,7 @@ def test_what_is_interrupted_at_any_step_goes_on(
     robot.close("--apply")
 
 
-@pytest.mark.parametrize("function", some(["write_units", "_restart"], 1))
+@pytest.mark.parametrize("function", some(["write_units", "restart_units"], 1))
 def test_applying_that_is_interrupted_goes_on_or_back(
     robot: Robot, monkeypatch: pytest.MonkeyPatch, function: str
 ) -> None:
@@ -698,9 +720,8 @@ def test_applying_that_is_interrupted_goes_on_or_back(
 
     robot.units = UNITS
     robot.close()
-    place: Any = closing if function == "write_units" else closing.OpenRobot
     with monkeypatch.context() as patched:
-        patched.setattr(place, function, interrupted)
+        patched.setattr(apply, function, interrupted)
         robot.close("--apply", status=130)
     assert robot.restarts == []
     robot.close("--undo")
@@ -896,9 +917,7 @@ def test_tools_that_ended_while_sros_watched(robot: Robot, monkeypatch: pytest.M
     library = frozenset({"libfastrtps"})
     seen = {7: ("/opt/tool", "a b"), 9: ("/opt/job",), 10: ("ros2", "topic", "list")}
     origins = {9: ProcessOrigin("job.service", "/opt")}
-    monkeypatch.setattr(
-        closing, "process_origin", lambda pid: origins.get(pid, ProcessOrigin("", "/opt"))
-    )
+    find_origins(monkeypatch, lambda pid: origins.get(pid, ProcessOrigin("", "/opt")))
     run, left = close._run, json.dumps([f"{node[3]}0000" for node in (tool, look, job)])
 
     def ran(words: Any, live: bool) -> tuple[int, str, str]:
@@ -1108,10 +1127,10 @@ def test_the_enclave_of_a_process(
 
 
 def test_a_process_to_stop_is_named_by_the_id_that_it_has_now() -> None:
-    talker = closing.ClosedProcess("/talker", 7, ("talk", "a"), "/opt", 0, "", "program")
+    talker = ClosedProcess("/talker", 7, ("talk", "a"), "/opt", 0, "", "program")
     again, other = process(8, "talk", "a"), process(7, "talk", "b")
     unseen = UnseenProcess(7, (), "another user's", speaks=False)
-    for running, pid in (
+    for processes, pid in (
         (RunningProcesses((process(7, "talk", "a"), again)), 7),
         (RunningProcesses((other, again)), 8),
         (RunningProcesses((process(9, "talk", "a", "--ros-args", "--enclave", "/talker"),)), 9),
@@ -1120,8 +1139,8 @@ def test_a_process_to_stop_is_named_by_the_id_that_it_has_now() -> None:
         (RunningProcesses((other,), hidden="those of other users"), 7),
         (RunningProcesses(unseen=(unseen,)), 7),
     ):
-        assert talker.as_it_runs(running).pid == pid
-    assert talker._replace(unit="talker.service").as_it_runs(RunningProcesses()).pid == 7
+        assert talker.with_current_pid(processes).pid == pid
+    assert talker._replace(unit="talker.service").with_current_pid(RunningProcesses()).pid == 7
 
 
 def test_what_is_exported_without_the_enclaves_of_other_machines(tmp_path: Path) -> None:
@@ -1132,12 +1151,14 @@ def test_what_is_exported_without_the_enclaves_of_other_machines(tmp_path: Path)
     )
     policy = f'<policy version="0.2.0"><enclaves>{enclaves}</enclaves></policy>'
     (tmp_path / "policy.xml").write_text(policy)
-    start = closing.ClosedProcess("/a", 7, ("talk",), "/opt", 0, "", "program")
-    observed = closing.ObservedProcesses(0, [start, start._replace(enclave="/b")])
+    start = ClosedProcess("/a", 7, ("talk",), "/opt", 0, "", "program")
+    observed = ObservedProcesses(0, [start, start._replace(enclave="/b")])
     (tmp_path / "processes.json").write_text(json.dumps(as_plain(observed)))
-    shell = closing.Shell(close._run, print, {}, lambda: datetime.now(UTC), UTC)
-    robot = closing.OpenRobot(tmp_path, 0, shell, elsewhere=["/b"])
-    exported = [step.words[2:-2] for step in robot.steps(None) if step.words[0] == "distribute_key"]
+    shell = Shell(close._run, print, {}, lambda: datetime.now(UTC), UTC)
+    robot = LocalRobot(tmp_path, 0, shell, elsewhere=["/b"])
+    exported = [
+        step.words[2:-2] for step in steps(robot, None) if step.words[0] == "distribute_key"
+    ]
     assert exported == [("/a", "/sros_observer")]
     moved = observed.belonging_elsewhere(["/b"])
     assert [each.enclave for each in moved.processes] == ["/a"] and moved.not_here == ["/b"]
@@ -1231,18 +1252,18 @@ def test_a_node_on_zenoh_gets_an_argument_from_its_unit(robot: Robot) -> None:
     systemctl = robot.folder / "bin/systemctl"
     systemctl.write_text("#!/bin/sh\necho '{ path=/opt/talk ; argv[]=/opt/talk a ; x }'\n")
     start = "/talker", 1, ("python3", "/opt/talk", "a"), "/opt", 0, "talker.service", "program"
-    on_zenoh = closing.ClosedProcess(*start, rmw="rmw_zenoh_cpp")
-    assert closing._as_its_unit_starts(on_zenoh).command == ("/opt/talk", "a")
+    on_zenoh = ClosedProcess(*start, rmw="rmw_zenoh_cpp")
+    assert with_command_of_unit(on_zenoh).command == ("/opt/talk", "a")
     script = on_zenoh._replace(command=("/opt/talk", "b"))
-    assert closing._as_its_unit_starts(script).unit == ""
+    assert with_command_of_unit(script).unit == ""
     for other in (script._replace(rmw=""), script._replace(enclave="/router")):
-        assert closing._as_its_unit_starts(other) == other
+        assert with_command_of_unit(other) == other
 
 
 def test_the_commands_of_a_robot_on_zenoh_name_its_rmw_and_the_enclaves() -> None:
     """Without them, a process runs open, or others do not see it."""
     start = "/talker", 1, ("python3", "talk"), "/opt", 0, "", "program"
-    talker = closing.ClosedProcess(*start, rmw="rmw_zenoh_cpp")
+    talker = ClosedProcess(*start, rmw="rmw_zenoh_cpp")
     run = "sros run export {} --rmw rmw_zenoh_cpp --"
     assert talker.secured_command(Path()) == (
         f"cd /opt && {run.format('/talker')} python3 talk --ros-args --enclave /talker"
@@ -1251,14 +1272,12 @@ def test_the_commands_of_a_robot_on_zenoh_name_its_rmw_and_the_enclaves() -> Non
     assert router.secured_command(Path()) == f"cd /opt && {run.format('/router')} rmw_zenohd"
     in_domain = "cd /opt && env ROS_DOMAIN_ID=7 RMW_IMPLEMENTATION=rmw_zenoh_cpp python3 talk"
     assert talker.open_command(7) == in_domain
-    observed = closing.ObservedProcesses(7, [talker])
+    observed = ObservedProcesses(7, [talker])
     assert observed.command_of_new(Path("export"), "/horn") == f"{run.format('/horn')} COMMAND"
     variables = {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}
     process = Process(1, ("python3", "talk"), variables, datetime.now(UTC))
-    running: Any = SimpleNamespace(
-        _secured=lambda _running: [(process, ProcessEnclave("/export", "/talker"))]
-    )
-    unseen = closing.OpenRobot._unseen_text(running, "/talker", "/talker", RunningProcesses())
+    now: Any = SimpleNamespace(secured=[(process, ProcessEnclave("/export", "/talker"))])
+    unseen = talk_proof.unseen_text(now, "/talker", "/talker")
     assert "start process 1 (talk) with `--ros-args --enclave /talker` at its end" in unseen
 
 

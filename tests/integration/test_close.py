@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from sros_tool.closing import read_processes
+from sros_tool.close.processes import read_processes
 from sros_tool.demo.backend import CYCLONE, RCLPY
 from sros_tool.runtime.events import EventKind, read_events
 from sros_tool.runtime.netns import end_with_parent

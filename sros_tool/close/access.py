@@ -1,0 +1,66 @@
+"""Who may do what by the policy of a robot, as lines for people."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sros_tool.close.robot import MOST_NAMES
+from sros_tool.files import policies_dir
+from sros_tool.graph.learn import common_parts
+from sros_tool.names import is_expression
+from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy
+from sros_tool.policy.rights import Right, Rules, policy_rights
+from sros_tool.wording import counted, first_few
+
+_NODE_PARTS = ("common/node.xml", "common/rclcpp_node.xml", "common/rclpy_node.xml")
+_MOST_LINES = 20
+
+
+def access_lines(policy: Policy, folder: Path) -> list[str]:
+    """Return a line for each name in a policy, with who may use it on either side.
+
+    Names that are used only as every node uses them (the common parts) are left out.
+    """
+    common = common_parts(folder, policies_dir())
+    parts = [part for part in _NODE_PARTS if part in common.rights]
+    ordinary = {
+        (enclave.path, right.right, right.name)
+        for enclave in policy.enclaves
+        for profile in enclave.all_profiles()
+        for right in common.included_rights(parts, profile.ns, profile.node)
+    }
+    rights = policy_rights(policy)
+    rules, enclaves = Rules(rights), sorted({right.enclave for right in rights})
+    shown = {
+        (right.kind, right.name)
+        for right in rights
+        if right.kind in RIGHTS
+        and right.qualifier is ALLOW
+        and (right.enclave, right.right, right.name) not in ordinary
+    }
+    stated = {right for right in rights if right.qualifier is ALLOW and is_expression(right.name)}
+
+    def may(enclave: str, right: str, name: str) -> bool:
+        if rules.allow(enclave, right, name):
+            return True
+        # A denial of some of the names leaves the others.
+        is_stated = Right(enclave, ALLOW, right, name) in stated
+        return is_stated and not rules.cover(Right(enclave, DENY, right, name))
+
+    sides = {
+        (kind, name): [
+            [enclave for enclave in enclaves if may(enclave, right, name)] for right in RIGHTS[kind]
+        ]
+        for kind, name in shown
+    }
+    kinds = [*RIGHTS]
+    in_order = sorted(
+        sides, key=lambda named: (not all(sides[named]), kinds.index(named[0]), named[1])
+    )
+    lines = [
+        f"{kind.removesuffix('s')} {name}: "
+        + " -> ".join(first_few(names, MOST_NAMES) or "nobody" for names in sides[kind, name])
+        for kind, name in in_order
+    ]
+    more = len(lines) - _MOST_LINES
+    return [*lines[:_MOST_LINES], *([f"and {counted(more, 'more name')}"] if more > 0 else [])]

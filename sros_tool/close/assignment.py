@@ -1,0 +1,200 @@
+"""Decide which running process has the nodes of which enclave.
+
+A process of Fast DDS shows its process id in the identifier of its DDS participant (two bytes of
+the GUID prefix; Fast DDS 2.6 to 3.6, ``GuidUtils.hpp``), and a process of Cyclone DDS states it in
+a property of its participant (``__Pid``; Cyclone DDS 0.10 to 11.0).  Other processes are known by
+the name that their command gives the node, or by the name of their program.  A wrong guess is safe:
+the middleware denies the process what its enclave may not do.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+
+from sros_tool.close.processes import (
+    ROUTER,
+    ClosedProcess,
+    ObservedProcesses,
+    is_in_domain,
+    needs_enclave_argument,
+    process_text,
+)
+from sros_tool.errors import UsageError
+from sros_tool.graph.observation import ObservedNode
+from sros_tool.runtime.environment import node_argument
+from sros_tool.runtime.processes import Process, ProcessOrigin, process_origin, program_of
+from sros_tool.runtime.units import unit_words
+
+_FAST_DDS = "010f"
+"""The first two bytes of a participant of Fast DDS: its vendor id (RTPS 2.3, 9.4.5.1)."""
+_CYCLONE_SECONDS = 30.0
+
+
+def assign(
+    nodes: Iterable[ObservedNode],
+    running: Iterable[Process],
+    domain: int,
+    process_ids: Mapping[str, int] | None = None,
+    origins: Mapping[int, ProcessOrigin] | None = None,
+) -> ObservedProcesses:
+    """Return the enclave of each process, by the nodes that the graph shows of it.
+
+    Processes of other domains or networks are left out.  ``process_ids`` maps participants of
+    Cyclone DDS to the process ids that they state; ``origins`` has what started each process, and
+    None is for processes that run now.
+    """
+    unclaimed = {
+        process.pid: process
+        for process in running
+        if is_in_domain(process, domain) and not process.is_daemon
+    }
+    if origins is None:
+        origins = {pid: process_origin(pid) for pid in unclaimed}
+    programs = {process.program[0]: origins[pid].unit for pid, process in unclaimed.items()}
+    units = Counter(programs.values())
+    assigned: list[ClosedProcess] = []
+
+    def assign_enclave(process: Process, enclave: str, known_by: str) -> None:
+        origin = origins[process.pid]
+        del unclaimed[process.pid]
+        unit = origin.unit if units[origin.unit] == 1 else ""
+        assigned.append(
+            ClosedProcess.from_process(process, enclave, origin._replace(unit=unit), known_by)
+        )
+
+    for router in [process for process in unclaimed.values() if process.is_router]:
+        assign_enclave(router, ROUTER, "program")
+    by_enclave: dict[str, list[ObservedNode]] = {}
+    for node in nodes:
+        by_enclave.setdefault(node.enclaves[0], []).append(node)
+    for known_by, shows_node in _KNOWN_BY.items():
+        unassigned = sorted(by_enclave.keys() - {process.enclave for process in assigned})
+        if known_by == "elimination" and len(unassigned) > 1:
+            continue
+        for enclave in unassigned:
+            nodes_of_enclave = by_enclave[enclave]
+            processes = [
+                process
+                for process in unclaimed.values()
+                if any(shows_node(process, node, process_ids or {}) for node in nodes_of_enclave)
+            ]
+            if len(processes) <= len({node.participant for node in nodes_of_enclave}):
+                for process in processes:
+                    assign_enclave(process, enclave, known_by)
+    enclaves_of_program: dict[int, set[str]] = {}
+    for closed in assigned:
+        enclaves_of_program.setdefault(closed.pid, set()).add(closed.enclave)
+    return ObservedProcesses(
+        domain,
+        sorted(
+            closed._replace(shares=sorted(enclaves_of_program[closed.pid] - {closed.enclave}))
+            for closed in assigned
+        ),
+        [
+            process_text(process)
+            for process in unclaimed.values()
+            if process.pid not in enclaves_of_program
+        ],
+        sorted(
+            enclave
+            for enclave, nodes_of_enclave in by_enclave.items()
+            if len({_process_prefix(node) for node in nodes_of_enclave})
+            > sum(process.enclave == enclave for process in assigned)
+        ),
+    )
+
+
+def _process_prefix(node: ObservedNode) -> str:
+    """Return what the participants of a process have in common: Fast DDS shows host and id."""
+    is_fast = node.participant.startswith(_FAST_DDS)
+    return node.participant[:12] if is_fast else node.participant
+
+
+def _shows_its_id(process: Process, node: ObservedNode, process_ids: Mapping[str, int]) -> bool:
+    if not node.participant.startswith(_FAST_DDS):
+        return process_ids.get(node.participant) == process.pid
+    low, high = process.pid & 0xFF, process.pid >> 8 & 0xFF
+    is_fast = bool(process.libraries & {"libfastrtps", "libfastdds"})
+    return is_fast and node.participant[8:12] == f"{low:02x}{high:02x}"
+
+
+def _is_named(process: Process, node: ObservedNode, _process_ids: object) -> bool:
+    return node_argument(process.command) == (node.ns, node.name)
+
+
+def _has_program_named_alike(process: Process, node: ObservedNode, _process_ids: object) -> bool:
+    return program_of(process.command).removesuffix(".py") == node.name
+
+
+_KNOWN_BY: dict[str, Callable[[Process, ObservedNode, Mapping[str, int]], bool]] = {
+    "process id": _shows_its_id,
+    "node name": _is_named,
+    "program": _has_program_named_alike,
+    "elimination": lambda _process, _node, _process_ids: True,
+}
+
+
+def process_ids_of_cyclone(pids: Sequence[int], domain: int) -> Mapping[str, int]:
+    """Return process ids as Cyclone DDS participants state them; none if it cannot be loaded."""
+    if not pids:
+        return {}
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "sros_tool.runtime.cyclone",
+        f"{domain}",
+        *map(str, pids),
+    ]
+    with suppress(ValueError, subprocess.TimeoutExpired):
+        ended = subprocess.run(command, capture_output=True, check=False, timeout=_CYCLONE_SECONDS)
+        value: Mapping[str, int] = json.loads(ended.stdout)
+        return value
+    return {}
+
+
+def ended_processes(
+    nodes: Iterable[ObservedNode],
+    ran: Iterable[tuple[Process, ProcessOrigin]],
+    observed: ObservedProcesses,
+) -> list[ClosedProcess]:
+    """Return the processes of nodes that ended while sros watched.
+
+    If an enclave had several commands, its processes are left out, because one of them may be
+    another program that took the node's name.  ``observed`` are the processes that stayed; a unit
+    that starts one of them starts it alone.
+    """
+    origins = {process.pid: origin for process, origin in ran}
+    units_in_use = {*observed.units.values()}
+    ended = assign(nodes, [process for process, _ in ran], observed.domain, {}, origins)
+    commands = Counter(process.enclave for process in ended.processes)
+    return [
+        process._replace(pid=0, unit="" if process.unit in units_in_use else process.unit)
+        for process in ended.processes
+        # Many tools end while sros watches, so elimination shows nothing.
+        if commands[process.enclave] == 1 and process.known_by != "elimination"
+    ]
+
+
+def with_command_of_unit(process: ClosedProcess) -> ClosedProcess:
+    """Return a process with the command of its unit, to which an argument can be added.
+
+    If the unit starts another command, such as a script, return the process without its unit.
+    """
+    if not (process.unit and needs_enclave_argument(process)):
+        return process
+    command = ["systemctl", "show", "--property=ExecStart", "--value", process.unit]
+    try:
+        shown = subprocess.run(command, capture_output=True, check=False).stdout
+    except OSError:
+        shown = b""
+    with suppress(UsageError):  # some words cannot be written in a unit
+        for words in (process.command, process.command[1:]):
+            if f"; argv[]={' '.join(words)} ;".encode() in shown and [*unit_words(words)]:
+                return process._replace(command=words)
+    return process._replace(unit="")

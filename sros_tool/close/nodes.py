@@ -1,0 +1,197 @@
+"""The nodes that were observed on the open robot, in the enclaves that the policy has now."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import cached_property
+from itertools import chain
+
+from sros_tool.close.endpoints import node_name
+from sros_tool.close.robot import OBSERVER, LocalRobot
+from sros_tool.errors import DocumentError, SrosError
+from sros_tool.explain.audit import DeniedRight, audit, audited_enclaves
+from sros_tool.graph.learn import stable_name
+from sros_tool.graph.observation import (
+    Endpoint,
+    Observation,
+    ObservedNode,
+    make_observation,
+    observation_from_json,
+)
+from sros_tool.keystore.participant import JoinContext
+from sros_tool.names import expand, is_expression
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import Policy
+from sros_tool.policy.patterns import overlap
+from sros_tool.runtime.rmw import chosen_vendor
+from sros_tool.xml import read_bytes
+
+
+class ObservedNodes:
+    """The nodes of the open robot, in the enclaves and with the names that the policy has now."""
+
+    def __init__(self, robot: LocalRobot) -> None:
+        self.robot = robot
+
+    @cached_property
+    def as_observed(self) -> Sequence[ObservedNode]:
+        """The nodes with the enclaves and names that they had."""
+        path = self.robot.observation_file
+        try:
+            return observation_from_json(json.loads(read_bytes(path, "observation"))).nodes
+        except (ValueError, TypeError, KeyError) as error:
+            raise DocumentError(
+                f"'{path}' is not an observation",
+                f"{error}",
+                "Watch the robot again: --for 1m.",
+            ) from error
+
+    @cached_property
+    def policy(self) -> Policy:
+        """The policy of the robot."""
+        return read_policy(self.robot.policy)
+
+    def in_their_enclaves(self) -> Iterator[ObservedNode]:
+        """Yield the nodes with the names that they had, in the enclaves that the policy has.
+
+        A node whose profile was moved to another enclave is in that enclave; a node without an
+        enclave has the enclave that it had.
+        """
+        names = {enclave.path for enclave in self.policy.enclaves}
+        enclave_of = {
+            (profile.ns, profile.node): (enclave.path,)
+            for enclave in self.policy.enclaves
+            for profile in enclave.all_profiles()
+        }
+        for node in self.as_observed:
+            moved = (
+                None
+                if names.issuperset(node.enclaves)
+                else enclave_of.get((node.ns, stable_name(node.name)))
+            )
+            yield replace(node, enclaves=moved) if moved else node
+
+    @cached_property
+    def expected(self) -> Observation:
+        """The nodes that the policy has an enclave for, with the names that they should have."""
+        names, nodes = {enclave.path for enclave in self.policy.enclaves}, []
+        for node in self.in_their_enclaves():
+            if new := self.renamed.get(node_name(node)):
+                endpoints = frozenset(self._renamed_endpoints(node, *new).values())
+                nodes.append(replace(node, ns=new[0], name=new[1], endpoints=endpoints))
+            elif names.issuperset(node.enclaves):
+                nodes.append(node)
+        return make_observation(nodes)
+
+    @cached_property
+    def renamed(self) -> Mapping[str, tuple[str, str]]:
+        """The namespaces and names that the policy gives observed nodes now, by their old names.
+
+        A node was renamed if it alone of its enclave has no profile any more, and one profile of
+        that enclave alone is for a node that was not observed.
+        """
+        _, without_profile = self.divide_by_profile(self.as_observed)
+        known = {node_name(node) for node in self.as_observed}
+        renamed = {}
+        for enclave in self.policy.enclaves:
+            old = {node_name(node) for node in without_profile if enclave.path in node.enclaves}
+            new = {
+                (profile.ns, profile.node)
+                for profile in enclave.all_profiles()
+                if expand("~", profile.ns, profile.node) not in known
+                and not is_expression(f"{profile.ns}{profile.node}")
+            }
+            if len(old) == len(new) == 1:
+                renamed[old.pop()] = new.pop()
+        return renamed
+
+    def _renamed_endpoints(
+        self, node: ObservedNode, ns: str, name: str
+    ) -> dict[Endpoint, Endpoint]:
+        """Map the endpoints of an observed node to those that it should have under another name.
+
+        The first possible name that its enclave allows counts; without one, the first.
+        """
+        possible = {
+            endpoint: _possible_endpoints(endpoint, node, ns, name) for endpoint in node.endpoints
+        }
+        tried = frozenset(chain.from_iterable(possible.values()))
+        tried_by = make_observation([replace(node, ns=ns, name=name, endpoints=tried)])
+        denied = {
+            endpoint for right in self.denied_rights(tried_by) for endpoint in right.endpoints
+        }
+        return {
+            endpoint: next((new for new in names if new not in denied), names[0])
+            for endpoint, names in possible.items()
+        }
+
+    @cached_property
+    def moved_endpoints(self) -> Collection[tuple[Endpoint, Endpoint]]:
+        """The endpoints of renamed nodes that are renamed, too, with their new names."""
+        return {
+            (before, after)
+            for node in self.as_observed
+            if (new := self.renamed.get(node_name(node)))
+            for before, after in self._renamed_endpoints(node, *new).items()
+            if before != after
+        }
+
+    def divide_by_profile(
+        self, nodes: Iterable[ObservedNode]
+    ) -> tuple[list[ObservedNode], list[ObservedNode]]:
+        """Divide nodes into those with a profile in the policy, and those without."""
+        profiles = [
+            profile for enclave in self.policy.enclaves for profile in enclave.all_profiles()
+        ]
+        with_profile: list[ObservedNode] = []
+        without_profile: list[ObservedNode] = []
+        for node in nodes:
+            name = stable_name(node.name)
+            has_profile = any(
+                overlap(profile.ns, node.ns) and overlap(profile.node, name) for profile in profiles
+            )
+            (with_profile if has_profile else without_profile).append(node)
+        return with_profile, without_profile
+
+    def denied_rights(self, observation: Observation) -> Sequence[DeniedRight]:
+        """Return the rights that nodes need and the keystore denies."""
+        shell = self.robot.shell
+        context = JoinContext(self.robot.domain, shell.now(), shell.zone)
+        vendor = chosen_vendor(None, None, shell.environment)[0]
+        enclaves = audited_enclaves([self.robot.rights_source], vendor, context)
+        return audit(observation, enclaves, OBSERVER).denied
+
+    def names_in(self, enclave: str) -> tuple[set[str], str]:
+        """Return the names of an enclave's nodes, observed or in the policy, and a replaced one.
+
+        The replaced name is that of a node to which the policy gives another one; "" for none.
+        """
+        with suppress(SrosError):  # a broken file must not keep the robot closed
+            observed = {node_name(node) for node in self.as_observed if enclave in node.enclaves}
+            in_policy = self.policy.enclave(enclave)
+            profiles = in_policy.all_profiles() if in_policy else ()
+            names = {expand("~", profile.ns, profile.node) for profile in profiles}
+            return observed | names, next(iter(observed & self.renamed.keys()), "")
+        return set(), ""
+
+
+def _possible_endpoints(
+    endpoint: Endpoint, node: ObservedNode, ns: str, name: str
+) -> Sequence[Endpoint]:
+    """Return an endpoint of a node as it may be named under another node name, likeliest first.
+
+    Private names of the node move with it.  The graph does not show whether a program wrote another
+    name of its namespace as a relative one, which moves, or as an absolute one.
+    """
+    prefix, fqn = endpoint.topic[:2], endpoint.topic[2:]
+    private, near = expand("~/", node.ns, node.name), expand("", node.ns, "")
+    if fqn.startswith(private):
+        moved = f"{expand('~/', ns, name)}{fqn.removeprefix(private)}"
+        return endpoint._replace(topic=prefix + moved), endpoint
+    if fqn.startswith(near):  # a DDS topic without a ROS name does not
+        moved = expand(fqn.removeprefix(near), ns, name)
+        return endpoint, endpoint._replace(topic=prefix + moved)
+    return (endpoint,)

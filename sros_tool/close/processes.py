@@ -1,0 +1,273 @@
+"""The processes of a robot, their enclaves, and the commands that start them."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+from sros_tool.errors import DocumentError
+from sros_tool.policy.model import Policy
+from sros_tool.runtime.environment import RMW_ZENOH, ROS_ARGS, named_enclave
+from sros_tool.runtime.processes import (
+    SERVICE_NAME,
+    Process,
+    ProcessOrigin,
+    RunningProcesses,
+    launch_verb,
+)
+from sros_tool.runtime.rmw import RMW
+from sros_tool.runtime.variables import DOMAIN, ENCLAVE
+from sros_tool.values import Words
+from sros_tool.xml import read_bytes
+
+ROUTER = "/router"
+"""The enclave of a Zenoh router."""
+COMPOSE_FILE = "compose.yaml"
+
+
+class ClosedProcess(NamedTuple):
+    """A process of the robot, and the enclave in which it has to run."""
+
+    enclave: str
+    """The enclave of the process."""
+    pid: int
+    """Its id; 0 if it ended while sros watched, or is restarted by hand, and no process with its
+    command runs any more."""
+    command: Sequence[str]
+    """Its command with the arguments."""
+    folder: str
+    """Its working directory."""
+    user: int
+    """The id of the user who runs it."""
+    unit: str
+    """The systemd unit that starts it alone; empty for a process that is restarted by hand."""
+    known_by: Annotated[
+        str, Words(("process id", "node name", "program", "elimination", "enclave"))
+    ]
+    """How sros knows that this process has the nodes of the enclave."""
+    launch: Sequence[str] = ()
+    """The command of the `ros2 launch` that started it; empty for a process of its own."""
+    container: str = ""
+    """The id of the Docker container in which it runs; empty outside of containers."""
+    rmw: str = ""
+    """rmw_zenoh_cpp for a process on Zenoh; empty on DDS."""
+    shares: Sequence[str] = ()
+    """The other enclaves whose processes the same command starts, as `multiprocessing` does."""
+    chooses: bool = False
+    """Whether the program itself gives the process its enclave, by ROS_SECURITY_ENCLAVE_OVERRIDE.
+    """
+
+    @classmethod
+    def from_process(
+        cls, process: Process, enclave: str, origin: ProcessOrigin, known_by: str
+    ) -> ClosedProcess:
+        """Return a running process with its enclave and what started it."""
+        start = enclave, *process.program, origin.folder, process.user, origin.unit
+        rmw = RMW_ZENOH if process.is_zenoh else ""
+        chooses = process.environment.get(ENCLAVE) == enclave
+        return cls(*start, known_by, origin.launch, origin.container, rmw, (), chooses)
+
+    def with_current_pid(self, running: RunningProcesses) -> ClosedProcess:
+        """Return a copy with the id that a process with this command has now.
+
+        The command may have the argument for the enclave that ``sros run`` adds.  A process that
+        may run, but could not be examined, keeps its id, and so does a process that its unit
+        restarts; a process that ended while sros watched has none.
+        """
+        command = command_without_enclave(self.command, self.enclave)
+        programs = [process.program for process in running.processes]
+        pids = [
+            pid
+            for pid, words in programs
+            if command_without_enclave(words, self.enclave) == command
+        ]
+        unseen = {process.pid for process in running.unseen}
+        if (self.unit and self.pid) or running.hidden or self.pid in unseen or self.pid in pids:
+            return self
+        return self._replace(pid=pids[0] if pids else 0)
+
+    def open_command(self, domain: int) -> str:
+        """Return the shell command that starts the process open, in its ROS domain and RMW."""
+        if self.container:
+            return "docker compose up -d"
+        variables = [f"{DOMAIN}={domain}"] * bool(domain) + [f"{RMW}={self.rmw}"] * bool(self.rmw)
+        words = (*(("env", *variables) if variables else ()), *(self.launch or self.command))
+        return f"cd {shlex.quote(self.folder)} && {shlex.join(words)}"
+
+    def secured_command(self, folder: Path, launch_enclave: str = "") -> str:
+        """Return the shell command that starts the process, its launch or containers with security.
+
+        ``folder`` is the folder of the closed robot, and ``launch_enclave`` the enclave of the node
+        of `ros2 launch` itself.
+        """
+        if self.container:
+            overlay = shlex.quote(str(folder / "start" / COMPOSE_FILE))
+            return f"docker compose -f compose.yaml -f {overlay} up -d"
+        words = self.command
+        if self.launch:
+            after = launch_verb(self.launch) + 1
+            words = launch_words(folder, self.launch[:after], self.launch[after:])
+        elif needs_enclave_argument(self):
+            words = (*words, ROS_ARGS, "--enclave", self.enclave)
+        enclave = launch_enclave if self.launch else self.enclave
+        if enclave:
+            words = (*run_words(folder / "export", enclave, self.rmw), *words)
+        elif self.rmw:
+            words = ("env", f"{RMW}={self.rmw}", *words)
+        return f"cd {shlex.quote(self.folder)} && {shlex.join(words)}"
+
+
+def command_without_enclave(command: Sequence[str], enclave: str) -> Sequence[str]:
+    """Return a command without the argument for its enclave that ``sros run`` adds at its end."""
+    words = tuple(command)
+    return words[:-3] if words[-3:] == (ROS_ARGS, "--enclave", enclave) else words
+
+
+def run_words(export: Path, enclave: str, rmw: str) -> Sequence[str]:
+    """Return the words before a command that start it in an enclave; ``rmw`` is "" on DDS."""
+    return ("sros", "run", str(export), enclave, *(("--rmw", rmw) if rmw else ()), "--")
+
+
+def launch_words(folder: Path, before: Sequence[str], after: Sequence[str]) -> Sequence[str]:
+    """Return a command of ``ros2 launch`` whose processes run in the enclaves of a closed robot."""
+    secured = ("--secured", str(folder / "export"), str(folder / "policy.xml"))
+    return (*before, *secured, *after)
+
+
+def needs_enclave_argument(process: ClosedProcess) -> bool:
+    """Return whether the command must name the enclave, which others look for on Zenoh."""
+    is_node = bool(process.rmw) and process.enclave != ROUTER
+    return is_node and named_enclave(process.command) != process.enclave
+
+
+class ObservedProcesses(NamedTuple):
+    """The processes of an open robot, and what sros cannot start in an enclave."""
+
+    domain: int
+    """The ROS domain."""
+    processes: Sequence[ClosedProcess] = ()
+    """The processes, each with the enclave that it will run in."""
+    unknown: Sequence[str] = ()
+    """Processes on this machine whose nodes are not known; they are not closed."""
+    elsewhere: Sequence[str] = ()
+    """Enclaves with nodes whose process sros did not find on this machine."""
+    ended: Sequence[str] = ()
+    """Enclaves whose processes ended while sros watched."""
+    not_here: Sequence[str] = ()
+    """Enclaves that belong to other machines: those of `--elsewhere`."""
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The systemd units that start a process alone, by its enclave."""
+        return {process.enclave: process.unit for process in self.processes if process.unit}
+
+    def with_current_pids(self, running: RunningProcesses) -> ObservedProcesses:
+        """Return a copy with the current ids and the current unknown processes."""
+        pids = {process.pid for process in self.processes}
+        commands = {tuple(process.command) for process in self.processes}
+        unknown = [
+            process_text(process)
+            for process in running.processes
+            if is_in_domain(process, self.domain)
+            and not (process.is_daemon or process.asks_for_security)
+            and process.program[0] not in pids
+            and process.program[1] not in commands
+        ]
+        processes = [process.with_current_pid(running) for process in self.processes]
+        return self._replace(processes=processes, unknown=unknown)
+
+    def belonging_elsewhere(self, names: Iterable[str]) -> ObservedProcesses:
+        """Return a copy in which the enclaves ``names`` belong to other machines."""
+        not_here = {*self.not_here, *names}
+        return self._replace(
+            processes=[process for process in self.processes if process.enclave not in not_here],
+            elsewhere=[enclave for enclave in self.elsewhere if enclave not in not_here],
+            not_here=sorted(not_here),
+        )
+
+    def within(self, policy: Policy) -> ObservedProcesses:
+        """Return a copy without enclaves that the policy does not have any more."""
+        names = {ROUTER, *(enclave.path for enclave in policy.enclaves)}
+        return self._replace(
+            processes=[
+                process._replace(shares=sorted(names.intersection(process.shares)))
+                for process in self.processes
+                if process.enclave in names
+            ],
+            elsewhere=[enclave for enclave in self.elsewhere if enclave in names],
+        )
+
+    def command_of_new(self, export: Path, enclave: str) -> str:
+        """Return the shell command for a process of an enclave of which none was observed."""
+        rmw = next((process.rmw for process in self.processes if process.rmw), "")
+        return f"{shlex.join(run_words(export, enclave, rmw))} COMMAND"
+
+    def started_in(self, process: ClosedProcess) -> str:
+        """Return the enclave in which the command of a process is started.
+
+        It differs from the enclave of the process if the program itself chooses that enclave.
+        """
+        names = {process.enclave, *process.shares}
+        program = (other for other in self.processes if other.enclave in names)
+        return min((part.chooses, part.enclave) for part in program)[1]
+
+    def commands_by_hand(self, folder: Path) -> Mapping[str, Sequence[ClosedProcess]]:
+        """Map shell commands to the processes that they start and that no unit starts alone.
+
+        A Zenoh router comes first: nodes wait for it.
+        """
+        launches = {
+            tuple(process.launch): process.enclave
+            for process in self.processes
+            if launch_verb(process.command)
+        }
+        commands: dict[str, list[ClosedProcess]] = {}
+        for process in sorted(self.processes, key=lambda process: process.enclave != ROUTER):
+            if not process.unit:
+                first = process._replace(enclave=self.started_in(process))
+                command = first.secured_command(folder, launches.get(tuple(process.launch), ""))
+                commands.setdefault(command, []).append(process)
+        return commands
+
+
+def is_in_domain(process: Process, domain: int) -> bool:
+    """Return whether a process may be in a ROS domain, in the network of this process."""
+    # A domain that rcl cannot read can be any for a program without it.
+    near = process.domain == str(domain) or not process.domain.isdecimal()
+    return near and not process.network
+
+
+def process_text(process: Process) -> str:
+    """Return the label of a process with its command."""
+    return f"{process.label}: {shlex.join(process.command)}"
+
+
+def read_processes(path: Path) -> ObservedProcesses:
+    """Return the processes in a file that `assign` filled.
+
+    Raises:
+        DocumentError: The file cannot be read.
+    """
+    try:
+        value = json.loads(read_bytes(path, "list of processes"))
+        processes = [ClosedProcess(**process) for process in value["processes"]]
+        if not all(isinstance(name, str) for name in value.get("not_here", ())):
+            raise ValueError(f"{value['not_here']} are not all text")
+        for process in processes:
+            words = (process.enclave, process.folder, process.container, process.rmw)
+            texts = (*words, *process.command, *process.launch, *process.shares)
+            if not all(isinstance(text, str) for text in texts):
+                raise ValueError(f"{texts} are not all text")
+            if process.unit and not re.fullmatch(SERVICE_NAME, process.unit, re.A):
+                raise ValueError(f"{process.unit!r} is not a service")
+        return ObservedProcesses(**value)._replace(processes=processes)
+    except (ValueError, TypeError, KeyError) as error:
+        raise DocumentError(
+            f"'{path}' is not a list of processes",
+            f"{error}",
+            "Remove it, to watch the robot again.",
+        ) from error

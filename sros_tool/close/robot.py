@@ -1,0 +1,192 @@
+"""The robot of this machine, the folder into which it is closed, and what is remembered of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from datetime import datetime, tzinfo
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sros_tool.checks.environment import secured_by
+from sros_tool.close.processes import ObservedProcesses, read_processes
+from sros_tool.enclave_environment import loadable_environment
+from sros_tool.errors import SrosError, UsageError
+from sros_tool.files import replace_file
+from sros_tool.keystore.layout import (
+    CLOSED_OBSERVER,
+    CLOSED_POLICY,
+    CLOSED_PROCESSES,
+    list_enclaves,
+)
+from sros_tool.owners import other_writers, replaceable_on_the_way
+from sros_tool.policy.document import read_policy
+from sros_tool.runtime.variables import domain_of
+from sros_tool.values import as_plain
+from sros_tool.wording import first_few
+
+REQUIREMENTS, TEMPLATE, OBSERVER = "requirements.toml", "production", CLOSED_OBSERVER
+MOST_NAMES = 3
+
+
+class Shell(NamedTuple):
+    """What closing a robot needs of the command line.
+
+    ``run`` runs a verb of sros, and returns its status, its output and its messages, unless its
+    second argument lets it show these itself.  ``say`` shows progress.
+    """
+
+    run: Callable[[Sequence[str], bool], tuple[int, str, str]]
+    say: Callable[[str], None]
+    environment: Mapping[str, str]
+    now: Callable[[], datetime]
+    zone: tzinfo
+
+    def say_lines(self, text: str) -> None:
+        """Show the lines of a text."""
+        for line in text.splitlines():
+            self.say(line)
+
+    def read_json(self, words: Sequence[str]) -> tuple[int, Any]:
+        """Show and run a verb; return its status and the JSON that it prints."""
+        self.say(f"+ sros {shlex.join(words)}")
+        status, output, _ = self.run(words, False)
+        return status, json.loads(output)
+
+    def check(self, *words: str) -> int:
+        """Run `check`, show what it says if it finds an error, and return its status."""
+        command = ("check", *words, "--fail-on", "error")
+        self.say(f"+ sros {shlex.join(command)}")
+        status, output, messages = self.run(command, False)
+        self.say_lines(f"{output}{messages}" if status else "")
+        return status
+
+    def check_open(self) -> None:
+        """Raise `UsageError` if an observer that this shell starts might run secured."""
+        if secured := [*secured_by(self.environment, Path.cwd())]:
+            raise UsageError(
+                f"{' and '.join(secured)}, so this shell does not see an open robot",
+                "sros looks for open nodes with an observer that is open itself.",
+                "Unset the variables in this message, for example with `env -u NAME sros close "
+                "...`; if the message names a file in this folder, run sros in another folder.",
+            )
+
+
+class LocalRobot:
+    """The robot of this machine, with the folder into which it is closed.
+
+    Raises:
+        SrosError: others can change what is in the folder, which says what systemd starts, or a
+            file in it is broken.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        domain: int | None,
+        shell: Shell,
+        without: Iterable[str] = (),
+        elsewhere: Iterable[str] = (),
+    ) -> None:
+        self.folder, self.shell, self.without = folder, shell, sorted({*without})
+        self.named_elsewhere = sorted({*elsewhere})
+        self.close_command = f"sros close {shlex.quote(str(folder))}"
+        self.policy, self.observer = folder / CLOSED_POLICY, folder / "observer.xml"
+        self.requirements = folder / REQUIREMENTS
+        self.keystore, self.export = folder / "keystore", folder / "export"
+        self.start, self.page = folder / "start", folder / "rights.html"
+        self.commands_file = self.start / "commands.txt"
+        self.observation_file = folder / "observed.json"
+        self.processes_file = folder / CLOSED_PROCESSES
+        self.seen_policy = folder / "seen.xml"
+        self._check_writers()
+        is_watched = self.processes_file.exists()
+        self.observed = read_processes(self.processes_file) if is_watched else None
+        wanted = domain_of(shell.environment) if domain is None else domain
+        self.domain = self.observed.domain if self.observed else wanted
+        if domain not in (None, self.domain):
+            raise UsageError(
+                f"the robot was watched in domain {self.domain}, not {domain}",
+                "",
+                "Close each domain into a folder of its own.",
+            )
+
+    def _check_writers(self) -> None:
+        """Raise `SrosError` if others can change what is in the folder.
+
+        Whoever runs sros by sudo is trusted, as root is.
+        """
+        sudo = self.shell.environment.get("SUDO_UID", "") if os.geteuid() == 0 else ""
+        trusted = frozenset({0, os.geteuid(), *([int(sudo)] if sudo.isdecimal() else [])})
+        files = (self.policy, self.observation_file, self.processes_file)
+        for path in (self.folder, self.start, self.start / "units", *files):
+            ways = [*replaceable_on_the_way(path, trusted)]
+            if path.exists() and (why := other_writers(path.stat(), trusted)):
+                ways.insert(0, (path, why))
+            for step, why in ways:
+                raise SrosError(
+                    f"others can change '{path}'",
+                    f"'{step}': {why}.",
+                    "Close the robot into a folder that only you and root can change.",
+                )
+
+    @property
+    def processes(self) -> ObservedProcesses:
+        """The observed processes; none if the robot was not watched."""
+        return self.observed or ObservedProcesses(self.domain)
+
+    @property
+    def not_here(self) -> set[str]:
+        """The enclaves that belong to other machines."""
+        return {*self.named_elsewhere, *self.processes.not_here}
+
+    @property
+    def rights_source(self) -> Path:
+        """The keystore, or the policy if the keystore was brought to another machine."""
+        return self.keystore if self.keystore.exists() else self.policy
+
+    def policy_enclaves(self) -> set[str]:
+        """Return the names of the enclaves in the policy; none without a policy."""
+        if not self.policy.exists():
+            return set()
+        return {enclave.path for enclave in read_policy(self.policy).enclaves}
+
+    def keystore_enclaves(self) -> set[str]:
+        """Return the names of the enclaves in the keystore; none without a keystore."""
+        return {*(list_enclaves(self.keystore) if self.keystore.exists() else ())}
+
+    def remember(self, observed: ObservedProcesses) -> None:
+        """Write the observed processes into the folder."""
+        self.observed = observed
+        content = f"{json.dumps(as_plain(observed), indent=2)}\n"
+        replace_file(self.processes_file, content.encode())
+
+    def check_elsewhere(self) -> None:
+        """Raise `UsageError` if neither the policy nor the keystore has an enclave elsewhere."""
+        known = (self.keystore_enclaves() - {OBSERVER}) | self.policy_enclaves()
+        check_enclaves(self.named_elsewhere, known, "--elsewhere")
+
+    def variables(self, enclave: str, rmw: str = "") -> dict[str, str]:
+        """Return the environment of an enclave of the export."""
+        shell, domain = self.shell, str(self.domain)
+        return loadable_environment(
+            self.export,
+            enclave,
+            domain,
+            rmw or None,
+            environment=shell.environment,
+            now=shell.now(),
+            zone=shell.zone,
+        ).variables
+
+
+def check_enclaves(names: Iterable[str], known: Collection[str], option: str) -> None:
+    """Raise `UsageError` if an option names an enclave that the robot does not have."""
+    if unknown := sorted({*names}.difference(known)):
+        raise UsageError(
+            f"the robot has no enclave {unknown[0]}",
+            f"It has {first_few(sorted(known), MOST_NAMES)}.",
+            f"Correct {option}.",
+        )

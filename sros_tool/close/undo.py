@@ -1,0 +1,109 @@
+"""Open a closed robot again."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterator
+from itertools import chain
+
+from sros_tool.close.drop_ins import drop_ins_of, restart_units
+from sros_tool.close.nodes import ObservedNodes
+from sros_tool.close.processes import ClosedProcess, ObservedProcesses, process_text
+from sros_tool.close.robot import LocalRobot
+from sros_tool.close.running import RunningRobot, keystore_text, secured_process
+from sros_tool.close.state import CloseState, current_state
+from sros_tool.files import remove_file
+from sros_tool.names import expand
+from sros_tool.policy.document import read_policy
+from sros_tool.runtime.environment import node_argument
+from sros_tool.runtime.processes import Process, program_of
+from sros_tool.values import FileChange
+
+
+def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
+    """Remove the drop-ins of this folder, restart their units, and say what to do by hand."""
+    observed = RunningRobot(robot).with_later_processes(robot.processes)
+    drop_ins = drop_ins_of(robot, observed)
+    for path in drop_ins:
+        robot.shell.say(f"{'would remove' if dry_run else 'removed'} {path}")
+        if not dry_run:
+            remove_file(path)
+    units_of_drop_ins = {path.parent.name.removesuffix(".d") for path in drop_ins}
+    restart_units(robot, observed, {*observed.units.values()} | units_of_drop_ins, dry_run=dry_run)
+    changes = [FileChange("remove", str(path)) for path in drop_ins]
+    state = current_state(robot)._replace(dry_run=dry_run, changes=changes)
+    return state._replace(problems=[*_texts_to_open(robot, observed)])
+
+
+def _texts_to_open(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[str]:
+    """Yield how to start each process open that runs in an enclave or does not run.
+
+    Processes of enclaves that were taken out of the policy are left out.  Secured processes
+    that sros does not know are named, so that none of them is taken for open.
+    """
+    running = RunningRobot(robot)
+    are_open = {
+        process.program[1]: process
+        for process in running.in_domain
+        if not process.asks_for_security
+    }
+    nodes = ObservedNodes(robot)
+    observed_commands = {tuple(process.command) for process in observed.processes}
+    others = [are_open[command] for command in are_open if command not in observed_commands]
+    secured = {
+        enclave.name: process
+        for process, enclave in sorted(
+            running.secured_everywhere, key=lambda secured: running.may_use_files(secured.process)
+        )
+    }
+    if robot.policy.exists():
+        observed = observed.within(read_policy(robot.policy))
+    by_hand = [*chain.from_iterable(observed.commands_by_hand(robot.folder).values())]
+    closed = [process for process in by_hand if process.enclave in secured]
+    processes_of = Counter(process.enclave for process in closed)
+    commands = []
+    for process in closed:
+        now = secured[process.enclave]
+        is_alone = processes_of[process.enclave] == 1 and not process.launch
+        if is_alone and not process.container and running.may_use_files(now):
+            commands.append(secured_process(now, process.enclave).open_command(robot.domain))
+        else:
+            commands.append(process.open_command(robot.domain))
+    for command in dict.fromkeys(commands):
+        yield f"restart it open: {command}"
+    for process in by_hand:
+        if process.enclave not in secured and tuple(process.command) not in are_open:
+            names, old = nodes.names_in(process.enclave)
+            under = f", under its old name {old}" if old else ""
+            how = f"start it open{under}: {process.open_command(robot.domain)}"
+            like = [other.label for other in others if _is_like(other, process, names)]
+            state = "does not run; "
+            if like:
+                state = f"runs open by another command ({like[0]}); if that is another program, "
+            robot.shell.say(f"{process.enclave} {state}{how}")
+    for name in sorted(secured.keys() - {process.enclave for process in observed.processes}):
+        guest = secured[name]
+        how = f"restart it open: {process_text(guest)}"
+        if not running.may_use_files(guest):
+            how = f"it is {guest.label} of user {guest.user}, who cannot read its files"
+        yield f"{name} runs in an enclave, too; {how}"
+    pids = {process.pid for process, _ in running.secured_everywhere}
+    for other in running.in_domain:
+        if (enclave := other.enclave) and other.pid not in pids and not other.is_daemon:
+            why = f" ({enclave.problem})" if enclave.problem else ""
+            yield (
+                f"{other.label} runs secured with the files of '{keystore_text(enclave)}'{why}, "
+                "which are not known as those of this folder; open processes do not hear it"
+            )
+    for unseen in running.processes.unseen:
+        if unseen.speaks:
+            yield f"{unseen.label} speaks ROS 2, and cannot be looked at: {unseen.why}"
+    if running.processes.hidden or any(not unseen.speaks for unseen in running.processes.unseen):
+        robot.shell.say("some processes cannot be looked at: to be sure of them, ask as root")
+
+
+def _is_like(process: Process, observed: ClosedProcess, nodes: Collection[str]) -> bool:
+    """Return whether a process may be an observed one, which has these nodes, by other words."""
+    if named := node_argument(process.program[1]):
+        return expand("~", *named) in nodes
+    return program_of(process.program[1]) == program_of(tuple(observed.command))

@@ -1,0 +1,229 @@
+"""Watch an open robot: its nodes, their processes, and what started them."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import threading
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+
+from sros_tool.close.assignment import (
+    assign,
+    ended_processes,
+    process_ids_of_cyclone,
+    with_command_of_unit,
+)
+from sros_tool.close.nodes import ObservedNodes
+from sros_tool.close.processes import ObservedProcesses
+from sros_tool.close.robot import MOST_NAMES, LocalRobot
+from sros_tool.close.running import RunningRobot
+from sros_tool.close.steps import CommandStep
+from sros_tool.errors import UnavailableError, UsageError
+from sros_tool.explain.explanation import likely_meaning
+from sros_tool.files import policies_dir, remove_file, replace_file
+from sros_tool.folders import make_folders, remove_folders
+from sros_tool.graph.learn import common_parts, is_tool
+from sros_tool.graph.observation import ObservedNode, make_observation
+from sros_tool.names import is_expression
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import ALLOW
+from sros_tool.policy.rights import Right, policy_rights
+from sros_tool.runtime.environment import RMW_ZENOH
+from sros_tool.runtime.processes import Process, ProcessOrigin, ProcessTable, process_origin
+from sros_tool.runtime.rmw import RMW
+from sros_tool.runtime.variables import DOMAIN
+from sros_tool.wording import counted, first_few
+
+_LOOK_SECONDS = 1.0
+"""How often processes are looked at while the robot is watched; shorter ones can be missed."""
+_MOST_COMMANDS = 10_000
+"""Number of commands of processes that are kept; of others, the start command is not known."""
+_OF_EVERY_SHELL = ("_", "SHLVL", "PWD", "OLDPWD", "COLUMNS", "LINES", DOMAIN)
+"""Variables that differ between shells, or that the commands set."""
+
+_StartedProcesses = dict[tuple[str, ...], tuple[Process, ProcessOrigin]]
+"""Processes by their commands, with what started them."""
+
+
+def watch(robot: LocalRobot, step: CommandStep) -> str:
+    """Watch the robot by a step, and write its nodes and processes into the folder.
+
+    Return, as a sentence, which of the observed rights an earlier policy lacks.
+
+    Raises:
+        SrosError: the robot cannot be watched.
+    """
+    _check_open(robot)
+    made = make_folders(robot.folder)
+    robot.shell.say(f"+ {step.command}")
+    started: _StartedProcesses = {}
+    with _looking(robot, started):
+        status, output, _ = robot.shell.run(step.words, True)
+    if status:
+        remove_folders(made)
+        others = RunningRobot(robot).in_other_domains()
+        raise UnavailableError(
+            f"there is no robot to close: no node was observed in domain {robot.domain}",
+            f"{others}." if others else "",
+            f"{'Otherwise start' if others else 'Start'} the robot open, and run this again.",
+        )
+    replace_file(robot.observation_file, output.encode())
+    return _remember(robot, output, started)
+
+
+def _check_open(robot: LocalRobot) -> None:
+    """Raise `SrosError` if the robot cannot be watched as an open one."""
+    robot.shell.check_open()
+    rmw = robot.shell.environment.get(RMW)
+    running = RunningRobot(robot)
+    if secured := [process.label for process, _ in running.secured]:
+        raise UsageError(
+            f"the robot runs closed: {first_few(secured, MOST_NAMES)}",
+            "Only an open robot can be watched.",
+            f"Go back by `{robot.close_command} --undo` and watch again, "
+            f"or add what is missing to '{robot.policy}' by hand.",
+        )
+    for process in running.in_domain:
+        if process.is_zenoh and rmw != RMW_ZENOH:
+            raise UsageError(
+                f"{process.label} speaks Zenoh, but this shell is set up for DDS",
+                "",
+                f"Run `export {RMW}={RMW_ZENOH}`, and this command again.",
+            )
+
+
+@contextmanager
+def _looking(robot: LocalRobot, started: _StartedProcesses) -> Iterator[None]:
+    """Put into ``started`` the processes that run in this context, with what started them."""
+    table, over = ProcessTable(), threading.Event()
+
+    def look() -> None:
+        for process in table.look(robot.shell.now()).processes:
+            before, origin = started.get(process.command, (process, None))
+            if before.pid != process.pid or origin is None:
+                origin = process_origin(process.pid)
+            if process.command in started or len(started) < _MOST_COMMANDS:
+                started[process.command] = process, origin
+
+    def look_until_over() -> None:
+        while True:
+            with suppress(OSError):  # the next look may succeed
+                look()
+            if over.wait(_LOOK_SECONDS):
+                return
+
+    looking = threading.Thread(target=look_until_over)
+    looking.start()
+    try:
+        yield
+    finally:
+        over.set()
+        looking.join()
+
+
+def _remember(robot: LocalRobot, document: str, started: _StartedProcesses) -> str:
+    """Write which process has which nodes, and the policy of the observer.
+
+    ``document`` is the observation, and ``started`` are the processes that ran while sros watched.
+    Return, as a sentence, which of the observed rights an earlier policy lacks.
+    """
+    replace_file(robot.observer, (policies_dir() / "observer.xml").read_bytes())
+    nodes = [node for node in ObservedNodes(robot).in_their_enclaves() if not is_tool(node)]
+    running = RunningRobot(robot)
+    learned = json.loads(document)
+    observed = _observed_processes(robot, nodes, learned["ended"], running, started)
+    seen_here = {process.enclave for process in observed.processes}
+    not_here = (robot.not_here - seen_here).union(robot.named_elsewhere)
+    robot.check_elsewhere()
+    # What does not run now is still started by its command.
+    absent = robot.policy_enclaves() - seen_here - not_here
+    kept = [process for process in robot.processes.processes if process.enclave in absent]
+    remembered = observed._replace(processes=[*observed.processes, *kept])
+    robot.remember(remembered.belonging_elsewhere(not_here))
+    _say_variables(robot, observed, running)
+    number = counted(len(observed.processes), "process", "processes")
+    robot.shell.say(f"saw {counted(len(nodes), 'node')} in {number} of this machine")
+    if others := running.in_other_domains():
+        robot.shell.say(others)
+    if os.path.lexists(robot.seen_policy):  # of an earlier watch
+        remove_file(robot.seen_policy)
+    return _lacking_text(robot, learned["added"], nodes) if learned["dry_run"] else ""
+
+
+def _observed_processes(
+    robot: LocalRobot,
+    nodes: Sequence[ObservedNode],
+    ended_participants: Collection[str],
+    running: RunningRobot,
+    started: _StartedProcesses,
+) -> ObservedProcesses:
+    """Return the processes of nodes that run now, and of nodes that ended while sros watched."""
+    processes = running.processes.processes
+    pids = [process.pid for process in processes if "libddsc" in process.libraries]
+    stayed = [node for node in nodes if node.participant not in ended_participants]
+    process_ids = process_ids_of_cyclone(pids, robot.domain)
+    observed = assign(stayed, processes, robot.domain, process_ids)
+    ended = {node.enclaves[0] for node in nodes} - {node.enclaves[0] for node in stayed}
+    commands = {process.command for process in processes}
+    finished = ended_processes(
+        [node for node in nodes if node.enclaves[0] in ended],
+        [started[command] for command in started.keys() - commands],
+        observed,
+    )
+    with_units = [with_command_of_unit(process) for process in (*observed.processes, *finished)]
+    return observed._replace(processes=with_units, ended=sorted(ended))
+
+
+def _say_variables(robot: LocalRobot, observed: ObservedProcesses, running: RunningRobot) -> None:
+    """Name the variables of processes that their commands do not set, and this shell neither."""
+    pids = {process.pid for process in observed.processes}
+    for process in running.processes.processes:
+        more = process.environment.keys() - {*robot.shell.environment, *_OF_EVERY_SHELL}
+        if process.pid in pids and more:
+            robot.shell.say(
+                f"{process.label} has variables that this shell does not have, and that its "
+                f"command in {robot.commands_file} does not set: "
+                f"{first_few(sorted(more), MOST_NAMES)}"
+            )
+
+
+def _lacking_text(
+    robot: LocalRobot, lacking: Sequence[Mapping[str, str]], nodes: Iterable[ObservedNode]
+) -> str:
+    """Return, as a sentence, which rights of nodes the policy lacks; "" if it lacks none.
+
+    Writes the rights that the nodes use as a policy of its own.
+    """
+    from sros_tool.graph.learn import draft, learn, write  # only after another watch
+
+    if not lacking:
+        return ""
+    common = common_parts(robot.folder, policies_dir())
+    learned = learn(make_observation(nodes), common)
+    write(draft(robot.seen_policy, learned, common))
+    used, stated = policy_rights(learned.policy()), policy_rights(read_policy(robot.policy))
+    rights, meanings = [], []
+    for value in lacking:
+        right = Right(value["enclave"], ALLOW, value["right"], value["name"])
+        rights.append(f"{right.enclave} {right.right} {right.name}")
+        named = (
+            other
+            for other in stated
+            if (other.enclave, other.qualifier) == (right.enclave, ALLOW)
+            and not is_expression(other.name)
+        )
+        if meaning := likely_meaning(right, used, named):
+            meanings.append(meaning)
+    policy, seen_policy = shlex.quote(str(robot.policy)), shlex.quote(str(robot.seen_policy))
+    add = f"sros merge_policy {policy} {seen_policy} --in-place"
+    first = (
+        f"{first_few(meanings, MOST_NAMES)}; then restart it with that, and watch again: "
+        f"{robot.close_command} --for 1m; otherwise, " * bool(meanings)
+    )
+    return (
+        f"'{robot.policy}' stays as it is, and lacks {counted(len(rights), 'right')} seen now "
+        f"({first_few(rights, MOST_NAMES)}); {first}if a process should not have them, stop "
+        f"it, and run `{robot.close_command}`; if they are right, add them: {add}"
+    )
