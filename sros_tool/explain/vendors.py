@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import datetime
 from enum import Enum, auto
 from fnmatch import fnmatchcase
 from typing import NamedTuple
 
-from sros_tool.dds.decision.access import Outcome, OutcomeWord, ReasonWord
+from sros_tool.dds.decision.access import AccessVerb, Outcome, OutcomeWord, ReasonWord
 from sros_tool.dds.decision.vendors import PRINCIPAL, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.distributions import SUPPORTED, Shipped
@@ -210,7 +210,7 @@ def explain_on_dds(
         *_similar_name_notes(answer),
         *(note_on_lacking_keys(copied) if copied else ()),
         *_earlier_permissions_notes(answer, context.at),
-        *_note_on_anybody(_anybody_may(evaluator, question), refuse),
+        *_note_on_anybody([_opened_parts(evaluator, question)], refuse),
     )
     asked = Asked(enclave.name, question, context)
     if compared is Compared.VENDORS:
@@ -376,6 +376,23 @@ def _runs_on_zenoh(keystore: OpenedKeystore, name: str) -> bool:
 # ── many enclaves ──────────────────────────────────────────────────────────────────────────
 
 
+class OpenedParts(NamedTuple):
+    """What processes without an identity may do, or else the acting parts that they may do."""
+
+    whole: bool = False
+    parts: tuple[str, ...] = ()
+
+    @staticmethod
+    def joined(opened: Iterable[OpenedParts]) -> OpenedParts:
+        """Return what is opened in any enclave or domain."""
+        known = tuple(opened)
+        if any(opened_parts.whole for opened_parts in known):
+            return OpenedParts(whole=True)
+        return OpenedParts(
+            parts=tuple(dict.fromkeys(part for some in known for part in some.parts))
+        )
+
+
 @shows(
     *("enclave", "allowed", "in_part", "outcome", "reason", "expression", "wildcard", "domains"),
     null_if_empty=("expression", "wildcard", "domains"),
@@ -392,8 +409,8 @@ class VendorOutcome(NamedTuple):
     """The expression that decided, or null."""
     domains: str = ""
     """The ROS domains in which the enclave has the right, such as ``10`` or ``10,20``, or null."""
-    anybody: bool = False
-    """Whether the enclave's governance also gives the right to processes without an identity."""
+    opened: OpenedParts = OpenedParts()
+    """What the enclave's governance gives to processes without an identity."""
     in_part: Sequence[str] = ()
     """The parts of an action, such as ``send_goal``, by which the enclave can command the server
     (with call) or inform the clients (with execute), although it does not have the whole right."""
@@ -402,6 +419,11 @@ class VendorOutcome(NamedTuple):
     def allowed(self) -> bool:
         """Whether the enclave has the right that was asked for."""
         return self.outcome.ok
+
+    @property
+    def anybody(self) -> bool:
+        """Whether the governance also gives the right to processes without an identity."""
+        return self.opened.whole
 
     @property
     def wildcard(self) -> str:
@@ -417,7 +439,7 @@ class VendorOutcome(NamedTuple):
 
 @shows(
     *("question", "vendor", "vendor_why", "documented_only", "domain", "enclaves", "anybody"),
-    "export",
+    *("anybody_in_part", "export"),
 )
 class WhoByVendor(NamedTuple):
     """The decision of a vendor for every enclave of a keystore."""
@@ -439,6 +461,12 @@ class WhoByVendor(NamedTuple):
     def anybody(self) -> bool:
         """Whether processes without an identity have the right, too, by the governance."""
         return any(outcome.anybody for outcome in self.enclaves)
+
+    @property
+    def anybody_in_part(self) -> tuple[str, ...]:
+        """The parts by which processes without an identity can command the server or inform the
+        clients, without the whole right."""
+        return OpenedParts.joined(outcome.opened for outcome in self.enclaves).parts
 
     @property
     def documented_only(self) -> bool:
@@ -470,31 +498,46 @@ def _title(vendor: Vendor, why: str) -> str:
 def _outcome(evaluator: Evaluator, name: str, question: Question) -> VendorOutcome:
     answer = evaluator.answer(question)
     expression = answer.decision.expression or ""
-    anybody = _anybody_may(evaluator, question)
     return VendorOutcome(
         name,
         answer.outcome,
         answer.reason,
         answer.text,
         expression,
-        anybody=anybody,
+        opened=_opened_parts(evaluator, question),
         in_part=_allowed_parts(evaluator, answer),
     )
 
 
-def _anybody_may(evaluator: Evaluator, question: Question) -> bool:
-    """Return whether processes without an identity may do it, by the enclave's governance."""
+def _opened_parts(evaluator: Evaluator, question: Question) -> OpenedParts:
+    """Return what processes without an identity may do, by the enclave's governance."""
     access = evaluator.access
     opened = access.topics_of_unauthenticated() if access else None
-    parts = question.parts
-    return opened is not None and bool(parts) and all(part.topic in opened for part in parts)
+    if opened is None or not question.parts:
+        return OpenedParts()
+    if all(part.topic in opened for part in question.parts):
+        return OpenedParts(whole=True)
+    sent = {part: asked.parts for part, asked in acting_parts(question).items()} or {
+        part.role: (part,) for part in question.parts if part.verb is AccessVerb.PUBLISH
+    }
+    return OpenedParts(
+        parts=tuple(n for n, parts in sent.items() if all(part.topic in opened for part in parts))
+    )
 
 
-def _note_on_anybody(anybody: bool, remedy: str) -> Iterator[Note]:
-    if anybody:
+def _note_on_anybody(opened_parts: Iterable[OpenedParts], remedy: str) -> Iterator[Note]:
+    opened = OpenedParts.joined(opened_parts)
+    if opened.whole:
         text = (
             "processes without an identity may do it, too: the governance admits them, and does "
             f"not protect the name. {remedy}"
+        )
+        yield Note("explain.anybody", text)
+    elif opened.parts:
+        text = (
+            "processes without an identity may do a part of it, which is enough to act on the "
+            f"other side: {', '.join(opened.parts)}. The governance admits them, and does not "
+            f"protect the topics of this part. {remedy}"
         )
         yield Note("explain.anybody", text)
 
@@ -537,8 +580,8 @@ class VendorOfPolicy(NamedTuple):
 
     def notes(self, outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
         """Yield a note if processes without an identity have the right, too."""
-        anybody = any(outcome.anybody for outcome in outcomes)
-        return _note_on_anybody(anybody, f"Change the template, or run {REFUSE_STRANGERS}.")
+        opened = (outcome.opened for outcome in outcomes)
+        return _note_on_anybody(opened, f"Change the template, or run {REFUSE_STRANGERS}.")
 
 
 class VendorOfKeystore(NamedTuple):
@@ -586,8 +629,10 @@ class VendorOfKeystore(NamedTuple):
 
             vendor = self.stated(name) or self.vendor
             parts = _parts(enclave, self.asking.domain)
-            decision, domains, in_part = first_allowing_domain(parts, decided)
-            return decision._replace(domains=domains, in_part=in_part)
+            decisions = {domains: decided(next(iter(domains))) for domains in parts}
+            decision, domains, in_part = first_allowing_domain(decisions)
+            opened = OpenedParts.joined(outcome.opened for outcome in decisions.values())
+            return decision._replace(domains=domains, in_part=in_part, opened=opened)
 
         return decide_each(self.keystore.names if self.names is None else self.names, outcome)
 
@@ -609,7 +654,7 @@ class VendorOfKeystore(NamedTuple):
 
         yield from note_on_export(self.keystore.root)
         refuse = remedy_in_keystore(self.keystore.root, f"Run {REFUSE_STRANGERS}.")
-        yield from _note_on_anybody(any(outcome.anybody for outcome in outcomes), refuse)
+        yield from _note_on_anybody((outcome.opened for outcome in outcomes), refuse)
         denied = {outcome.enclave for outcome in outcomes if not outcome.allowed}
         yield from note_on_earlier_permissions(self.keystore, denied, self.asking.at)
         if not all(outcome.stopped for outcome in outcomes):

@@ -165,21 +165,17 @@ def names_meant(decider: Decider, question: Question, enclaves: Container[str]) 
 
 
 def first_allowing_domain(
-    parts: Iterable[DomainSet], decide: Callable[[int], _Outcome]
+    outcomes: Mapping[DomainSet, _Outcome],
 ) -> tuple[_Outcome, str, tuple[str, ...]]:
-    """Return the decision of the first domain that gives the right, else of the first domain.
+    """Return the decision of the first domains that give the right, else of the first domains.
 
     Also returns the domains that give the right, as text; or, if none does, the parts of an action
     that some domain gives.
-
-    ``decide`` is asked about one domain of each part, because all domains of a part have the same
-    rules.
     """
-    outcomes = [(part, decide(next(iter(part)))) for part in parts]
-    allowing = [(part, outcome) for part, outcome in outcomes if outcome.allowed]
-    domains = DomainSet.of(*((d, d) for part, _ in allowing for d in part)) if allowing else ""
-    in_part = () if allowing else dict.fromkeys(p for _, o in outcomes for p in o.in_part)
-    return (allowing or outcomes)[0][1], str(domains), tuple(in_part)
+    allowing = [domains for domains, outcome in outcomes.items() if outcome.allowed]
+    shown = DomainSet.of(*((d, d) for domains in allowing for d in domains)) if allowing else ""
+    in_part = () if allowing else dict.fromkeys(p for o in outcomes.values() for p in o.in_part)
+    return outcomes[next(iter(allowing or outcomes))], str(shown), tuple(in_part)
 
 
 def decide_each(names: Sequence[str], decide: Callable[[str], _Outcome]) -> tuple[_Outcome, ...]:

@@ -942,7 +942,8 @@ class ZenohOfKeystore:
                 answered = evaluator.answer(name, question, reach=False, brief=True)
                 return evaluator.with_parts(answered, brief=True)
 
-            decision, domains, in_part = first_allowing_domain(self._parts, decided)
+            decisions = {domains: decided(next(iter(domains))) for domains in self._parts}
+            decision, domains, in_part = first_allowing_domain(decisions)
             return replace(decision, domains=domains, in_part=in_part)
 
         return decide_each(self._names, answer)

@@ -196,6 +196,14 @@ def test_who_may_what_counts_processes_without_an_identity(tmp_path: Path) -> No
     keystore = tmp_path / "ks"
     sros("create_keystore", keystore, "--template", tmp_path / "open.toml").ok()
     sros("generate_artifacts", "-k", keystore, "-p", tmp_path / "p.xml").ok()
+    (tmp_path / "door.toml").write_text(
+        f"{head}[protection]\n{OPEN_DOOR}{strict.partition('[protection.default]')[2]}\n"
+        '[[protection.service]]\nnames = ["/arm/_action/send_goal"]\ndata = "NONE"\n'
+        'metadata = "NONE"\nread_access_control = false\nwrite_access_control = false\n'
+    )
+    door = tmp_path / "door"
+    sros("create_keystore", door, "--template", tmp_path / "door.toml").ok()
+    sros("generate_artifacts", "-k", door, "-p", tmp_path / "p.xml").ok()
     for vendor, is_open in (("cyclonedds", True), ("fastdds", False)):  # measured by the demo
         judged = sros("check", keystore, "--requirements", rules, "--vendor", vendor)
         for text in (
@@ -210,6 +218,15 @@ def test_who_may_what_counts_processes_without_an_identity(tmp_path: Path) -> No
         assert (who.status, refuse in who.err) == ((0, True) if is_open else (1, False))
         single = sros("explain", keystore, "/a", "publish", "/x", "--vendor", vendor).ok()
         assert (refuse in single.err) is is_open
+        for words, parts in (
+            (("call", "/arm", "--type", "action"), "other side: send_goal. The governance admits"),
+            (("execute", "/arm"), "other side: send_goal. The governance admits"),
+            (("call", "/arm/_action/send_goal"), "may do it, too"),
+            (("call", "/arm/_action/get_result"), ""),
+        ):
+            asked = sros("explain", door, "--who", *words, "--vendor", vendor)
+            assert ("without an identity" in asked.err) is bool(parts), asked
+            assert parts in asked.err
     reach = sros("explain", keystore, "--reach", "/a").ok()
     assert "whom they influence is not followed" in reach.err and refuse in reach.err
     table = sros("view", keystore, "--format", "markdown").ok().out
