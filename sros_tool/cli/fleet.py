@@ -757,6 +757,8 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
             robot.has_list and robot.crl_in_force is False for robot in status.robots
         ):
             text += f"; {waiting} more have it, but may run processes that started before it"
+        if (until := status.revoked_until) and until > compared_fleet.at:
+            text += f"; robots need it until {until:%Y-%m-%d}, when what it revokes has expired"
         yield text
     yield from _expiry_facts(compared_fleet)
     if status.unassigned:

@@ -392,7 +392,7 @@ class PublishedMetadata:
 
 @shows(
     *("keystore", "complete", "stage", "counts", "unassigned", "overdue", "older", "clock"),
-    *("edited", "publication", "robots"),
+    *("edited", "revoked_until", "publication", "robots"),
     null_if_empty=("older", "clock", "edited"),
 )
 @dataclass(frozen=True, slots=True)
@@ -420,6 +420,9 @@ class FleetStatus:
     edited: str = ""
     """How the keystore's fleet file differs from the file that sros wrote, as a clause: the robots
     are then perhaps not all. Null if it does not differ."""
+    revoked_until: datetime | None = None
+    """Until when robots need the revocation list, in UTC: the expiry of the last certificate on it.
+    Null if no certificate is on it, or if the ledger does not have all of them."""
     publication: PublishedMetadata | None = None
     """What robots fetch; null if nothing was published for a robot."""
     is_any_revoked: bool = False
@@ -535,6 +538,7 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
         unassigned,
         older=older,
         edited=edited_fleet(keystore, keystore.ledger_with("what", "fleet")),
+        revoked_until=known.revoked_until(),
         publication=known.publication,
         is_any_revoked=known.is_any_revoked(),
         groups=fleet.groups,
@@ -913,6 +917,17 @@ class _Known:
             return any(crl.revoked for crl in self._keystore.revocation_lists)
         except SrosError:
             return self.has_list
+
+    def revoked_until(self) -> datetime | None:
+        """Return when the last certificate on the revocation list expires; None if unknown."""
+        with suppress(SrosError):
+            lists = self._keystore.revocation_lists
+            listed = {f"{entry.serial:x}" for crl in lists for entry in crl.revoked}
+            entries = self._keystore.ledger_file.with_values("serial", listed).entries
+            ends = {entry.serial: entry.not_after for entry in entries if entry.not_after}
+            if listed and listed <= ends.keys():
+                return parse_iso(max(ends[serial] for serial in listed))
+        return None
 
     def revoked(self, robot: Robot) -> tuple[str, ...]:
         """Return the enclaves of a robot that were revoked and are not in the keystore."""

@@ -318,6 +318,19 @@ def test_a_robot_that_was_revoked(field: Field) -> None:
     assert "1 enclave revoked" in field.run("fleet", "status", "ks", "--robot", "r3").out
 
 
+def test_until_when_a_revocation_is_needed(field: Field) -> None:
+    assert field.status()["revoked_until"] is None
+    field.run("renew", "ks", "/r3/base", "--revoke-old")
+    certificate = read_certificate(field.root / ENCLAVES / "r3/base/cert.pem")
+    field.run("revoke", "ks", "--robot", "r3")
+    until = certificate.not_valid_after_utc
+    assert field.status()["revoked_until"] == iso(until), "of the last one, not of the first"
+    said = field.run("fleet", "status", "ks", status=1).out
+    assert f"; robots need it until {until:%Y-%m-%d}, when what it revokes has expired\n" in said
+    (field.root / "ledger.jsonl").unlink()
+    assert field.status()["revoked_until"] is None, "nobody knows"
+
+
 def test_a_revoked_robot_comes_back_by_the_commands_that_errors_name(field: Field) -> None:
     made = ("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
     field.run("revoke", "ks", "--robot", "r3")
@@ -557,7 +570,7 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     field.run("revoke", "ks", "/dispatcher")
     assert in_force() == [False, False, False]
     said = field.run("fleet", "status", "ks", status=1).out
-    assert "\nthe revocation list is in force on 0 of 3 robots\n" in said
+    assert "\nthe revocation list is in force on 0 of 3 robots; robots need it until " in said
     field.deliver("r1", "r2")
     field.send("r2", running={"/r2/base": RunningFiles.EARLIER, "/r9/base": RunningFiles.EARLIER})
     assert in_force() == [False, False, False], "r1 does not say which processes it has"
@@ -577,9 +590,9 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     field.deliver("r3", restart=[])
     field.send("r2", running={"/r2/base": RunningFiles.CURRENT})
     said = field.run("fleet", "status", "ks").out
-    assert "\nthe revocation list is in force on all 3 robots\n" in said
+    assert "\nthe revocation list is in force on all 3 robots; robots need it until " in said
     said = field.run("fleet", "status", "ks", "--robot", "r3").out
-    assert "\nthe revocation list is in force on 1 robot\n" in said
+    assert "\nthe revocation list is in force on 1 robot; robots need it until " in said
 
 
 def test_a_list_that_revokes_nobody_is_not_said_to_be_in_force(field: Field) -> None:
