@@ -6,7 +6,7 @@ this module.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from datetime import datetime, tzinfo
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError
-from sros_tool.explain.answer import Evaluator, Question, about_action
+from sros_tool.explain.answer import Evaluator, Question, about_action, ask
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     PERMISSIONS_FILE,
@@ -303,6 +303,23 @@ def taken_for_action(question: Question, action: Question) -> tuple[Note, ...]:
         "To ask about a service, add --type service."
     )
     return (Note("explain.an-action", text),)
+
+
+def note_on_action(
+    question: Question, kind: str | None, decide: Callable[[Question], tuple[bool, Sequence[str]]]
+) -> Iterator[Note]:
+    """Yield a note if an enclave that is denied a service may call an action with its name.
+
+    ``kind`` is the kind of the name if the user gave it; ``decide`` returns whether the enclave may
+    do it, or else the parts that it may do.
+    """
+    if (question.word, question.type, kind) == ("call", "service", None):
+        action = ask("call", question.name, "action")
+        whole, parts = decide(action)
+        if whole or parts:
+            does = action if whole else f"do a part of '{action}'"
+            text = f"it may {does}: add --type action if {question.name} is an action."
+            yield Note("explain.an-action", text)
 
 
 def question_meant(

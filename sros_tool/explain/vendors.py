@@ -19,7 +19,6 @@ from sros_tool.explain.answer import (
     Provenance,
     Question,
     acting_parts,
-    ask,
     text_of_parts,
 )
 from sros_tool.explain.asking import (
@@ -27,6 +26,7 @@ from sros_tool.explain.asking import (
     AskedEnclave,
     AskingContext,
     ZenohInBrief,
+    note_on_action,
     note_on_lacking_keys,
     planned_enclave,
     question_meant,
@@ -204,7 +204,7 @@ def explain_on_dds(
         *taken,
         *_provenance_notes(answer),
         *_export_notes(answer),
-        *_other_type_notes(evaluator, answer, kind),
+        *_note_on_action(evaluator, answer, kind),
         *_note_on_parts(evaluator, answer),
         *_not_a_topic_notes(answer, asked_enclave),
         *_similar_name_notes(answer),
@@ -289,17 +289,15 @@ def _earlier_permissions_notes(answer: Answer, now: datetime) -> Iterator[Note]:
         yield from note_on_earlier_permissions(keystore, {answer.enclave.name}, now)
 
 
-def _other_type_notes(evaluator: Evaluator, answer: Answer, kind: str | None) -> Iterator[Note]:
+def _note_on_action(evaluator: Evaluator, answer: Answer, kind: str | None) -> Iterator[Note]:
     """Yield a note if the enclave may not call the service, but an action with this name."""
-    question = answer.question
-    if question.word == "call" and question.type == "service" and not kind and not answer.allowed:
-        as_action = evaluator.answer(ask("call", question.name, "action"))
-        if as_action.allowed or _allowed_parts(evaluator, as_action):
-            asked = as_action.question
-            does = asked if as_action.allowed else f"do a part of '{asked}'"
-            text = f"it may {does}: add --type action if {question.name} is an "
-            text += "action."
-            yield Note("explain.an-action", text)
+
+    def decide(action: Question) -> tuple[bool, Sequence[str]]:
+        decided = evaluator.answer(action)
+        return decided.allowed, _allowed_parts(evaluator, decided)
+
+    if not answer.allowed:
+        yield from note_on_action(answer.question, kind, decide)
 
 
 def _note_on_parts(evaluator: Evaluator, answer: Answer) -> Iterator[Note]:

@@ -34,6 +34,7 @@ from sros_tool.explain.asking import (
     AskedEnclave,
     AskingContext,
     ZenohInBrief,
+    note_on_action,
     note_on_lacking_keys,
     question_meant,
     rights_naming,
@@ -1103,11 +1104,17 @@ def explain_on_zenoh(
     joins = question.word == "join"
     evaluator = ZenohEvaluator(keystore, moment=context.at, domain=context.domain, joining=joins)
     answer = evaluator.with_parts(evaluator.answer(enclave.name, question), brief=False)
+
+    def decide(action: Question) -> tuple[bool, Sequence[str]]:
+        decided = evaluator.answer(enclave.name, action, reach=False, brief=True)
+        return decided.allowed, evaluator.with_parts(decided, brief=True).in_part
+
     outdated = evaluator.outdated_enclaves(answer)
     by_permissions = explain(stated, question)
     notes = (
         *taken,
         *_notes(answer, by_permissions, outdated),
+        *(() if answer.allowed else note_on_action(question, kind, decide)),
         *(() if joins else note_on_lacking_keys(keystore)),
     )
     asked = Asked(enclave.name, question, context)

@@ -172,9 +172,16 @@ def test_a_part_of_an_action_that_no_enclave_names_is_noted(tmp_path: Path) -> N
     policy.write_text(
         policy_text({"/ui": '<services request="ALLOW"><service>/go/*</service></services>'})
     )
-    for words in (("--who", "call", "/go"), ("/ui", "call", "/go")):
-        asked = explain(policy, *words)
+    keystore = tmp_path / "ks"
+    sros("generate_artifacts", "-k", keystore, "-p", policy).ok()
+    sros("zenoh", keystore).ok()
+    on_zenoh = ("--vendor", "zenoh")
+    questions = ("--who", "call", "/go"), ("/ui", "call", "/go")
+    for (place, vendor), words in product(((policy, ()), (keystore, on_zenoh)), questions):
+        asked = explain(place, *words, *vendor)
         assert asked.status == 1 and "may do a part of 'call action /go': add --type" in asked.err
+    of_service = explain(keystore, "/ui", "call", "/go", *on_zenoh, "--type", "service")
+    assert "explain.an-action" not in of_service.err
 
 
 def test_who_may_says_what_each_enclave_is_told(made: Path) -> None:
