@@ -30,6 +30,7 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.files import _follow_own_links, replace_file, staged_file
 from sros_tool.folders import Folder
+from sros_tool.keystore import transaction as transactions
 from sros_tool.keystore.delivery import export
 from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.delivery.robot import create_request
@@ -42,8 +43,7 @@ from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.transaction import transaction as locking
-from sros_tool.keystore.transaction.stage import staged_name
+from sros_tool.keystore.transaction import staged_name
 from sros_tool.xml import read_bytes
 from tests.conftest import MEMORY, POLICY
 from tests.support.children import run
@@ -376,11 +376,11 @@ def test_a_lock_file_with_two_names_changes_no_owner(keystore: Path, outside: Pa
 
 def test_the_lock_is_of_one_holder_at_a_time(keystore: Path) -> None:
     with Folder(keystore) as one, Folder(keystore) as two:
-        first = locking.KeystoreLock(one).acquire()
+        first = transactions.KeystoreLock(one).acquire()
         with pytest.raises(KeystoreError, match="is busy"):
-            locking.KeystoreLock(two).acquire(wait=0.0)
+            transactions.KeystoreLock(two).acquire(wait=0.0)
         first.release()
-        locking.KeystoreLock(two).acquire(wait=0.0).release()
+        transactions.KeystoreLock(two).acquire(wait=0.0).release()
     assert not (keystore / LOCK).exists()
 
 
@@ -389,15 +389,15 @@ def test_releasing_a_lock_leaves_the_lock_of_the_next_holder(
 ) -> None:
     """Another process locks as soon as the file of the first is gone."""
     unlink = Folder.unlink
-    taken: list[locking.KeystoreLock] = []
+    taken: list[transactions.KeystoreLock] = []
 
     def unlink_then_another_locks(folder: Folder, path: str, **options: bool) -> None:
         unlink(folder, path, **options)
         if not taken:
-            taken.append(locking.KeystoreLock(two).acquire(wait=0.0))
+            taken.append(transactions.KeystoreLock(two).acquire(wait=0.0))
 
     with Folder(keystore) as one, Folder(keystore) as two:
-        first = locking.KeystoreLock(one).acquire()
+        first = transactions.KeystoreLock(one).acquire()
         monkeypatch.setattr(Folder, "unlink", unlink_then_another_locks)
         first.release()
         assert (keystore / LOCK).exists()
@@ -418,7 +418,7 @@ def test_a_lock_that_a_full_disk_holds_once_is_released(
         unlink(folder, path, **options)
 
     with Folder(keystore) as one:
-        first = locking.KeystoreLock(one).acquire()
+        first = transactions.KeystoreLock(one).acquire()
         monkeypatch.setattr(Folder, "unlink", refuse_once)
         first.release()
     assert refused == [LOCK]

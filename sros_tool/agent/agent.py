@@ -77,7 +77,7 @@ from sros_tool.keystore.layout import (
     search_enclaves,
 )
 from sros_tool.keystore.reader import read_certificate
-from sros_tool.keystore.transaction.transaction import recover_keystore
+from sros_tool.keystore.transaction import recover_keystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import make_request, validity_of
 from sros_tool.pki.crl import list_number, load_crl, newest_list

@@ -47,7 +47,7 @@ from sros_tool.keystore.layout import (
     search_enclaves,
 )
 from sros_tool.keystore.reader import OpenedEnclave, open_enclave, weaknesses
-from sros_tool.keystore.transaction.transaction import Transaction, recover_keystore
+from sros_tool.keystore.transaction import Transaction, recover_keystore
 from sros_tool.pki.certificates import (
     digest,
     load_certificates,

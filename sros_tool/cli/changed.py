@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.change import Changed
     from sros_tool.keystore.lifecycle.replaced import ReplacedRights
     from sros_tool.keystore.outcomes import KeptZenoh
-    from sros_tool.keystore.transaction.stage import Change
+    from sros_tool.keystore.transaction import Change
 
 _NAMES_SHOWN = 5
 MAX_NAMES = 20

@@ -41,7 +41,7 @@ from sros_tool.keystore.layout import (
     list_enclaves,
     search_enclaves,
 )
-from sros_tool.keystore.transaction.transaction import KeystoreLock
+from sros_tool.keystore.transaction import KeystoreLock
 from sros_tool.names import check_enclave_name
 from sros_tool.validity import elapsed, iso, parse_iso
 from sros_tool.values import DryRun, FileChange, NamedKeystore, Notes, as_plain, parse_json

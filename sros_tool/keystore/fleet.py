@@ -34,7 +34,7 @@ from sros_tool.validity import iso
 from sros_tool.wording import first_few
 
 if TYPE_CHECKING:
-    from sros_tool.keystore.transaction.transaction import Transaction
+    from sros_tool.keystore.transaction import Transaction
     from sros_tool.zenoh.configuration import ZenohNetwork
 
 _COMMENT = """\

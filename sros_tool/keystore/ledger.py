@@ -61,7 +61,7 @@ from sros_tool.xml import open_at_once, read_bytes
 
 if TYPE_CHECKING:
     from sros_tool.keystore.ledger_index import IndexUpdate, LedgerIndex, Posting
-    from sros_tool.keystore.transaction.transaction import Transaction
+    from sros_tool.keystore.transaction import Transaction
 
 GAP = "gap"
 SEALED = "sealed"

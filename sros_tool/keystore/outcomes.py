@@ -15,7 +15,7 @@ from sros_tool.errors import Note, SrosError
 from sros_tool.keystore.expiry import read_credentials
 from sros_tool.keystore.layout import ROLES
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.keystore.transaction.stage import Change
+from sros_tool.keystore.transaction import Change
 from sros_tool.pki.certificates import digest, subject_text, validity_of
 from sros_tool.values import FileChange, Words
 

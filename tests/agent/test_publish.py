@@ -21,6 +21,7 @@ from sros_tool.agent.fetch import FetchProblem
 from sros_tool.cli.fleet import _published_lines
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.folders import Folder
+from sros_tool.keystore import transaction
 from sros_tool.keystore.delivery import publish as publishing
 from sros_tool.keystore.delivery.export import ReleasedEnclave
 from sros_tool.keystore.delivery.export import released_enclave as evaluate
@@ -41,7 +42,6 @@ from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.ledger import Entry, clock_behind
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.keystore.transaction import transaction
 from sros_tool.pki.crl import load_crl
 from sros_tool.validity import iso
 from tests.agent.published import DAY, ROLES, Home, Thief

@@ -18,6 +18,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import rsa
 
 from sros_tool.errors import DocumentError, KeystoreError
+from sros_tool.keystore import transaction
 from sros_tool.keystore.confirmation import (
     MAX_BYTES,
     MESSAGE_FILE,
@@ -41,7 +42,6 @@ from sros_tool.keystore.fleet import recorded_fleet
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import PUBLISHED, key_on_robot
 from sros_tool.keystore.reader import OpenedKeystore, read_certificate
-from sros_tool.keystore.transaction import transaction
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, key_digest, make_request, validity_of
 from sros_tool.pki.crl import load_crl

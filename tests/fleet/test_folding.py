@@ -12,7 +12,7 @@ from sros_tool.checks.formats import folded_findings
 from sros_tool.checks.requirements import VIOLATED
 from sros_tool.cli.changed import print_plan
 from sros_tool.fleet.robots import Fleet, Robot, folded
-from sros_tool.keystore.transaction import stage
+from sros_tool.keystore import transaction
 from tests.proof.test_review import Change
 from tests.support.harness import copy_of, policy_text, publish, sros, subscribe
 
@@ -221,7 +221,7 @@ def test_a_review_is_folded(tmp_path: Path) -> None:
 
 
 def test_many_files_of_a_plan_are_counted(capsys: pytest.CaptureFixture[str]) -> None:
-    plan = [stage.Change("create", f"enclaves/e{number}/key.pem") for number in range(21)]
+    plan = [transaction.Change("create", f"enclaves/e{number}/key.pem") for number in range(21)]
     print_plan(Path("ks"), plan)
     first = ", ".join(f"ks/{change.path}" for change in plan[:5])
     said = f"would create 21 files: {first} and 16 more (-v lists all)\n"

@@ -24,7 +24,7 @@ from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.transaction import Transaction
 from sros_tool.policy.document import read_policy
 from tests.support.harness import certificate, policy_text, publish, snapshot, sros
 

@@ -139,7 +139,7 @@ def test_a_commit_that_fails_leaves_the_modes(root: Path, monkeypatch: pytest.Mo
     before = snapshot(root)
     opened = open_to_others(root)
     with monkeypatch.context() as broken:
-        broken.setattr("sros_tool.keystore.transaction.transaction.write_manifest", full)
+        broken.setattr("sros_tool.keystore.transaction.write_manifest", full)
         assert sros("renew", root, "/a").status == 2
     assert snapshot(root) == before
     assert open_to_others(root) == opened

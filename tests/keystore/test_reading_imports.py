@@ -35,6 +35,4 @@ def test_reading_imports_nothing_that_writes(module: str) -> None:
 
 
 def test_what_writes_is_seen_by_this_search() -> None:
-    assert "sros_tool.keystore.transaction.transaction" in loaded_by(
-        "sros_tool.keystore.lifecycle.renew"
-    )
+    assert "sros_tool.keystore.transaction" in loaded_by("sros_tool.keystore.lifecycle.renew")

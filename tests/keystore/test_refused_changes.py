@@ -23,7 +23,7 @@ from sros_tool.keystore.layout import CRL, enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.transaction import Transaction
 from sros_tool.wording import enumerated
 from tests.support.children import run
 from tests.support.harness import Ended, copy_of, sros
@@ -339,7 +339,7 @@ def test_a_dry_run_says_what_it_did_not_keep(
         _break_governance(transaction, other)
         with pytest.raises(KeystoreError):
             refuse_stopping(transaction, now())
-    monkeypatch.setattr("sros_tool.keystore.transaction.transaction._MOST_KEPT", 100)
+    monkeypatch.setattr("sros_tool.keystore.transaction._MOST_KEPT", 100)
     with Transaction(root, dry_run=True) as transaction:
         _break_governance(transaction, other)
         (note,) = refuse_stopping(transaction, now())

@@ -565,7 +565,7 @@ def test_death_at_every_step(stage: RotationStage | None, tmp_path: Path) -> Non
 
 
 def shape_after_tidy(root: Path) -> tuple[object, ...]:
-    from sros_tool.keystore.transaction.transaction import recover_keystore
+    from sros_tool.keystore.transaction import recover_keystore
 
     recover_keystore(root)
     return shape(root)

@@ -19,6 +19,7 @@ import pytest
 from sros_tool import folders
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.folders import Folder
+from sros_tool.keystore import transaction as transactions
 from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.layout import (
     CRL,
@@ -37,11 +38,7 @@ from sros_tool.keystore.lifecycle.create import (
 )
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.transaction import stage as stage_of
-from sros_tool.keystore.transaction import transaction
-from sros_tool.keystore.transaction import transaction as locking
-from sros_tool.keystore.transaction.stage import Change, Changes
-from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.transaction import Change, Changes, Transaction
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
 from tests.support.children import some_steps
@@ -569,7 +566,7 @@ def test_a_transaction_waits_for_another(keystore: Path) -> None:
 
 
 def test_a_busy_keystore_is_told(keystore: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(locking, "_LOCK_SECONDS", 0.05)
+    monkeypatch.setattr(transactions, "_LOCK_SECONDS", 0.05)
     with Transaction(keystore):
         before = snapshot(keystore)
         with pytest.raises(KeystoreError, match="is busy"), Transaction(keystore):
@@ -588,7 +585,7 @@ def test_stale_stages_beside_a_keystore_are_removed_and_those_in_use_are_not(
     used = tmp_path / ".k[s]*.sros-87654321"
     used.mkdir()
     with Folder(used) as in_use:
-        assert locking.lock_new(in_use)
+        assert transactions.lock_new(in_use)
         create_keystore(tmp_path / "k[s]*", template=TEMPLATE, now=NOW)
     assert not stale.exists()
     assert used.exists()
@@ -598,7 +595,7 @@ def test_stale_stages_beside_a_keystore_are_removed_and_those_in_use_are_not(
 def test_a_stage_that_was_removed_before_it_was_locked_is_made_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lock = locking.lock_new
+    lock = transactions.lock_new
     removed: list[Path] = []
 
     def lose_the_first(folder: Folder) -> bool:
@@ -607,7 +604,7 @@ def test_a_stage_that_was_removed_before_it_was_locked_is_made_again(
             folder.path.rmdir()
         return lock(folder)
 
-    monkeypatch.setattr("sros_tool.keystore.transaction.transaction.lock_new", lose_the_first)
+    monkeypatch.setattr("sros_tool.keystore.transaction.lock_new", lose_the_first)
     create_keystore(tmp_path / "ks", template=TEMPLATE, now=NOW)
     assert removed
     check_whole(tmp_path / "ks")
@@ -719,7 +716,7 @@ def test_a_list_of_files_that_a_stranger_made_up_moves_nothing(
     path: str, live: str, keystore: Path
 ) -> None:
     made_up_stage(keystore, live, [[path, "", ""]])
-    (keystore / STAGE / live / stage_of.staged_name(path)).write_text("mine")
+    (keystore / STAGE / live / transactions.staged_name(path)).write_text("mine")
     before = snapshot(keystore.parent)
     with pytest.raises(KeystoreError, match=r"not a file of a keystore.*restore"):
         create_enclaves(keystore, ["/new"], now=NOW)
@@ -748,7 +745,7 @@ def test_a_list_of_files_leads_through_no_link(keystore: Path, tmp_path: Path) -
     (keystore / "enclaves/a").rename(outside)
     (keystore / "enclaves/a").symlink_to(outside)
     made_up_stage(keystore, "after", [["enclaves/a/new.pem", None, ""]])
-    number = stage_of.staged_name("enclaves/a/new.pem")
+    number = transactions.staged_name("enclaves/a/new.pem")
     (keystore / STAGE / "after" / number).write_text("mine")
     before = snapshot(tmp_path)
     with pytest.raises(KeystoreError, match="symbolic link"):
@@ -759,7 +756,7 @@ def test_a_list_of_files_leads_through_no_link(keystore: Path, tmp_path: Path) -
 @pytest.mark.parametrize("text", ["", "{}", "[]", '{"version": 4, "moves": []}', '{"version": 3}'])
 def test_a_list_of_files_that_cannot_be_read_is_told(text: str, keystore: Path) -> None:
     made_up_stage(keystore, "after", [])
-    (keystore / STAGE / stage_of.MANIFEST).write_text(text)
+    (keystore / STAGE / transactions.MANIFEST).write_text(text)
     before = snapshot(keystore)
     with pytest.raises(KeystoreError, match="can be neither completed nor undone"):
         create_enclaves(keystore, ["/new"], now=NOW)
@@ -772,7 +769,7 @@ def made_up_stage(keystore: Path, live: str, moves: list[list[str | None]]) -> N
     (keystore / STAGE).chmod(0o700)
     (keystore / STAGE / "live").symlink_to(live)
     text = json.dumps({"version": 2, "moves": moves})
-    (keystore / STAGE / stage_of.MANIFEST).write_text(text)
+    (keystore / STAGE / transactions.MANIFEST).write_text(text)
 
 
 @pytest.mark.parametrize(
@@ -792,7 +789,7 @@ def test_a_stage_of_an_unknown_format_is_refused_and_not_touched(
     before = snapshot(keystore)
     for verb in (
         lambda: create_enclaves(keystore, ["/new"], now=NOW),
-        lambda: transaction.recover_keystore(keystore),
+        lambda: transactions.recover_keystore(keystore),
     ):
         with pytest.raises(KeystoreError, match=r"this version of sros.*version of sros that"):
             verb()

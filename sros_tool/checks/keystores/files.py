@@ -135,7 +135,7 @@ INTERRUPTED = FindingKind(
     "a write that was interrupted",
     "DDS still loads a complete set of files, old or new. The next verb that writes completes or "
     "undoes the change.",
-    "sros: sros_tool/keystore/transaction/transaction.py.",
+    "sros: sros_tool/keystore/transaction.py.",
     "Run any verb of sros that writes, such as `sros create_enclave`.",
 )
 FOREIGN_STAGE = FindingKind(
@@ -144,7 +144,7 @@ FOREIGN_STAGE = FindingKind(
     "an interrupted write that sros cannot have left",
     "Somebody else may have forged it, in the keystore or in the archive that the keystore came "
     "from, to make sros move files with your rights. Verbs that write refuse to continue.",
-    "sros: keystore/transaction/stage.py; CWE-59.",
+    "sros: sros_tool/keystore/transaction.py; CWE-59.",
     "Find out who can write to the keystore, look at what is in the folder, and remove it.",
 )
 STRAY_KEY = FindingKind(
@@ -368,7 +368,7 @@ def _unread_path_finding(error: OSError, root: str) -> Finding:
 
 def _interrupted_change_finding(parent: Path, root: str) -> Finding:
     from sros_tool.folders import Folder
-    from sros_tool.keystore.transaction.stage import check_interrupted
+    from sros_tool.keystore.transaction import check_interrupted
 
     try:
         with Folder(parent) as folder:

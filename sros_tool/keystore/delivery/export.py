@@ -49,8 +49,7 @@ from sros_tool.keystore.outcomes import (
 from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
 from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, open_enclave
 from sros_tool.keystore.selection import missing_enclave_error, select_enclaves
-from sros_tool.keystore.transaction.stage import Change
-from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.transaction import Change, Transaction
 from sros_tool.keystore.zenoh_files import open_zenoh
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import load_certificates, validity_of

@@ -74,7 +74,7 @@ from sros_tool.keystore.lifecycle.revoke import (
 )
 from sros_tool.keystore.outcomes import changes_below
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.keystore.transaction.transaction import KeystoreLock
+from sros_tool.keystore.transaction import KeystoreLock
 from sros_tool.parallel import map_slices, tick
 from sros_tool.pki.certificates import load_certificates
 from sros_tool.pki.crl import lists_as_revoked, read_list

@@ -57,8 +57,7 @@ from sros_tool.keystore.reader import (
     read_certificate,
     weaknesses,
 )
-from sros_tool.keystore.transaction.stage import Change
-from sros_tool.keystore.transaction.transaction import Transaction, recover_keystore
+from sros_tool.keystore.transaction import Change, Transaction, recover_keystore
 from sros_tool.keystore.zenoh_files import open_zenoh
 from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime

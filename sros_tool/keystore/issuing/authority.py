@@ -33,7 +33,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.loading import authority_refusals, refusals_text
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import Template
-from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.transaction import Transaction
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     Issuer,

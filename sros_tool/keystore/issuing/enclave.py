@@ -52,7 +52,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import Entry, certificate_entry, document_entry
 from sros_tool.keystore.rights import SignedRights
 from sros_tool.keystore.template import Template
-from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.transaction import Transaction
 from sros_tool.parallel import Progress, tick
 from sros_tool.pki.certificates import (
     Issuer,

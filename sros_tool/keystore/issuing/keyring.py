@@ -19,7 +19,7 @@ from sros_tool.keystore.issuing.ca_service import CaService, check_ca_service, i
 from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, ROLES, ca_key, key_path
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import Template
-from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.transaction import Transaction
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 from sros_tool.pki.token import (
     create_token_key,

@@ -66,8 +66,7 @@ from sros_tool.keystore.settings import (
     write_settings,
 )
 from sros_tool.keystore.template import Template
-from sros_tool.keystore.transaction.stage import Change
-from sros_tool.keystore.transaction.transaction import Transaction, recover_keystore
+from sros_tool.keystore.transaction import Change, Transaction, recover_keystore
 from sros_tool.keystore.zenoh_files import (
     NO_CHANGE,
     Drift,

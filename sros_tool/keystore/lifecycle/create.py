@@ -87,7 +87,7 @@ from sros_tool.keystore.reader import OpenedKeystore, check_domain
 from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.keystore.settings import edit_remedy, found_edits, with_places, write_settings
 from sros_tool.keystore.template import NODE_BASICS, Template, template_names
-from sros_tool.keystore.transaction.transaction import recover_keystore
+from sros_tool.keystore.transaction import recover_keystore
 from sros_tool.names import check_enclave_name
 from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.parallel import Progress

@@ -48,7 +48,7 @@ from sros_tool.keystore.lifecycle.rotation import (
 )
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import Template
-from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.transaction import Transaction
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import (
     authority_text,

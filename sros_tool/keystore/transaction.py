@@ -1,6 +1,6 @@
 """Transactions: atomic changes of many files in a keystore, even if the machine stops.
 
-New files are written below ``.sros-transaction`` in the keystore (`stage`).  The commit
+New files are written to a stage, ``.sros-transaction`` in the keystore.  The commit
 (`Transaction.commit`) changes existing files in three steps.  Each path becomes a link to
 ``.sros-transaction/live/<name>``; ``live`` is a link to ``before``, so the content is still the
 old one.  Then ``live`` is pointed at ``after``, which changes all files at once.  Finally plain
@@ -10,6 +10,15 @@ completes a committed transaction and undoes any other.  Each step of a recovery
 skips finished work, so an interrupted recovery can be repeated, too.
 
 A new keystore is created in a sibling folder and renamed to its path.
+
+The stage holds
+
+- ``after``: new files and links for existing folders, in one flat folder, each named by the
+  `staged_name` of its path;
+- ``before``: the replaced files and links, named in the same way; created by the commit;
+- ``live``: a link to ``before`` or ``after``; pointing it at ``after`` is the commit;
+- ``added``: new folders, as they will be in the keystore;
+- ``manifest.json``: a `Move` for each path in ``after``, and for each path to remove.
 """
 
 from __future__ import annotations
@@ -17,18 +26,23 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import hashlib
+import json
 import logging
 import os
+import re
 import secrets
 import signal
 import stat
 import time
+from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import NamedTuple, Self, TypeVar, overload
 
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.folders import Folder, make_folders, remove_folders
@@ -45,30 +59,313 @@ from sros_tool.keystore.layout import (
     STAGE,
     enclave_folder,
     folder_mode,
+    is_layout_path,
     link_to_list,
     readable_enclaves,
     search_enclaves,
 )
-from sros_tool.keystore.transaction.stage import (
-    ADDED,
-    ADOPT,
-    AFTER,
-    BEFORE,
-    CLOSE,
-    LIVE,
-    ChangeRun,
-    Changes,
-    Move,
-    Staged,
-    check_interrupted,
-    point_live,
-    relocated_target,
-    stage_link_target,
-    staged_name,
-    write_manifest,
-)
 from sros_tool.parallel import map_slices
 from sros_tool.xml import read_bytes
+
+_BEFORE, _AFTER, _LIVE, _ADDED, MANIFEST = "before", "after", "live", "added", "manifest.json"
+_VERSION = 3
+_EARLIER = 2
+"""The version without moves of folders."""
+
+
+class Move(NamedTuple):
+    """The change of a path in an existing folder of the keystore.
+
+    ``before`` and ``after`` are the content of the path: None for nothing, "" for a file, and the
+    target of a symbolic link.  If the path is the certificate of an enclave whose whole folder
+    moves, ``to`` is the new path of that folder.
+    """
+
+    path: str
+    before: str | None
+    after: str | None
+    to: str = ""
+
+
+_CLOSE = "close"
+_ADOPT = "adopt"
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A file or link that a transaction changes.
+
+    ``action`` is "create", "replace" or "remove", or `_CLOSE` for a private key or a folder of keys
+    that other users could open before, or `_ADOPT` for a keystore of ros2/sros2 that gets its
+    settings and ledger; ``path`` is relative to the keystore.
+    """
+
+    action: str
+    path: str
+
+
+class ChangeRun(NamedTuple):
+    """The same action on several files of a folder; ``folder`` is "" or ends with "/".
+
+    With ``file``, it is the action on this file of each enclave in ``names``.
+    """
+
+    action: str
+    folder: str
+    names: tuple[str, ...]
+    file: str = ""
+
+    def path(self, name: str) -> str:
+        """Return the path of the change for one of the names."""
+        return f"{enclave_folder(name)}/{self.file}" if self.file else f"{self.folder}{name}"
+
+
+class Changes(Sequence[Change]):
+    """The changes of a transaction, in order.
+
+    Consecutive changes of the same kind are stored together: most folders of a large keystore get
+    the same files, whose names are in memory only once.
+    """
+
+    def __init__(self) -> None:
+        """Create an empty list of changes."""
+        self._runs: list[ChangeRun] = []
+        self._ends: list[int] = []  # how many changes there are up to the end of each run
+        self._names: dict[tuple[str, ...], tuple[str, ...]] = {}
+        self._last_is_open = False
+
+    def add(self, action: str, path: str) -> None:
+        """Add a change at the end."""
+        folder, slash, name = path.rpartition("/")
+        names: tuple[str, ...] = (name,)
+        if self._last_is_open and self._runs[-1][:2] == (action, folder + slash):
+            names = (*self._runs.pop().names, name)
+            self._ends.pop()
+        self.extend((ChangeRun(action, folder + slash, names),))
+        self._last_is_open = True
+
+    def extend(self, runs: Iterable[ChangeRun]) -> None:
+        """Add changes at the end."""
+        for run in runs:
+            names = self._names.setdefault(run.names, run.names)
+            self._runs.append(run._replace(names=names))
+            self._ends.append(len(self) + len(names))
+
+    def mark(self) -> int:
+        """Return a mark of the changes so far, for `since`."""
+        self._last_is_open = False
+        return len(self._runs)
+
+    def since(self, mark: int) -> tuple[ChangeRun, ...]:
+        """Return the changes that were added after ``mark``."""
+        return tuple(self._runs[mark:])
+
+    def __len__(self) -> int:
+        return self._ends[-1] if self._ends else 0
+
+    def __iter__(self) -> Iterator[Change]:
+        return (Change(run.action, run.path(name)) for run in self._runs for name in run.names)
+
+    @overload
+    def __getitem__(self, index: int) -> Change: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Change]: ...
+
+    def __getitem__(self, index: int | slice) -> Change | Sequence[Change]:
+        if isinstance(index, slice):
+            return tuple(self)[index]
+        place = range(len(self))[index]
+        at = bisect_right(self._ends, place)
+        run = self._runs[at]
+        return Change(run.action, run.path(run.names[place - self._ends[at]]))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sequence) and tuple(self) == tuple(other)
+
+    def __hash__(self) -> int:
+        return hash(tuple(self))
+
+
+@dataclass(frozen=True, slots=True)
+class Staged:
+    """The changes that a forked worker staged, sent to the process that commits.
+
+    ``kept`` has the new files and link targets of a dry run; None for files beyond its limit.
+    """
+
+    changes: tuple[ChangeRun, ...]
+    moves: tuple[Move, ...]
+    kept: dict[str, bytes | str | None]
+
+
+def staged_name(path: str) -> str:
+    """Return the name of a path's file in the stage; short, so that a link fits in an inode."""
+    return hashlib.blake2b(os.fsencode(path), digest_size=8).hexdigest()
+
+
+def _stage_link_target(path: str) -> str:
+    """Return the target of the link that replaces ``path`` during the commit."""
+    return "../" * path.count("/") + f"{STAGE}/{_LIVE}/{staged_name(path)}"
+
+
+def _relocated_target(path: str, text: str) -> str:
+    """Return the link target ``text`` of ``path``, rewritten for a link in the stage."""
+    return text if text.startswith("/") else f"../../{path.rpartition('/')[0]}/{text}"
+
+
+def _point_live(folder: Folder, to: str) -> None:
+    """Atomically point the ``live`` symlink of the stage at ``to``: ``before`` or ``after``."""
+    folder.symlink(to, f"{STAGE}/{_LIVE}.next")
+    folder.replace(f"{STAGE}/{_LIVE}.next", f"{STAGE}/{_LIVE}")
+
+
+def _write_manifest(folder: Folder, moves: Sequence[Move]) -> None:
+    """Write the manifest; the caller flushes it to disk before the first move."""
+    text = json.dumps({"version": _VERSION, "moves": moves})
+    folder.write(f"{STAGE}/{MANIFEST}", text.encode(), 0o600)
+
+
+def _read_manifest(folder: Folder) -> tuple[Move, ...]:
+    """Return the moves in the manifest.
+
+    Raises:
+        KeystoreError: the manifest is damaged, or another version of sros wrote it.
+    """
+    try:
+        read = json.loads(folder.read(f"{STAGE}/{MANIFEST}"))
+        if read["version"] not in (_EARLIER, _VERSION):
+            raise ValueError(f"its version is not {_VERSION}")
+        return tuple(_move(*move) for move in read["moves"])
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        raise _damaged_stage_error(
+            folder, f"Its list of files, {MANIFEST}, cannot be read: {error}."
+        ) from error
+
+
+def _move(path: str, before: str | None, after: str | None, to: str = "") -> Move:
+    for state in (before, after):
+        if state is not None and not isinstance(state, str):
+            raise ValueError(f"{state!r} is not the state of a path")
+    if not isinstance(path, str) or not is_layout_path(path):
+        raise ValueError(f"{path!r} is not a file of a keystore")
+    if after and not _stays_inside(path, after):
+        raise ValueError(f"the link {path!r} would lead out of the keystore, to {after!r}")
+    if to and not (_OF_ENCLAVE.fullmatch(path) and after is None and _MOVED.fullmatch(to)):
+        raise ValueError(f"the folder of {path!r} would move to {to!r}")
+    return Move(path, before, after, to)
+
+
+_OF_ENCLAVE = re.compile(rf"{ENCLAVES}/.+/{re.escape(CERTIFICATE_FILE)}")
+_MOVED = re.compile(rf"{REVOKED}/[0-9a-f]+")
+
+
+def _stays_inside(path: str, target: str) -> bool:
+    """Return whether a link at ``path`` to ``target`` leads to a place inside the keystore."""
+    target_path = os.path.normpath(f"{os.path.dirname(path)}/{target}")
+    return not target.startswith("/") and not target_path.startswith("..")
+
+
+_KNOWN = re.compile(
+    rf"{_BEFORE}|{_AFTER}|{_ADDED}|{re.escape(MANIFEST)}|{_LIVE}(\.next)?|spare(\.\d+)?"
+)
+_STAGED_NAME = re.compile(r"[0-9a-f]{16}")
+
+
+def _check_stage(folder: Folder) -> str | None:
+    """Return the target of the link ``live``: _BEFORE, _AFTER, or None if nothing was changed yet.
+
+    Whoever can write to the keystore, or packed it into an archive, could forge a stage, to have
+    the next verb of another user move files.  A stage is only accepted if sros, run by this user or
+    by the owner of the keystore, can have made all of it.
+
+    Raises:
+        KeystoreError: another user made the stage, or it has the format of another version.
+    """
+    if not folder.is_folder(STAGE):
+        return None
+    _check_owner(folder, STAGE)
+    if folder.mode(STAGE) & 0o077:
+        raise _foreign_stage_error(folder, "Other users may open it.")
+    for name in folder.names(STAGE):
+        if not _KNOWN.fullmatch(name):
+            raise _damaged_stage_error(
+                folder, f"{name!r} is not part of the format of this version of sros."
+            )
+        path = f"{STAGE}/{name}"
+        _check_owner(folder, path)
+        if name == _ADDED:
+            _check_added(folder, "")
+        elif name in (_BEFORE, _AFTER):
+            folder.is_folder(path)
+            for staged in folder.names(path):
+                if not _STAGED_NAME.fullmatch(staged):
+                    raise _damaged_stage_error(
+                        folder, f"{staged!r} is not a file of a transaction."
+                    )
+                _check_file(folder, f"{path}/{staged}")
+    to = folder.link_target(f"{STAGE}/{_LIVE}")
+    if to not in (None, _BEFORE, _AFTER) or (
+        to is None and folder.state(f"{STAGE}/{_LIVE}") is not None
+    ):
+        raise _damaged_stage_error(
+            folder, f"{_LIVE!r} is not part of the format of this version of sros."
+        )
+    return to
+
+
+def check_interrupted(folder: Folder) -> tuple[str | None, tuple[Move, ...]]:
+    """Return the target of ``live`` in a stage, and the moves to complete or to undo.
+
+    Raises:
+        KeystoreError: as `_check_stage` and `_read_manifest`.
+    """
+    to = _check_stage(folder)
+    return to, _read_manifest(folder) if to else ()
+
+
+def _check_added(folder: Folder, path: str) -> None:
+    """Raise `KeystoreError` unless all files below an added folder can belong to a keystore."""
+    added_path = f"{STAGE}/{_ADDED}/{path}".rstrip("/")
+    if stat.S_ISDIR(folder.mode(added_path)):
+        _check_owner(folder, added_path)
+        for name in folder.names(added_path):
+            _check_added(folder, f"{path}/{name}".lstrip("/"))
+        return
+    if not is_layout_path(path):
+        raise _damaged_stage_error(folder, f"{_ADDED}/{path} is not a file of a keystore.")
+    _check_file(folder, added_path)
+
+
+def _check_file(folder: Folder, path: str) -> None:
+    _check_owner(folder, path)
+    mode = folder.mode(path)
+    if not stat.S_ISREG(mode) and not stat.S_ISLNK(mode):
+        raise _damaged_stage_error(folder, f"{path} is neither a file nor a link.")
+
+
+def _check_owner(folder: Folder, path: str) -> None:
+    state = folder.state(path)
+    if state and state.st_uid not in (0, os.geteuid(), folder.owner[0]):
+        raise _foreign_stage_error(folder, f"{path} belongs to user {state.st_uid}.")
+
+
+def _damaged_stage_error(folder: Folder, why: str) -> KeystoreError:
+    return KeystoreError(
+        f"the interrupted change in '{folder.path / STAGE}' can be neither completed nor undone",
+        why,
+        "Complete it with the version of sros that began it, or restore the keystore from a "
+        "backup.",
+    )
+
+
+def _foreign_stage_error(folder: Folder, why: str) -> KeystoreError:
+    return KeystoreError(
+        f"'{folder.path / STAGE}' is not an interrupted change of yours",
+        f"{why} Somebody else may have put it there, to make sros move files with your rights.",
+        "Find out who can write to the keystore, look at its content, and remove it.",
+    )
+
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -130,7 +427,7 @@ class Transaction:
     @property
     def _added(self) -> str:
         """The folder in `_in` for the files of new folders; ends with "/"."""
-        return "" if self._new_root else f"{STAGE}/{ADDED}/"
+        return "" if self._new_root else f"{STAGE}/{_ADDED}/"
 
     def on_failure(self, undo: Callable[[], None]) -> None:
         """Register ``undo``, which is called if the transaction ends without a commit."""
@@ -173,7 +470,7 @@ class Transaction:
         self._lock = KeystoreLock(self._in)
         self._lock.acquire()
         _recover(self._in)
-        for path in (STAGE, f"{STAGE}/{ADDED}", f"{STAGE}/{AFTER}"):
+        for path in (STAGE, f"{STAGE}/{_ADDED}", f"{STAGE}/{_AFTER}"):
             self._in.mkdir(path, 0o700)
         _LOG.info("began a transaction in the keystore '%s'", self.root)
 
@@ -324,11 +621,11 @@ class Transaction:
             kept = self._path_of_old_content.get(path)
             return kept if isinstance(kept, str) else None
         target = _link_target(self._stage_place(path))
-        return target and target.removeprefix(relocated_target(path, ""))
+        return target and target.removeprefix(_relocated_target(path, ""))
 
     def _stage_place(self, path: str) -> str:
         exists = not self._new_root and self._in.is_folder(path.rpartition("/")[0])
-        staged = f"{STAGE}/{AFTER}/{staged_name(path)}" if exists else f"{self._added}{path}"
+        staged = f"{STAGE}/{_AFTER}/{staged_name(path)}" if exists else f"{self._added}{path}"
         return f"{self._in.path}/{staged}"
 
     def changed_folders(self) -> dict[str, set[str]]:
@@ -348,7 +645,7 @@ class Transaction:
         staged = self._prepare(path, target)
         if staged is not None:
             flat = self._folders[path.rpartition("/")[0]]
-            self._in.symlink(relocated_target(path, target) if flat else target, staged)
+            self._in.symlink(_relocated_target(path, target) if flat else target, staged)
         else:
             self._path_of_old_content[path] = target
 
@@ -393,7 +690,7 @@ class Transaction:
             self._moves.append(Move(path, before, after))
         if self.dry_run:
             return None
-        return f"{STAGE}/{AFTER}/{staged_name(path)}" if exists else f"{self._added}{path}"
+        return f"{STAGE}/{_AFTER}/{staged_name(path)}" if exists else f"{self._added}{path}"
 
     def _begin_change(self, path: str, action: str) -> None:
         folder, _, name = path.rpartition("/")
@@ -492,7 +789,7 @@ class Transaction:
     def note_adoption(self) -> None:
         """Add a change that says that the keystore gets its first settings and ledger."""
         self._adopts = True
-        self.changes.add(ADOPT, "")
+        self.changes.add(_ADOPT, "")
 
     # ── commit ─────────────────────────────────────────────────────────────────────────────
 
@@ -510,7 +807,7 @@ class Transaction:
             return
         if self.dry_run:
             for path in self._open_keys():
-                self.changes.add(CLOSE, path)
+                self.changes.add(_CLOSE, path)
             return
         folder = self._in
         if self._new_root:
@@ -518,11 +815,11 @@ class Transaction:
             self._put_keystore_in_place()
             self._finish()
             return
-        write_manifest(folder, self._moves)
+        _write_manifest(folder, self._moves)
         folder.flush_file_system(STAGE)
         _bridge(folder, self._moves)
         map_slices(sorted(self._linked), partial(_link_to_first_list, folder))
-        point_live(folder, AFTER)
+        _point_live(folder, _AFTER)
         self._undo.clear()
         with contextlib.suppress(OSError, SrosError):  # already committed; `_end` tries again
             complete(folder, self._moves)
@@ -531,7 +828,7 @@ class Transaction:
             with contextlib.suppress(OSError):  # `check` finds what stays open
                 folder.close_to_others(path)
                 if not folder.mode(path) & 0o077:
-                    self.changes.add(CLOSE, path)
+                    self.changes.add(_CLOSE, path)
 
     def _open_keys(self) -> list[str]:
         """Return the keys that other users can open, except files that this transaction writes."""
@@ -621,23 +918,23 @@ def _bridge(folder: Folder, moves: Sequence[Move]) -> None:
     """Replace each path with a link through ``live`` to its old content, now in ``before``."""
     if not moves:
         return
-    folder.mkdir(f"{STAGE}/{BEFORE}", 0o700)
-    point_live(folder, BEFORE)
+    folder.mkdir(f"{STAGE}/{_BEFORE}", 0o700)
+    _point_live(folder, _BEFORE)
     work = _Bridge(folder)
     if _can_exchange(folder):
         map_slices(moves, work.exchange_with_links)
         return
     # A file system that cannot exchange two names: make hard links or copies first.
     if any(copied for _, copied in map_slices(moves, work.keep)):
-        folder.flush_file_system(f"{STAGE}/{BEFORE}")
+        folder.flush_file_system(f"{STAGE}/{_BEFORE}")
     map_slices(moves, work.replace_with_links)
 
 
 def _can_exchange(folder: Folder) -> bool:
     """Return whether the file system can exchange two names, by trying it."""
     spare = f"{STAGE}/spare"
-    folder.symlink(BEFORE, spare)  # the same as `live`, so that exchanging them changes nothing
-    can = folder.exchange(spare, f"{STAGE}/{LIVE}")
+    folder.symlink(_BEFORE, spare)  # the same as `live`, so that exchanging them changes nothing
+    can = folder.exchange(spare, f"{STAGE}/{_LIVE}")
     folder.unlink(spare)
     return can
 
@@ -659,7 +956,7 @@ class _Bridge:
                 self._place(move)
                 continue
             kept = _path_of_old_content(move)
-            self._folder.symlink(stage_link_target(move.path), kept)
+            self._folder.symlink(_stage_link_target(move.path), kept)
             if not self._folder.exchange(kept, move.path):
                 full_path = str(self._folder.path / move.path)
                 raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP), full_path)
@@ -686,21 +983,21 @@ class _Bridge:
     def _keep_link(self, move: Move) -> None:
         if move.before:
             self._folder.symlink(
-                relocated_target(move.path, move.before), _path_of_old_content(move)
+                _relocated_target(move.path, move.before), _path_of_old_content(move)
             )
 
     def _place(self, move: Move) -> None:
         if move.before is None:
-            self._folder.symlink(stage_link_target(move.path), move.path)
+            self._folder.symlink(_stage_link_target(move.path), move.path)
             return
         spare = f"{STAGE}/spare.{os.getpid()}"
-        self._folder.symlink(stage_link_target(move.path), spare)
+        self._folder.symlink(_stage_link_target(move.path), spare)
         self._folder.replace(spare, move.path)
 
 
 def _path_of_old_content(move: Move) -> str:
     """Return the path of the old content during the commit."""
-    return f"{STAGE}/{BEFORE}/{staged_name(move.path)}"
+    return f"{STAGE}/{_BEFORE}/{staged_name(move.path)}"
 
 
 _LOCK_SECONDS = 60.0
@@ -846,11 +1143,11 @@ def _recover(folder: Folder) -> None:
     if not folder.is_folder(STAGE):
         return
     to, moves = check_interrupted(folder)
-    if to == AFTER:
+    if to == _AFTER:
         _LOG.info("moving the committed files to their places in the keystore '%s'", folder.path)
         complete(folder, moves)
         return
-    if to == BEFORE:
+    if to == _BEFORE:
         _LOG.info("undoing an uncommitted transaction in the keystore '%s'", folder.path)
         _undo(folder, moves)
     _remove_stage(folder)
@@ -859,8 +1156,8 @@ def _recover(folder: Folder) -> None:
 def complete(folder: Folder, moves: Sequence[Move]) -> None:
     """Move all committed files to their places, and remove the stage."""
     _replace_links(folder, moves)
-    if folder.is_folder(f"{STAGE}/{ADDED}"):
-        _move_into_place(folder, f"{STAGE}/{ADDED}", "")
+    if folder.is_folder(f"{STAGE}/{_ADDED}"):
+        _move_into_place(folder, f"{STAGE}/{_ADDED}", "")
     folder.flush()
     _remove_stage(folder)
 
@@ -868,7 +1165,7 @@ def complete(folder: Folder, moves: Sequence[Move]) -> None:
 def _remove_stage(folder: Folder) -> None:
     """Remove the stage of a transaction that changed nothing, or is complete or undone."""
     # First ``live``: without it, the rest of the stage only needs to be removed.
-    folder.unlink(f"{STAGE}/{LIVE}", missing_ok=True)
+    folder.unlink(f"{STAGE}/{_LIVE}", missing_ok=True)
     folder.remove_tree(STAGE)
 
 
@@ -890,9 +1187,9 @@ def _replace_links(folder: Folder, moves: Sequence[Move]) -> None:
                     _replace_by_link(folder, after, spare, path)
             else:
                 with contextlib.suppress(FileNotFoundError):  # an earlier recovery moved it
-                    folder.replace(f"{STAGE}/{AFTER}/{name}", path)
+                    folder.replace(f"{STAGE}/{_AFTER}/{name}", path)
             if before is not None:
-                folder.unlink(f"{STAGE}/{BEFORE}/{name}", missing_ok=True)
+                folder.unlink(f"{STAGE}/{_BEFORE}/{name}", missing_ok=True)
 
     map_slices(moves, replace)
     removed = (move for move in moves if move.after is None)
@@ -905,7 +1202,7 @@ def _move_revoked_folder(folder: Folder, certificate: str, to: str) -> None:
     with contextlib.suppress(FileNotFoundError):  # an earlier recovery moved it
         folder.rename(certificate.rpartition("/")[0], to)
     with contextlib.suppress(FileNotFoundError):  # an earlier recovery put it back
-        kept = f"{STAGE}/{BEFORE}/{staged_name(certificate)}"
+        kept = f"{STAGE}/{_BEFORE}/{staged_name(certificate)}"
         folder.replace(kept, f"{to}/{CERTIFICATE_FILE}")
     for link in folder.links(to):
         folder.unlink(f"{to}/{link}")
@@ -921,7 +1218,7 @@ def _undo(folder: Folder, moves: Sequence[Move]) -> None:
         elif before:
             _replace_by_link(folder, before, f"{STAGE}/spare", path)
         else:
-            folder.replace(f"{STAGE}/{BEFORE}/{staged_name(path)}", path)
+            folder.replace(f"{STAGE}/{_BEFORE}/{staged_name(path)}", path)
     if any(move.path == CRL and move.before is None for move in moves):
         _unlink_from_list(folder)
 
@@ -947,7 +1244,7 @@ def _replace_by_link(folder: Folder, target: str, spare: str, path: str) -> None
 
 
 def _leads_into_stage(folder: Folder, path: str) -> bool:
-    return folder.link_target(path) == stage_link_target(path)
+    return folder.link_target(path) == _stage_link_target(path)
 
 
 def _make_folders(folder: Folder, paths: Iterable[str]) -> None:

@@ -1,1 +1,0 @@
-"""Atomic changes of many files of a keystore: staging, commit and recovery."""
