@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections import defaultdict
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from datetime import datetime, tzinfo
 from pathlib import Path
@@ -126,10 +126,12 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
             "",
             "Name one SOURCE and --observed, or two SOURCEs.",
         )
-    read = [_read(path, fleet, drawing) for path, fleet in zip(sources, fleets, strict=False)]
-    observed = [read_source(path, now=drawing.now) for path in drawing.observed]
     titles = _titles([*sources, *drawing.observed])
-    read = list(map(PictureSource.titled, read, titles))
+    read = [
+        _read(path, fleet, drawing, title).titled(title)
+        for path, fleet, title in zip(sources, fleets, titles, strict=False)
+    ]
+    observed = [read_source(path, now=drawing.now) for path in drawing.observed]
     if drawing.template:
         _check_no_governance(sources, read)
         template = drawing.template
@@ -210,11 +212,17 @@ def _compared_picture(
     return overlay(first, second, "drift", hosts)
 
 
-def _read(path: Path, fleet: Fleet | None, drawing: Drawing) -> PictureSource:
+def _read(path: Path, fleet: Fleet | None, drawing: Drawing, title: str) -> PictureSource:
     """Read a source; if ``drawing`` asks for it, with findings of ``sros check``.
 
-    A source that ``sros check`` cannot read has no findings.
+    A source that ``sros check`` cannot read has no findings.  Findings name files with the folders
+    that ``title`` has.
     """
+    folders = title.removesuffix(_base_name(path))
+
+    def shown(file: str) -> str:
+        return folders + os.path.relpath(file, path.parent) if folders else _file_name(file)
+
     sample = _sample(path, drawing)
     source = read_source(path, now=drawing.now, fleet=fleet, sample=sample)
     if not drawing.checked:
@@ -235,7 +243,7 @@ def _read(path: Path, fleet: Fleet | None, drawing: Drawing) -> PictureSource:
         )
     except SrosError:
         findings = []
-    pictured = [_pictured_finding(finding, {finding.subject}) for finding in findings]
+    pictured = [_pictured_finding(finding, {finding.subject}, shown) for finding in findings]
     return _with_findings(source, path, pictured)
 
 
@@ -409,18 +417,27 @@ def _with_requirements(
     return with_requirements(picture, requirements)
 
 
-def _pictured_finding(finding: Finding, enclaves: Container[str]) -> PicturedFinding:
-    """Return a finding for the picture; if its subject is not an enclave, the text names it."""
+def _file_name(path: str) -> str:
+    return Path(path).name
+
+
+def _pictured_finding(
+    finding: Finding, enclaves: Container[str], shown: Callable[[str], str] = _file_name
+) -> PicturedFinding:
+    """Return a finding for the picture; if its subject is not an enclave, the text names it.
+
+    ``shown`` returns the name of a file.
+    """
     known = finding.subject in enclaves
     about = "" if known or finding.subject == finding.file else finding.subject
-    text = _finding_text(finding, about)
+    text = _finding_text(finding, about, shown)
     enclave = finding.subject if known else ""
     return PicturedFinding(finding.id, finding.severity.word, text, finding.remedy, enclave)
 
 
-def _finding_text(finding: Finding, subject: str = "") -> str:
+def _finding_text(finding: Finding, subject: str, shown: Callable[[str], str] = _file_name) -> str:
     """Return a finding as one text: file name, line, subject and text."""
-    place = f"{Path(finding.file).name}:{finding.line}" if finding.line else ""
+    place = f"{shown(finding.file)}:{finding.line}" if finding.line else ""
     return ": ".join(filter(None, (place, subject, finding.text)))
 
 

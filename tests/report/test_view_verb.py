@@ -174,7 +174,10 @@ def test_two_sources_of_one_name_are_told_apart_by_folders(tmp_path: Path, obser
         write(tmp_path / release / "p", "x.xml", "/x")
     words = ("--observed",) if observed else ()
     ended = sros("view", tmp_path / "old/p/x.xml", *words, tmp_path / "new/p/x.xml", "--json")
-    assert json.loads(ended.ok().out)["title"] == "old/p/x.xml and new/p/x.xml"
+    shown = json.loads(ended.ok().out)
+    assert shown["title"] == "old/p/x.xml and new/p/x.xml"
+    places = {finding["text"].partition(":")[0] for finding in shown["findings"]}
+    assert places == {"old/p/x.xml"} | ({"new/p/x.xml"} if not observed else set())
 
 
 @pytest.mark.parametrize(
