@@ -62,8 +62,8 @@ VERBS: Mapping[str, str | Shapes] = {
     "check": Shapes(
         "Findings on policies, keystores and the runtime. `--sarif` prints SARIF 2.1.0 instead.",
         {
-            "findings": "sros_tool.checks.registry:ShownFindings",
-            "--list": "sros_tool.checks.registry:AllKinds",
+            "findings": "sros_tool.checks.kind:ShownFindings",
+            "--list": "sros_tool.checks.kind:AllKinds",
             "--needs-renewal": "sros_tool.keystore.expiry:ExpiringEnclaves",
             "--watch": "sros_tool.checks.runtime:FindingChange",
         },

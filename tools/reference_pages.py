@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 
 import click
 
-from sros_tool.checks.registry import all_kinds
+from sros_tool.checks.kind import all_kinds
 from sros_tool.keystore.template import load_template, settings_values, template_names
 from sros_tool.policy.model import Level
 from sros_tool.runtime.vendor_log import LOG_TEXTS

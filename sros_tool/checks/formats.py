@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from sros_tool.checks.kind import Finding, FindingKind, Severity, group_by_cause
-from sros_tool.checks.registry import ChosenFindings
+from sros_tool.checks.kind import ChosenFindings, Finding, FindingKind, Severity, group_by_cause
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import Fleet, named_robots, with_robot_placeholder
 from sros_tool.keystore.expiry import Lifetime, survey

@@ -58,8 +58,7 @@ from sros_tool.values import file_change, shows, versioned
 from sros_tool.wording import counted
 
 if TYPE_CHECKING:
-    from sros_tool.checks.kind import Finding
-    from sros_tool.checks.registry import ChosenFindings, FindingFilter
+    from sros_tool.checks.kind import ChosenFindings, Finding, FindingFilter
     from sros_tool.checks.targets import Circumstances
     from sros_tool.dds.advisories import Advisory
     from sros_tool.demo.doctor import Diagnosis, SecurityProvider
@@ -75,7 +74,7 @@ _LEVELS = click.Choice(["note", "warning", "error"])
 
 def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
     """Complete the ids of findings."""
-    from sros_tool.checks.registry import all_kinds
+    from sros_tool.checks.kind import all_kinds
 
     return [kind_id for kind_id in all_kinds() if kind_id.startswith(incomplete)]
 
@@ -255,8 +254,7 @@ def check(
     --fail-on severity or higher is shown; 2 if all such findings only say that a process could not
     be examined; else 0.
     """
-    from sros_tool.checks.kind import Severity
-    from sros_tool.checks.registry import FindingFilter
+    from sros_tool.checks.kind import FindingFilter, Severity
 
     check_one_format()
     family, paths = _family(targets)
@@ -757,14 +755,14 @@ def _print_text(chosen_findings: ChosenFindings, fleet: Fleet | None = None) -> 
 
 
 def _print_json(chosen_findings: ChosenFindings, _selection: FindingFilter) -> None:
-    from sros_tool.checks.registry import shown_findings
+    from sros_tool.checks.kind import shown_findings
 
     print_json(shown_findings(chosen_findings))
 
 
 def _print_sarif(chosen_findings: ChosenFindings, selection: FindingFilter) -> None:
     from sros_tool.checks.formats import sarif
-    from sros_tool.checks.registry import select_kinds
+    from sros_tool.checks.kind import select_kinds
 
     kinds, findings = select_kinds(selection), (*chosen_findings.shown, *chosen_findings.accepted)
     echo_lines(json_text(sarif(findings, kinds, version=__version__, base=Path.cwd())))
@@ -772,7 +770,7 @@ def _print_sarif(chosen_findings: ChosenFindings, selection: FindingFilter) -> N
 
 def _print_kinds(selection: FindingFilter, form: str) -> None:
     """Print the kinds of findings that are selected."""
-    from sros_tool.checks.registry import AllKinds, select_kinds
+    from sros_tool.checks.kind import AllKinds, select_kinds
 
     kinds = list(select_kinds(selection))
     if form != "text":

@@ -310,7 +310,7 @@ class _Outputs:
 
     def _write(self, markdown: str, findings: Sequence[Finding]) -> None:
         from sros_tool.checks.formats import sarif
-        from sros_tool.checks.registry import FindingFilter, select_kinds
+        from sros_tool.checks.kind import FindingFilter, select_kinds
 
         if self._summary:
             _save(self._summary, markdown.encode("utf-8", "backslashreplace"))
@@ -348,7 +348,7 @@ def _save(file: Path, data: bytes) -> None:
 
 def _sentence(result: Review, step: ReviewStep) -> str:
     """Return the result of a step as a clause."""
-    from sros_tool.checks.registry import ChosenFindings
+    from sros_tool.checks.kind import ChosenFindings
     from sros_tool.cli.policy import access_summary
     from sros_tool.keystore.expiry import ExpiryCheck
     from sros_tool.proof.review import (
@@ -422,7 +422,7 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
     allowed; rights that nobody answers any more; the findings of a failed step.
     """
     from sros_tool.checks.formats import folded_findings
-    from sros_tool.checks.registry import ChosenFindings
+    from sros_tool.checks.kind import ChosenFindings
     from sros_tool.cli.policy import (
         added_lines,
         dropped_lines,
@@ -537,7 +537,7 @@ def _sorted_by_weight(result: Review) -> list[ReviewStep]:
 def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
     """Return the details of a step as Markdown, or "" if `_sentence` is complete."""
     from sros_tool.checks.formats import findings_markdown
-    from sros_tool.checks.registry import ChosenFindings
+    from sros_tool.checks.kind import ChosenFindings
     from sros_tool.cli.check import renewal_markdown
     from sros_tool.cli.policy import access_markdown, rights_markdown
     from sros_tool.keystore.expiry import ExpiryCheck, describe_lifetime

@@ -19,8 +19,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Annotated, NamedTuple
 
-from sros_tool.checks.kind import WARNING, Finding
-from sros_tool.checks.registry import ChosenFindings, FindingFilter
+from sros_tool.checks.kind import WARNING, ChosenFindings, Finding, FindingFilter
 from sros_tool.checks.requirements import VACUOUS
 from sros_tool.checks.targets import Circumstances, path_findings, policy_findings
 from sros_tool.errors import DocumentError, SrosError

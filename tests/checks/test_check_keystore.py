@@ -10,8 +10,7 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
-from sros_tool.checks.kind import group_by_cause
-from sros_tool.checks.registry import FindingFilter
+from sros_tool.checks.kind import FindingFilter, group_by_cause
 from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.vendors import TESTED, Signers, Vendor, joined_titles
 from sros_tool.keystore.layout import enclave_path

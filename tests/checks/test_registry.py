@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from sros_tool.checks.formats import sarif
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Severity
-from sros_tool.checks.registry import FindingFilter, all_kinds
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, FindingFilter, Severity, all_kinds
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import UsageError
 from sros_tool.runtime.processes import ProcessTable, RunningProcesses, UnseenProcess

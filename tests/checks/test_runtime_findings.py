@@ -16,8 +16,7 @@ import pytest
 
 from sros_tool.checks import runtime
 from sros_tool.checks.environment import secured_by
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding
-from sros_tool.checks.registry import FindingFilter
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingFilter
 from sros_tool.checks.runtime import RuntimeState
 from sros_tool.runtime.processes import Process, ProcessTable, RunningProcesses
 from sros_tool.zenoh.json5 import MOST_BYTES

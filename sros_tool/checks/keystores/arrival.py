@@ -12,8 +12,7 @@ from typing import Annotated, NamedTuple
 
 from sros_tool.checks.keystores.enclaves import WAITS
 from sros_tool.checks.keystores.keystore import keystore_findings
-from sros_tool.checks.kind import ERROR, Finding, FindingKind
-from sros_tool.checks.registry import FindingFilter
+from sros_tool.checks.kind import ERROR, Finding, FindingFilter, FindingKind
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
 from sros_tool.keystore.delivery.archive import SUFFIXES
