@@ -625,7 +625,11 @@ def _confirmation_from(value: Any, label: str) -> Confirmation:
             label, f"its format is not {_FORMAT}", "Use an sros of the same version."
         )
     if unknown := sorted(value.keys() - _KEYS - _OPTIONAL_KEYS):
-        raise _invalid_confirmation_error(label, f"it has the unknown key {_shortened(unknown[0])}")
+        raise _invalid_confirmation_error(
+            label,
+            f"it has the unknown key {_shortened(unknown[0])}; if the robot has a later release of "
+            "sros, update sros here first",
+        )
     if missing := sorted(_KEYS - value.keys()):
         raise _invalid_confirmation_error(label, f"it lacks {', '.join(missing)}")
     robot = value["robot"]

@@ -100,6 +100,7 @@ VALID: dict[str, Any] = {
     "files": {PATH: DIGEST},
     "certificates": {PATH: [DIGEST]},
     "restart": ["/r7"],
+    "crl_restart": [],
     "dds": DDS,
     "sequence": 7,
     "release": 0,
@@ -109,7 +110,16 @@ VALID: dict[str, Any] = {
     "problems": ["The disk is full."],
     "requests": ["-----BEGIN CERTIFICATE REQUEST-----\nMA==\n-----END CERTIFICATE REQUEST-----\n"],
 }
-OF_AGENT = ("sequence", "release", "expiry", "running", "clock", "problems", "requests")
+OF_AGENT = (
+    "crl_restart",
+    "sequence",
+    "release",
+    "expiry",
+    "running",
+    "clock",
+    "problems",
+    "requests",
+)
 OPTIONAL = ("certificates", "restart", "dds", *OF_AGENT)
 CONTROLS = "\x1b[2J\x9b\u202e\udc9b\x00\n"
 NO_LIBRARIES: Any = {
@@ -154,7 +164,10 @@ def hostile() -> list[tuple[str, bytes]]:
             [], None, {PATH: DIGEST}, {PATH: [1]}, {PATH: [DIGEST] * 33}, {PATH: [CONTROLS]},
             {"enclaves/r7/permissions.p7s": [DIGEST]}, {"enclaves/r8/cert.pem": [DIGEST]},
         ),
-        "restart": ({}, None, "/r7", [1], [[]], [""], ["r7"], ["/r7/.."], [CONTROLS]),
+        **dict.fromkeys(
+            ("restart", "crl_restart"),
+            ({}, None, "/r7", [1], [[]], [""], ["r7"], ["/r7/.."], [CONTROLS]),
+        ),
         "dds": (
             [], None, {}, {"libraries": []}, {**DDS, "more": 1}, {**DDS, "libraries": {}},
             *({**DDS, "unseen": wrong} for wrong in (-1, True, 1.0, "1", 10**9, None)),
@@ -209,6 +222,11 @@ def test_a_hostile_confirmation_is_refused_in_one_paragraph() -> None:
         "as earlier versions write it"
     )
     assert not any(getattr(without, key) for key in OF_AGENT)
+    for later in ({"dds", *OF_AGENT}, {"crl_restart"}):  # than 0.2.0, than 0.3.0
+        earlier = {key: value for key, value in VALID.items() if key not in later}
+        assert json.loads(render_confirmation(parse_confirmation(_json(earlier), "it"))) == earlier
+    with pytest.raises(DocumentError, match="later release of sros, update sros here first"):
+        parse_confirmation(_json({**VALID, "of_a_later_release": 1}), "it")
     for name, data in hostile():
         with pytest.raises(DocumentError) as caught:
             parse_confirmation(data, "it")
