@@ -314,6 +314,14 @@ def follow_reach(
             f"them: whom they influence is not followed. {refuse}"
         )
         notes.append(Note("explain.anybody", text))
+    if source.routers and enclave not in source.routers:
+        routers = first_few(list(source.routers), 3)
+        text = (
+            f"whoever has the key of {routers} can send and read everything that passes through "
+            "the router, whatever the permissions say. This is not followed: `--reach "
+            f"{source.routers[0]}` shows whom the router reaches."
+        )
+        notes.append(Note("explain.zenoh-router", text))
     return FollowedReach(source.path, (*without, *questions), domain, reach, source.fleet, notes)
 
 
