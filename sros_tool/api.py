@@ -477,12 +477,13 @@ def export_enclaves(
         PosixPath('robot.tar.gz')
     """
     from sros_tool.keystore.delivery.export import distribute
+    from sros_tool.keystore.reader import OpenedKeystore
 
     names = tuple(_no_string("enclaves", enclaves))
     if not names:
         raise UsageError("no enclave is given to export", "", "Pass at least one enclave name.")
     return distribute(
-        Path(keystore), names, Path(target), now=_time_or_now(now), force=force
+        OpenedKeystore(Path(keystore)), names, Path(target), now=_time_or_now(now), force=force
     ).target
 
 

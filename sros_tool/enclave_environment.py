@@ -609,6 +609,7 @@ def container_text(
     """
     from sros_tool.keystore.delivery.export import exported_files
     from sros_tool.keystore.layout import enclave_path
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.runtime.environment import (
         COMPOSE,
         SECRET,
@@ -620,7 +621,7 @@ def container_text(
     )
 
     if form == SECRET:
-        files = exported_files(root, (enclave,), now)
+        files = exported_files(OpenedKeystore(root), (enclave,), now)
         return render_secret(enclave, {PurePosixPath(path).name: files[path] for path in files})
     if form == COMPOSE:
         _check_mounted(root, enclave, target)

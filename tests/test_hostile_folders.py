@@ -31,7 +31,6 @@ from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.files import _follow_own_links, replace_file, staged_file
 from sros_tool.folders import Folder
 from sros_tool.keystore import transaction as transactions
-from sros_tool.keystore.delivery import export
 from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.delivery.robot import create_request
 from sros_tool.keystore.delivery.signing import sign_request
@@ -41,7 +40,7 @@ from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
-from sros_tool.keystore.reader import OpenedKeystore, open_enclave
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import staged_name
 from sros_tool.xml import read_bytes
@@ -502,7 +501,7 @@ def test_an_archive_that_waited_there_is_not_read_into_memory(keystore: Path, st
     with (sticky / "robot.tar.gz").open("wb") as file:
         file.truncate(1 << 42)
     with pytest.raises(KeystoreError, match="already exists, with other content"):
-        distribute(keystore, ["/a"], sticky / "robot.tar.gz", now=NOW)
+        distribute(OpenedKeystore(keystore), ["/a"], sticky / "robot.tar.gz", now=NOW)
 
 
 def test_an_output_follows_a_link_of_ones_own(tmp_path: Path) -> None:
@@ -696,11 +695,11 @@ def test_an_export_follows_no_link_out_of_the_keystore(
     path.unlink()
     path.symlink_to(tmp_path / file)
     with pytest.raises(KeystoreError, match="is a link out of"):
-        distribute(keystore, ["/a"], tmp_path / name, now=NOW)
+        distribute(OpenedKeystore(keystore), ["/a"], tmp_path / name, now=NOW)
     assert not (tmp_path / name).exists()
     path.unlink()
     shutil.copy(tmp_path / file, path)
-    distribute(keystore, ["/a"], tmp_path / name, now=NOW)
+    distribute(OpenedKeystore(keystore), ["/a"], tmp_path / name, now=NOW)
 
 
 def test_an_export_reads_no_file_that_a_link_leads_to_meanwhile(
@@ -708,26 +707,28 @@ def test_an_export_reads_no_file_that_a_link_leads_to_meanwhile(
 ) -> None:
     path = keystore / "enclaves/a/permissions.p7s"
 
+    read = OpenedKeystore.enclave
+
     def opened(*words: Any, **options: Any) -> Any:
-        state = open_enclave(*words, **options)
+        state = read(*words, **options)
         path.unlink()
         path.symlink_to(outside / "shadow")
         return state
 
-    monkeypatch.setattr(export, "open_enclave", opened)
+    monkeypatch.setattr(OpenedKeystore, "enclave", opened)
     with pytest.raises(KeystoreError, match="is a link out of"):
-        distribute(keystore, ["/a"], tmp_path / "robot", now=NOW)
+        distribute(OpenedKeystore(keystore), ["/a"], tmp_path / "robot", now=NOW)
 
 
 def test_a_ca_key_in_the_file_of_its_certificate_does_not_leave(
     keystore: Path, tmp_path: Path
 ) -> None:
     key = (keystore / "private/identity_ca.key.pem").read_bytes()
-    distribute(keystore, ["/a"], tmp_path / "robot", now=NOW)
+    distribute(OpenedKeystore(keystore), ["/a"], tmp_path / "robot", now=NOW)
     with (keystore / "public/identity_ca.cert.pem").open("ab") as file:
         file.write(key)
     with pytest.raises(KeystoreError, match="contains a private key"):
-        distribute(keystore, ["/a"], tmp_path / "other", now=NOW)
+        distribute(OpenedKeystore(keystore), ["/a"], tmp_path / "other", now=NOW)
     assert not (tmp_path / "other").exists()
     request = create_request(tmp_path / "born", "/born").file.read_bytes()
     with pytest.raises(KeystoreError, match="contains a private key"):
@@ -756,10 +757,10 @@ def test_no_key_is_left_to_the_owner_of_a_folder_that_waited_there(
         elif verb == "create_request":
             create_request(waiting, "/a", dry_run=dry_run)
         else:
-            distribute(keystore, ["/a"], waiting, now=NOW, dry_run=dry_run)
+            distribute(OpenedKeystore(keystore), ["/a"], waiting, now=NOW, dry_run=dry_run)
     assert not list(waiting.iterdir())
     sticky.chmod(0o755)  # only root can make a folder there, so it is meant for its owner
-    distribute(keystore, ["/a"], waiting, now=NOW)
+    distribute(OpenedKeystore(keystore), ["/a"], waiting, now=NOW)
 
 
 # ── files that grow, wait, or have no end ──────────────────────────────────────────────────

@@ -92,6 +92,7 @@ def distribute_key(
     from sros_tool.keystore.delivery.archive import SUFFIXES
     from sros_tool.keystore.delivery.export import distribute, pack_enclaves, select
     from sros_tool.keystore.outcomes import changes_below
+    from sros_tool.keystore.reader import OpenedKeystore
 
     root, rest = split_root(arguments)
     names = rest[:-1]
@@ -99,8 +100,9 @@ def distribute_key(
         raise UsageError("distribute_key takes a keystore, one or more enclaves and a target")
     target = PATH.convert(rest[-1], None, None)
     _check_target(root, rest[-1])
+    keystore = OpenedKeystore(root)
     selection = select(
-        root, names, patterns, robots=robots, all_enclaves=all_enclaves, keyless=keyless
+        keystore, names, patterns, robots=robots, all_enclaves=all_enclaves, keyless=keyless
     )
     notes: tuple[Note, ...] = ()
     if target == _STREAM:
@@ -108,7 +110,7 @@ def distribute_key(
             _refuse_json(as_json)
             _refuse_terminal()
         with progress("exporting"):
-            packed = pack_enclaves(root, selection.names, now=now(), keyless=keyless)
+            packed = pack_enclaves(keystore, selection.names, now=now(), keyless=keyless)
         changes = tuple(FileChange("send", path) for path in packed.paths)
         notes = packed.notes
         if not dry_run:
@@ -120,7 +122,7 @@ def distribute_key(
     else:
         with progress("exporting"):
             export = distribute(
-                root,
+                keystore,
                 selection.names,
                 target,
                 now=now(),
@@ -147,7 +149,7 @@ def distribute_key(
 
         archive = target == _STREAM or target.name.endswith(SUFFIXES)
         folder, names = Path() if archive else target, selection.names
-        outcomes = exported_outcomes(root, names, folder, changed=bool(changes))
+        outcomes = exported_outcomes(keystore, names, folder, changed=bool(changes))
         left_out = selection.left_out
         print_json(ExportedEnclaves(root, dry_run, target, outcomes, left_out, changes, notes))
     else:

@@ -13,7 +13,7 @@ from sros_tool.keystore.delivery.export import exported_files
 from sros_tool.keystore.delivery.release import Release, seal_releases
 from sros_tool.keystore.issuing.authority import Authority
 from sros_tool.keystore.layout import KEY_FILE, ca_certificate, ca_key
-from sros_tool.keystore.reader import read_certificate
+from sros_tool.keystore.reader import OpenedKeystore, read_certificate
 from sros_tool.pki.keys import load_key
 from tests.support.harness import copy_of, sros
 
@@ -33,7 +33,7 @@ def authority_of(root: Path) -> Authority:
 
 def files_of(root: Path, names: tuple[str, ...] = NAMES) -> dict[str, bytes]:
     """Return the files of enclaves as a release has them."""
-    files = exported_files(root, names, moment(), keyless=True)
+    files = exported_files(OpenedKeystore(root), names, moment(), keyless=True)
     return {path: data for path, data in files.items() if not path.endswith(f"/{KEY_FILE}")}
 
 

@@ -141,9 +141,9 @@ def evaluations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Return a list that gets the name of each enclave that is evaluated from now on."""
     evaluated: list[str] = []
 
-    def released_enclave(root: Path, name: str, now: datetime) -> ReleasedEnclave:
+    def released_enclave(keystore: OpenedKeystore, name: str, now: datetime) -> ReleasedEnclave:
         evaluated.append(name)
-        return evaluate(root, name, now)
+        return evaluate(keystore, name, now)
 
     monkeypatch.setattr(publishing, "released_enclave", released_enclave)
     return evaluated

@@ -21,6 +21,7 @@ from ansible_collections.sros.fleet.plugins.module_utils.exports import (
     read_archive,
 )
 from sros_tool.keystore.delivery.export import pack_enclaves
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.names import check_enclave_name
 
 NOW = datetime.now(UTC)
@@ -42,7 +43,7 @@ def packed(*entries: tuple[str, bytes | str], after: bytes = b"") -> bytes:
 
 
 def test_what_sros_packs_is_read(made_keystore: Path) -> None:
-    data = pack_enclaves(made_keystore, ["/a", "/b"], now=NOW).data
+    data = pack_enclaves(OpenedKeystore(made_keystore), ["/a", "/b"], now=NOW).data
     files = read_archive(data)
     assert enclaves_in(files) == ["/a", "/b"]
     assert len(authorities(files)) == 2

@@ -21,6 +21,7 @@ from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from tests.support.harness import copy_of
 
@@ -38,7 +39,7 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
     def export(what: str, *names: str, keystore: str = "ks", at: datetime = now) -> None:
         made[what] = folder / "exports" / what
-        distribute(folder / keystore, names, made[what], now=at)
+        distribute(OpenedKeystore(folder / keystore), names, made[what], now=at)
 
     for name, moment in (("ks", now), ("other", now), ("old", long_ago - timedelta(days=30))):
         create_keystore(folder / name, template=load_template("production"), now=moment)
@@ -189,7 +190,7 @@ def test_a_list_that_the_robot_made_itself_holds_up_nothing(
     create_keystore(forger, template=load_template("production"), now=now)
     create_enclaves(forger, ["/a", "/b"], now=now)
     revoke(forger, ["/b"], now=now)
-    distribute(forger, ["/a"], tmp_path / "forged", now=now)
+    distribute(OpenedKeystore(forger), ["/a"], tmp_path / "forged", now=now)
     forged = files_of(tmp_path / "forged")
     before, after = files_of(exports["revoked"]), files_of(exports["ks"])
     path = "enclaves/a/crl.pem"

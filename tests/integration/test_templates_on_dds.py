@@ -12,6 +12,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.files import policies_dir, templates_dir
 from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import Template, load_template
 from sros_tool.policy.document import read_policy
 from tests.integration.converse import ENOUGH, converse, listener, talker
@@ -68,8 +69,8 @@ def test_production_without_a_policy_denies_the_topic_but_not_the_participant(
 def test_an_exported_pair_talks_when_the_original_is_gone(tmp_path: Path) -> None:
     make(tmp_path / "ks", load_template("production"))
     now = datetime.now(UTC)
-    distribute(tmp_path / "ks", [TALKER], tmp_path / "folder", now=now)
-    distribute(tmp_path / "ks", [LISTENER], tmp_path / "robot.tar.gz", now=now)
+    distribute(OpenedKeystore(tmp_path / "ks"), [TALKER], tmp_path / "folder", now=now)
+    distribute(OpenedKeystore(tmp_path / "ks"), [LISTENER], tmp_path / "robot.tar.gz", now=now)
     shutil.rmtree(tmp_path / "ks")
     (tmp_path / "unpacked").mkdir()
     run(["tar", "-xzf", tmp_path / "robot.tar.gz", "-C", tmp_path / "unpacked"])

@@ -54,7 +54,7 @@ def fleet(made_fleet: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def arrived(made_fleet: Path, tmp_path: Path) -> Path:
-    distribute(made_fleet, ["/arm/camera", "/base"], tmp_path / "robot", now=NOW)
+    distribute(OpenedKeystore(made_fleet), ["/arm/camera", "/base"], tmp_path / "robot", now=NOW)
     return tmp_path / "robot"
 
 
@@ -63,13 +63,13 @@ def test_an_older_list_does_not_replace_a_newer_one(fleet: Path, tmp_path: Path)
     refresh_crl(fleet, now=NOW)
     backup, robot = copy_of(fleet, tmp_path / "backup"), tmp_path / "robot"
     revoke(fleet, ["/armada"], now=NOW)
-    distribute(fleet, ["/base"], robot, now=NOW)
+    distribute(OpenedKeystore(fleet), ["/base"], robot, now=NOW)
     with pytest.raises(
         KeystoreError, match=r"is a newer .* number 2, the keystore has the number 1"
     ):
-        distribute(backup, ["/base"], robot, now=NOW, force=True)
+        distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True)
     (robot / "enclaves/base/crl.pem").unlink()
-    assert distribute(backup, ["/base"], robot, now=NOW, force=True).changes
+    assert distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True).changes
 
 
 # ── selection ──────────────────────────────────────────────────────────────────────────────
@@ -96,7 +96,7 @@ def test_selection(
     left_out: list[str],
     made_fleet: Path,
 ) -> None:
-    found = select(made_fleet, names, patterns, all_enclaves=every)
+    found = select(OpenedKeystore(made_fleet), names, patterns, all_enclaves=every)
     assert found == ExportSelection(tuple(chosen), tuple(left_out))
 
 
@@ -106,7 +106,7 @@ def test_selection(
 )
 def test_an_empty_selection_is_refused(patterns: list[str], why: str, made_fleet: Path) -> None:
     with pytest.raises(KeystoreError) as caught:
-        select(made_fleet, [], patterns)
+        select(OpenedKeystore(made_fleet), [], patterns)
     assert why in str(caught.value)
 
 
@@ -117,18 +117,18 @@ def test_several_enclaves_are_exported_completely_or_not_at_all(
     for wrong, why in ((BORN, "made on its robot"), ("/none", "does not exist")):
         for target in ("out", "out.tar.gz"):
             with pytest.raises(KeystoreError, match=why):
-                distribute(fleet, ["/base", wrong], tmp_path / target, now=NOW)
+                distribute(OpenedKeystore(fleet), ["/base", wrong], tmp_path / target, now=NOW)
     (fleet / "enclaves/base/permissions.p7s").unlink()
     with pytest.raises(KeystoreError, match="would not run"):
-        distribute(fleet, ["/arm/camera", "/base"], tmp_path / "out", now=NOW)
+        distribute(OpenedKeystore(fleet), ["/arm/camera", "/base"], tmp_path / "out", now=NOW)
     assert set(snapshot(tmp_path)) == set(before) - {"ks/enclaves/base/permissions.p7s"}
 
 
 def test_folder_archive_and_pipe_hold_the_same(fleet: Path, tmp_path: Path) -> None:
     names = ["/base", "/arm/camera"]
-    distribute(fleet, names, tmp_path / "out", now=NOW)
-    distribute(fleet, names, tmp_path / "out.tgz", now=NOW)
-    packed = pack_enclaves(fleet, names[::-1], now=NOW)
+    distribute(OpenedKeystore(fleet), names, tmp_path / "out", now=NOW)
+    distribute(OpenedKeystore(fleet), names, tmp_path / "out.tgz", now=NOW)
+    packed = pack_enclaves(OpenedKeystore(fleet), names[::-1], now=NOW)
     assert packed.data == (tmp_path / "out.tgz").read_bytes()
     files = unpack(packed.data)
     assert tuple(files) == packed.paths
@@ -142,7 +142,7 @@ def test_folder_archive_and_pipe_hold_the_same(fleet: Path, tmp_path: Path) -> N
 def test_a_lost_key_does_not_count_as_a_key_on_a_robot(fleet: Path, tmp_path: Path) -> None:
     (fleet / "enclaves/base/key.pem").unlink()
     with pytest.raises(KeystoreError, match=r"key\.pem: missing"):
-        distribute(fleet, ["/base"], tmp_path / "out", now=NOW)
+        distribute(OpenedKeystore(fleet), ["/base"], tmp_path / "out", now=NOW)
 
 
 # ── verification on the robot ──────────────────────────────────────────────────────────────
@@ -173,7 +173,7 @@ def _other_ca(robot: Path) -> None:
     root = robot.parent / "other"
     create_keystore(root, template=load_template("production"), now=NOW)
     create_enclaves(root, ["/zebra"], now=NOW)
-    distribute(root, ["/zebra"], robot.parent / "more", now=NOW)
+    distribute(OpenedKeystore(root), ["/zebra"], robot.parent / "more", now=NOW)
     shutil.copytree(robot.parent / "more/enclaves/zebra", robot / "enclaves/zebra")
 
 
@@ -292,7 +292,7 @@ def test_an_export_that_looks_like_home_is_found_with_its_ca_key(
     fleet: Path, tmp_path: Path, looks: str
 ) -> None:
     robot = tmp_path / "robot"
-    distribute(fleet, ["/base", "/armada"], robot, now=NOW)
+    distribute(OpenedKeystore(fleet), ["/base", "/armada"], robot, now=NOW)
     for name in ("public", "private", "sros.toml", "ledger.jsonl", "ledger.p7s"):
         if looks in (name, "whole") or name == "private":
             source = fleet / name
@@ -305,7 +305,7 @@ def test_an_export_that_looks_like_home_is_found_with_its_ca_key(
 
 
 def test_no_remedy_for_a_ca_key_may_lose_it(fleet: Path, tmp_path: Path) -> None:
-    distribute(fleet, ["/base"], tmp_path / "robot", now=NOW)
+    distribute(OpenedKeystore(fleet), ["/base"], tmp_path / "robot", now=NOW)
     shutil.copy(fleet / "private/identity_ca.key.pem", tmp_path / "robot/enclaves/base")
     (said,) = verify_arrival(tmp_path / "robot", now=NOW).findings
     assert said.id == "keystore.ca-key-on-robot"
@@ -313,9 +313,9 @@ def test_no_remedy_for_a_ca_key_may_lose_it(fleet: Path, tmp_path: Path) -> None
 
 
 def test_a_revoked_enclave_on_the_robot_is_a_finding(fleet: Path, tmp_path: Path) -> None:
-    distribute(fleet, ["/base", "/armada"], tmp_path / "robot", now=NOW)
+    distribute(OpenedKeystore(fleet), ["/base", "/armada"], tmp_path / "robot", now=NOW)
     revoke(fleet, ["/base"], now=NOW)
-    distribute(fleet, ["/armada"], tmp_path / "robot", now=NOW)
+    distribute(OpenedKeystore(fleet), ["/armada"], tmp_path / "robot", now=NOW)
     crl = tmp_path / "robot/enclaves/armada/crl.pem"
     (finding,) = verify_arrival(tmp_path / "robot", now=NOW).findings
     assert finding.id == "keystore.enclave-revoked"
@@ -341,20 +341,20 @@ def test_verifying_changes_nothing(arrived: Path) -> None:
 
 
 def test_an_update_replaces_the_files_of_an_earlier_export(fleet: Path, tmp_path: Path) -> None:
-    distribute(fleet, ["/base"], tmp_path / "robot", now=NOW)
+    distribute(OpenedKeystore(fleet), ["/base"], tmp_path / "robot", now=NOW)
     (tmp_path / "p.xml").write_text(policy_text({"/base": publish("new")}))
     generate_artifacts(fleet, policies=[read_policy(tmp_path / "p.xml")], now=NOW)
     renew(fleet, ["/base"], now=NOW)
     with pytest.raises(SrosError, match="other versions"):
-        distribute(fleet, ["/base", "/armada"], tmp_path / "robot", now=NOW)
-    distribute(fleet, ["/base", "/armada"], tmp_path / "robot", now=NOW, force=True)
+        distribute(OpenedKeystore(fleet), ["/base", "/armada"], tmp_path / "robot", now=NOW)
+    distribute(OpenedKeystore(fleet), ["/base", "/armada"], tmp_path / "robot", now=NOW, force=True)
     assert not verify_arrival(tmp_path / "robot", now=NOW).findings
     assert not [path for path in os.listdir(tmp_path / "robot") if path.startswith(".")]
 
 
 def test_an_enclave_that_the_keystore_lost_is_named(keystore: Path, tmp_path: Path) -> None:
     robot = tmp_path / "the robot"
-    distribute(keystore, ["/a", "/b"], robot, now=NOW)
+    distribute(OpenedKeystore(keystore), ["/a", "/b"], robot, now=NOW)
     sros("revoke", keystore, "/a").ok()
     ended = sros("distribute_key", keystore, "--all", robot, "--force").ok()
     assert f"'{robot}' also has enclave /a" in ended.err

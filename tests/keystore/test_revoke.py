@@ -340,9 +340,9 @@ def test_refresh_reaches_an_enclave_without_a_list(tmp_path: Path) -> None:
 
 def test_an_export_brings_the_list(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a", "/b")
-    distribute(root, ["/b"], tmp_path / "out", now=NOW)
+    distribute(OpenedKeystore(root), ["/b"], tmp_path / "out", now=NOW)
     revoke(root, ["/a"], now=NOW)
-    distribute(root, ["/b"], tmp_path / "out", now=NOW, force=True)
+    distribute(OpenedKeystore(root), ["/b"], tmp_path / "out", now=NOW, force=True)
     sent = tmp_path / "out/enclaves/b/crl.pem"
     assert sent.read_bytes() == (root / "public/identity_ca.crl.pem").read_bytes()
     assert not sent.is_symlink()

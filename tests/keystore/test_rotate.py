@@ -646,11 +646,11 @@ def test_no_default_replaces_a_ca_by_one_that_ends_before(
 
 def test_exports_can_be_replaced_during_a_rotation(separate: Path, tmp_path: Path) -> None:
     """A robot's folder gets its enclaves one after the other."""
-    distribute(separate, ["/a", "/b"], tmp_path / "robot", now=NOW)
+    distribute(OpenedKeystore(separate), ["/a", "/b"], tmp_path / "robot", now=NOW)
     for stage in STAGES:
         rotate_ca(separate, stage, now=NOW)
         for name in ("/a", "/b"):
-            distribute(separate, [name], tmp_path / "robot", now=NOW, force=True)
+            distribute(OpenedKeystore(separate), [name], tmp_path / "robot", now=NOW, force=True)
             folder = enclave_path(tmp_path / "robot", name)
             assert open_enclave(folder, now=NOW).problems == ()
 

@@ -37,6 +37,7 @@ from sros_tool.keystore.lifecycle.create import (
     generate_artifacts,
 )
 from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import Change, Changes, Transaction
 from sros_tool.policy.document import read_policy
@@ -210,7 +211,7 @@ def links_elsewhere(w: Path) -> None:
 
 
 def export(w: Path) -> None:
-    distribute(w / "ks", ["/a"], w / "out", now=NOW)
+    distribute(OpenedKeystore(w / "ks"), ["/a"], w / "out", now=NOW)
     create_permission(w / "ks", ["/a"], policy(w), now=NOW)
 
 
@@ -267,7 +268,7 @@ SCENARIOS = {
         empty_root,
     ),
     "distribute_key": Scenario(
-        lambda w: distribute(w / "ks", ["/a"], w / "out", now=NOW, force=True),
+        lambda w: distribute(OpenedKeystore(w / "ks"), ["/a"], w / "out", now=NOW, force=True),
         {"/a": "old_a"},
         {"/a": "new_a"},
         export,

@@ -47,7 +47,7 @@ from sros_tool.keystore.outcomes import (
     enclave_result,
 )
 from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
-from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, open_enclave
+from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore
 from sros_tool.keystore.selection import missing_enclave_error, select_enclaves
 from sros_tool.keystore.transaction import Change, Transaction
 from sros_tool.keystore.zenoh_files import open_zenoh
@@ -88,7 +88,7 @@ class ExportSelection:
 
 
 def select(
-    root: Path,
+    keystore: OpenedKeystore,
     names: Sequence[str],
     patterns: Sequence[str] = (),
     *,
@@ -108,7 +108,7 @@ def select(
     chosen: list[str] = []
     left_out: list[str] = []
     for name in select_enclaves(
-        OpenedKeystore(root),
+        keystore,
         names,
         patterns,
         robots=robots,
@@ -116,11 +116,11 @@ def select(
         checked=True,
     ):
         only_matches = name not in names and not keyless
-        at_robot = only_matches and key_on_robot(enclave_path(root, name))
+        at_robot = only_matches and key_on_robot(keystore.folder(name))
         (left_out if at_robot else chosen).append(name)
     if not chosen:
         raise KeystoreError(
-            f"the keys of {', '.join(left_out)} are not in keystore '{root}'",
+            f"the keys of {', '.join(left_out)} are not in keystore '{keystore.root}'",
             "They were made on their robots and stay there.",
             _ANSWER_AGAIN,
         )
@@ -128,7 +128,7 @@ def select(
 
 
 def distribute(
-    root: Path,
+    keystore: OpenedKeystore,
     names: Sequence[str],
     target: Path,
     *,
@@ -147,12 +147,12 @@ def distribute(
         KeystoreError: an enclave does not exist or cannot run, ``target`` cannot be used, or
             ``target`` has other content, which only ``force`` replaces.
     """
-    files = exported_files(root, names, now, keyless=keyless)
+    files = exported_files(keystore, names, now, keyless=keyless)
     notes = tuple(_token_notes(files))
     if target.name.endswith(_ARCHIVE_SUFFIXES):
         return Export(target, tuple(names), _write_archive(target, files, force, dry_run), notes)
-    changes = _write_folder(root, target, files, force, dry_run)
-    return Export(target, tuple(names), changes, (*notes, *_notes(root, target)))
+    changes = _write_folder(keystore, target, files, force, dry_run)
+    return Export(target, tuple(names), changes, (*notes, *_notes(keystore, target)))
 
 
 def _token_notes(files: Mapping[str, bytes]) -> Iterator[Note]:
@@ -168,14 +168,14 @@ def _token_notes(files: Mapping[str, bytes]) -> Iterator[Note]:
             yield Note("export.key-on-token", text)
 
 
-def _notes(root: Path, target: Path) -> Iterator[Note]:
+def _notes(keystore: OpenedKeystore, target: Path) -> Iterator[Note]:
     """Yield a note for each enclave in ``target`` that the keystore does not have now."""
     for name in search_enclaves(target)[0]:
-        if not has_enclave(root, name):
+        if not has_enclave(keystore.root, name):
             yield Note(
                 "export.not-in-keystore",
-                f"'{target}' also has enclave {name}, which keystore '{root}' does not have; if it "
-                f"was revoked, remove it from the robot, too: rm -r "
+                f"'{target}' also has enclave {name}, which keystore '{keystore.root}' does not "
+                "have; if it was revoked, remove it from the robot, too: rm -r "
                 f"{quote(str(enclave_path(target, name)))}",
             )
 
@@ -190,44 +190,43 @@ class PackedEnclaves:
 
 
 def pack_enclaves(
-    root: Path, names: Sequence[str], *, now: datetime, keyless: bool = False
+    keystore: OpenedKeystore, names: Sequence[str], *, now: datetime, keyless: bool = False
 ) -> PackedEnclaves:
     """Return the export of enclaves as an archive in memory; ``keyless`` as in `distribute`.
 
     Raises:
         KeystoreError: an enclave does not exist, or cannot run.
     """
-    files = exported_files(root, names, now, keyless=keyless)
+    files = exported_files(keystore, names, now, keyless=keyless)
     return PackedEnclaves(pack(files), tuple(files), tuple(_token_notes(files)))
 
 
 def exported_files(
-    root: Path, names: Sequence[str], now: datetime, *, keyless: bool = False
+    keystore: OpenedKeystore, names: Sequence[str], now: datetime, *, keyless: bool = False
 ) -> dict[str, bytes]:
     """Map the paths of the exported files to their content; ``keyless`` as in `distribute`.
 
     Raises:
         KeystoreError: an enclave does not exist, or cannot run.
     """
-    keystore = OpenedKeystore(root)
     keystore.check()
     for name in names:
-        if not has_enclave(root, check_enclave_name(name)):
+        if not has_enclave(keystore.root, check_enclave_name(name)):
             raise missing_enclave_error(keystore, name, keystore.names)
-    check_readable(root, names)
+    check_readable(keystore.root, names)
     files: dict[str, bytes] = {}
     for name in names:
-        at_robot = key_on_robot(enclave_path(root, name))
+        at_robot = key_on_robot(keystore.folder(name))
         if at_robot and not keyless:
             raise KeystoreError(
-                f"the key of enclave {name} is not in keystore '{root}'",
+                f"the key of enclave {name} is not in keystore '{keystore.root}'",
                 "It was made on its robot and stays there, so an export could not run.",
                 _ANSWER_AGAIN,
             )
-        evaluation = _evaluate_enclave(root, name, now)
+        evaluation = _evaluate_enclave(keystore, name, now)
         if evaluation.problems:
-            raise _refused_enclave_error(root, name, evaluation.problems)
-        files |= _files_of(root, name, evaluation)
+            raise _refused_enclave_error(keystore, name, evaluation.problems)
+        files |= _files_of(keystore, name, evaluation)
     return dict(sorted(files.items()))
 
 
@@ -243,7 +242,7 @@ class ReleasedEnclave(NamedTuple):
     until: datetime
 
 
-def released_enclave(root: Path, name: str, now: datetime) -> ReleasedEnclave:
+def released_enclave(keystore: OpenedKeystore, name: str, now: datetime) -> ReleasedEnclave:
     """Return the files of an enclave for its robot, after evaluating them.
 
     If the only reason why an enclave cannot run is a date (expired, or not valid yet), it is still
@@ -252,26 +251,26 @@ def released_enclave(root: Path, name: str, now: datetime) -> ReleasedEnclave:
     Raises:
         KeystoreError: the enclave cannot run for another reason.
     """
-    evaluation = _evaluate_enclave(root, name, now)
+    evaluation = _evaluate_enclave(keystore, name, now)
     state = evaluation.state
     problems = state.problems_in_keystore
     lasting = [str(problem) for problem in problems if problem.fault not in _OF_TIME]
     if lasting or (evaluation.problems and not problems):
-        raise _refused_enclave_error(root, name, lasting or evaluation.problems)
-    _check_zenoh(root, enclave_path(root, name), name, state)
-    _check_not_ca_key(enclave_path(root, name), state)
-    files = released_files(root, name)
+        raise _refused_enclave_error(keystore, name, lasting or evaluation.problems)
+    _check_zenoh(keystore, name, state)
+    _check_not_ca_key(keystore.folder(name), state)
+    files = released_files(keystore, name)
     until = now if problems else _evaluated_until(files, state, now)
     return ReleasedEnclave(files, "; ".join(map(str, problems)), until)
 
 
-def released_files(root: Path, name: str) -> dict[str, bytes]:
+def released_files(keystore: OpenedKeystore, name: str) -> dict[str, bytes]:
     """Map the paths of all files of an enclave, except its key, to their content, not evaluated.
 
     Raises:
         KeystoreError: a file has a private key.
     """
-    return _read_files(root, name, (file for file in _FILES if file not in KEY_FILES))
+    return _read_files(keystore, name, (file for file in _FILES if file not in KEY_FILES))
 
 
 def _evaluated_until(files: Mapping[str, bytes], state: OpenedEnclave, now: datetime) -> datetime:
@@ -315,49 +314,53 @@ _OF_TIME = frozenset(
 """Faults that depend on the time."""
 
 
-def _evaluate_enclave(root: Path, name: str, now: datetime) -> EvaluatedEnclave:
-    folder = enclave_path(root, name)
-    return evaluated(name, folder, open_enclave(folder, now=now), moment=now)
+def _evaluate_enclave(keystore: OpenedKeystore, name: str, now: datetime) -> EvaluatedEnclave:
+    return evaluated(name, keystore.folder(name), keystore.enclave(name, now=now), moment=now)
 
 
-def _refused_enclave_error(root: Path, name: str, problems: Sequence[str]) -> KeystoreError:
+def _refused_enclave_error(
+    keystore: OpenedKeystore, name: str, problems: Sequence[str]
+) -> KeystoreError:
     return KeystoreError(
         f"enclave {name} would not run on a robot",
         "; ".join(problem.rstrip(".") for problem in problems) + ".",
-        f"See `sros inspect {quote(str(enclave_path(root, name)))}`.",
+        f"See `sros inspect {quote(str(keystore.folder(name)))}`.",
     )
 
 
-def _files_of(root: Path, name: str, evaluation: EvaluatedEnclave) -> dict[str, bytes]:
+def _files_of(
+    keystore: OpenedKeystore, name: str, evaluation: EvaluatedEnclave
+) -> dict[str, bytes]:
     """Map the paths of all files of an enclave to their content.
 
     Raises:
         KeystoreError: a file has a private key of something else, or a Zenoh configuration cannot
             be used.
     """
-    folder, state = enclave_path(root, name), evaluation.state
-    _check_zenoh(root, folder, name, state)
-    _check_not_ca_key(folder, state)
-    return _read_files(root, name, _FILES)
+    _check_zenoh(keystore, name, evaluation.state)
+    _check_not_ca_key(keystore.folder(name), evaluation.state)
+    return _read_files(keystore, name, _FILES)
 
 
 _FILES = (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES, *ZENOH_FILES)
 
 
-def _read_files(root: Path, name: str, wanted_files: Iterable[str]) -> dict[str, bytes]:
+def _read_files(
+    keystore: OpenedKeystore, name: str, wanted_files: Iterable[str]
+) -> dict[str, bytes]:
     """Map the paths of an enclave's ``wanted_files`` to their content; skip missing files.
 
     Raises:
         KeystoreError: a file other than that of the key has a private key.
     """
     files: dict[str, bytes] = {}
-    with Folder(root) as opened:
+    with Folder(keystore.root) as opened:
         for file in wanted_files:
             path = f"{enclave_folder(name)}/{file}"
             with suppress(FileNotFoundError):
                 files[path] = opened.read_inside(path)
                 if file != KEY_FILE and holds_private_key(files[path]):
-                    raise _ca_key_error(root / path)
+                    raise _ca_key_error(keystore.root / path)
     return files
 
 
@@ -370,14 +373,14 @@ def _check_not_ca_key(folder: Path, state: OpenedEnclave) -> None:
         raise _ca_key_error(folder / KEY_FILE)
 
 
-def _check_zenoh(root: Path, folder: Path, name: str, state: OpenedEnclave) -> None:
+def _check_zenoh(keystore: OpenedKeystore, name: str, state: OpenedEnclave) -> None:
     """Raise `KeystoreError` if `sros run` on the robot would refuse the Zenoh configurations."""
-    zenoh = open_zenoh(folder, name, state)
+    zenoh = open_zenoh(keystore.folder(name), name, state)
     if zenoh.files and zenoh.problems:
         raise KeystoreError(
             f"the Zenoh configuration of enclave {name} could not be used on a robot",
             "; ".join(map(str, zenoh.problems)) + ".",
-            f"Write it again: `sros zenoh {quote(str(root))}`.",
+            f"Write it again: `sros zenoh {quote(str(keystore.root))}`.",
         )
 
 
@@ -395,9 +398,9 @@ def _real_path(path: Path) -> Path:
 
 
 def _write_folder(
-    root: Path, target: Path, files: dict[str, bytes], force: bool, dry_run: bool
+    keystore: OpenedKeystore, target: Path, files: dict[str, bytes], force: bool, dry_run: bool
 ) -> Sequence[Change]:
-    if _real_path(target).is_relative_to(_real_path(root)):
+    if _real_path(target).is_relative_to(_real_path(keystore.root)):
         raise KeystoreError(
             f"'{target}' is the keystore itself or a folder in it", "", "Choose another folder."
         )
@@ -412,7 +415,7 @@ def _write_folder(
             "Choose another folder.",
         )
     check_same_authority(target, files)
-    _check_robot(root, target, files)
+    _check_robot(keystore, target, files)
     _check_lists(target, files)
     stale = _stale_paths(target, files)
     different = {
@@ -436,10 +439,10 @@ def _write_folder(
     return transaction.changes
 
 
-def _check_robot(root: Path, target: Path, files: Mapping[str, bytes]) -> None:
+def _check_robot(keystore: OpenedKeystore, target: Path, files: Mapping[str, bytes]) -> None:
     """Raise `KeystoreError` if the agent in ``target`` is of another robot than an enclave."""
     settings = target / AGENT / "agent.toml"
-    if not settings.is_file() or not (fleet := load_fleet(OpenedKeystore(root))):
+    if not settings.is_file() or not (fleet := load_fleet(keystore)):
         return
     owner = None
     with suppress(SrosError, ValueError):  # the agent refuses these settings itself
@@ -547,13 +550,13 @@ class ExportedEnclaves(NamedTuple):
 
 
 def exported_outcomes(
-    root: Path, names: Sequence[str], folder: Path, *, changed: bool
+    keystore: OpenedKeystore, names: Sequence[str], folder: Path, *, changed: bool
 ) -> list[EnclaveResult[str]]:
     """Return the outcomes of exported enclaves, whose files are below ``folder``.
 
     ``changed`` says whether the export changed any file.
     """
-    keystore, outcome = OpenedKeystore(root), "exported" if changed else "kept"
+    outcome = "exported" if changed else "kept"
     return [
         enclave_result(keystore, name, outcome, written=True, folder=folder / enclave_folder(name))
         for name in names

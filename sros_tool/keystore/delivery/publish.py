@@ -476,8 +476,8 @@ class _Evaluator:
     of the others in the list.
     """
 
-    def __init__(self, root: Path, now: datetime) -> None:
-        self._root = root
+    def __init__(self, keystore: OpenedKeystore, now: datetime) -> None:
+        self._keystore = keystore
         self._now = now
         self._lists: dict[object, bool] = {}
 
@@ -490,13 +490,13 @@ class _Evaluator:
             SrosError: an enclave cannot run, or its files cannot be read.
         """
         if before:
-            by_enclave = {name: released_files(self._root, name) for name in enclaves}
+            by_enclave = {name: released_files(self._keystore, name) for name in enclaves}
             files = _sorted_by_path(by_enclave.values())
             if before.holds(_digest_without_lists(files), self._now) and all(
                 self._is_list_good(name, of_enclave) for name, of_enclave in by_enclave.items()
             ):
                 return _RobotFiles(files, "", before)
-        released = {name: released_enclave(self._root, name, self._now) for name in enclaves}
+        released = {name: released_enclave(self._keystore, name, self._now) for name in enclaves}
         files = _sorted_by_path(enclave.files for enclave in released.values())
         not_valid = (f"{name}: {of.not_valid}" for name, of in released.items() if of.not_valid)
         until = min(enclave.until for enclave in released.values())
@@ -525,7 +525,7 @@ class _Evaluator:
         kind = data, files[f"{folder}/{IDENTITY_CA_FILE}"], certificate.issuer, extensions
         if kind not in self._lists:
             try:
-                enclave = released_enclave(self._root, name, self._now)
+                enclave = released_enclave(self._keystore, name, self._now)
                 self._lists[kind] = not enclave.not_valid
             except SrosError:
                 self._lists[kind] = False
@@ -890,7 +890,7 @@ class _Run:
         self, robots: Sequence[_Changed], number: int, authority: Authority | None
     ) -> Iterator[_ReleaseOutcome]:
         """Yield the outcome for each robot; without ``authority`` nothing is written."""
-        evaluator = _Evaluator(self.keystore.root, self._now)
+        evaluator = _Evaluator(self.keystore, self._now)
         new: list[tuple[_Changed, _RobotFiles, str]] = []
         for robot in robots:
             before = self.list.robots.get(robot.robot)
