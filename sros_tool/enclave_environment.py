@@ -58,7 +58,7 @@ class EnclaveEnvironment:
 
 @read_consistently
 def loadable_environment(
-    root: Path,
+    keystore: OpenedKeystore,
     name: str,
     domain_text: str | None = None,
     rmw: str | None = None,
@@ -72,7 +72,7 @@ def loadable_environment(
     """Return the environment of an enclave after checking that a process can run in it.
 
     Args:
-        root: the keystore, or an export of it.
+        keystore: the opened keystore, or an export of it.
         name: the enclave.
         domain_text: the value of --domain; None stands for $ROS_DOMAIN_ID.
         rmw: the value of --rmw; None stands for $RMW_IMPLEMENTATION.
@@ -96,7 +96,6 @@ def loadable_environment(
         has_enclave,
     )
     from sros_tool.keystore.participant import JoinContext
-    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.selection import missing_enclave_error
     from sros_tool.names import check_enclave_name
     from sros_tool.pki.token import MODULE_VARIABLE
@@ -123,17 +122,16 @@ def loadable_environment(
     if with_zenoh and not target:
         _check_release(environment)
     check_enclave_name(name)
-    keystore = OpenedKeystore(root)
     keystore.check()
-    if not has_enclave(root, name):
+    if not has_enclave(keystore.root, name):
         raise missing_enclave_error(keystore, name, keystore.names)
     folder = keystore.folder(name)
     state = keystore.enclave(name, now=now)
     domains = state.domains() if wanted is not None else state.joined_domains()
     zenoh = _opened_zenoh(keystore, name, state, now) if with_zenoh and not state.token else None
     if zenoh and domains:
-        wanted = _zenoh_domain(root, zenoh, wanted, domains)
-    domain = _choose_domain(domains, wanted, root) if domains else 0
+        wanted = _zenoh_domain(keystore, zenoh, wanted, domains)
+    domain = _choose_domain(domains, wanted, keystore) if domains else 0
     state = keystore.enclave(name, now=now, domain=domain)
     if not with_zenoh:
         vendor = vendor_of(used) if target else shipped_vendor(used, environment)
@@ -150,16 +148,16 @@ def loadable_environment(
         if not (accept_key or target):
             _check_pin(state.token, name)
     elif not accept_key and not (target and state.key_on_robot):
-        _check_key_closed(folder / KEY_FILE, root, name)
+        _check_key_closed(folder / KEY_FILE, keystore, name)
     if not target:
         if not accept_key:
-            _check_folders_closed(root, folder, name)
+            _check_folders_closed(keystore, folder, name)
         if not zenoh:
             vendor = shipped_vendor(used, environment) or vendor_here(environment)[0]
             _check_dates_here(name, keystore, vendor, JoinContext(domain, now, zone))
-    variables = secured_environment(target or root, name, domain)
+    variables = secured_environment(target or keystore.root, name, domain)
     if zenoh:
-        place = enclave_path(target or root, name)
+        place = enclave_path(target or keystore.root, name)
         enclave_environment = _zenoh_environment(place, name, zenoh, variables, environment)
         return (
             replace(enclave_environment, notes=()) if target else enclave_environment
@@ -185,31 +183,32 @@ def loadable_environment(
     return EnclaveEnvironment(variables, notes, needs_pin=not state.token.pin_source)
 
 
-def _check_key_closed(key: Path, root: Path, name: str) -> None:
+def _check_key_closed(key: Path, keystore: OpenedKeystore, name: str) -> None:
     """Raise `KeystoreError` if users other than the owner can read the enclave's private key."""
     mode = stat.S_IMODE(key.stat().st_mode)
     if mode & 0o077:
-        another = remedy_in_keystore(root, f"`sros renew KEYSTORE {name} --new-key --revoke-old`.")
+        renew = f"`sros renew KEYSTORE {name} --new-key --revoke-old`."
         raise KeystoreError(
             f"others can read the private key of enclave {name}",
             f"The mode of '{key}' is {mode:04o}: whoever has read the key can act as the enclave.",
             f"Run `chmod 600 {quote(str(key))}`. If others had access, give the enclave another "
-            f"key. {another} To run it nevertheless, add --accept-readable-key.",
+            f"key. {remedy_in_keystore(keystore.root, renew)} To run it nevertheless, add "
+            "--accept-readable-key.",
         )
 
 
-def _check_folders_closed(root: Path, folder: Path, name: str) -> None:
+def _check_folders_closed(keystore: OpenedKeystore, folder: Path, name: str) -> None:
     """Raise `KeystoreError` if other users can write to the enclave's folders."""
-    trusted = frozenset({0, os.geteuid(), root.stat().st_uid})
+    trusted = frozenset({0, os.geteuid(), keystore.root.stat().st_uid})
     for path in (folder, *folder.parents):
         if why := other_writers(path.stat(), trusted):
             raise KeystoreError(
                 f"others can replace the files of enclave {name}",
                 f"'{path}': {why}. Whoever replaces them decides whom the process trusts.",
-                f"Run `chmod go-w {quote(str(path))}`, then `sros verify {quote(str(root))}`. To "
-                "run it nevertheless, add --accept-readable-key.",
+                f"Run `chmod go-w {quote(str(path))}`, then `sros verify "
+                f"{quote(str(keystore.root))}`. To run it nevertheless, add --accept-readable-key.",
             )
-        if path == root:
+        if path == keystore.root:
             return
 
 
@@ -411,7 +410,7 @@ def _refuse_outdated(keystore: OpenedKeystore, name: str, now: datetime) -> None
         )
 
 
-def _choose_domain(domains: DomainSet, wanted_domain: int | None, root: Path) -> int:
+def _choose_domain(domains: DomainSet, wanted_domain: int | None, keystore: OpenedKeystore) -> int:
     """Return the ROS domain for a process that uses a keystore, which is for ``domains``.
 
     Without ``wanted_domain``, from an option or ROS_DOMAIN_ID, this is 0, the default of ROS, if
@@ -427,15 +426,15 @@ def _choose_domain(domains: DomainSet, wanted_domain: int | None, root: Path) ->
     if wanted_domain in domains:
         return wanted_domain
     raise KeystoreError(
-        f"keystore '{root}' is for domain {domains}, not for {wanted_domain}",
+        f"keystore '{keystore.root}' is for domain {domains}, not for {wanted_domain}",
         "DDS would refuse the node.",
         f"Set ROS_DOMAIN_ID to {next(iter(domains))}, or "
-        f"{how_to_add_domains(root, f'{domains},{wanted_domain}')}.",
+        f"{how_to_add_domains(keystore.root, f'{domains},{wanted_domain}')}.",
     )
 
 
 def _zenoh_domain(
-    root: Path, zenoh: OpenedZenoh, wanted_domain: int | None, domains: DomainSet
+    keystore: OpenedKeystore, zenoh: OpenedZenoh, wanted_domain: int | None, domains: DomainSet
 ) -> int | None:
     """Return the ROS domain for a process, one of the domains of its Zenoh configuration.
 
@@ -453,7 +452,7 @@ def _zenoh_domain(
             f"{wanted_domain}",
             "Its rules deny everything in any other domain.",
             f"Set ROS_DOMAIN_ID to {own[0]}, or write the files for more domains. "
-            f"{remedy_in_keystore(root, '`sros zenoh KEYSTORE --domain ID`.')}",
+            f"{remedy_in_keystore(keystore.root, '`sros zenoh KEYSTORE --domain ID`.')}",
         )
     return wanted_domain
 
@@ -580,7 +579,7 @@ def target_path(text: str) -> Path:
 
 
 def container_text(
-    root: Path,
+    keystore: OpenedKeystore,
     enclave: str,
     form: str,
     *,
@@ -593,7 +592,7 @@ def container_text(
     """Return a Compose service or Kubernetes objects that run a process in an enclave.
 
     Args:
-        root: the keystore.
+        keystore: the opened keystore.
         enclave: one of its enclaves, in which a process can run.
         form: one of `sros_tool.runtime.environment.CONTAINER_FORMS`.
         target: the keystore in the container and, for Compose, on the machine that runs it.
@@ -609,7 +608,6 @@ def container_text(
     """
     from sros_tool.keystore.delivery.export import exported_files
     from sros_tool.keystore.layout import enclave_path
-    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.runtime.environment import (
         COMPOSE,
         SECRET,
@@ -621,28 +619,27 @@ def container_text(
     )
 
     if form == SECRET:
-        files = exported_files(OpenedKeystore(root), (enclave,), now)
+        files = exported_files(keystore, (enclave,), now)
         return render_secret(enclave, {PurePosixPath(path).name: files[path] for path in files})
     if form == COMPOSE:
-        _check_mounted(root, enclave, target)
+        _check_mounted(keystore, enclave, target)
     name = check_name(name, form) if name else object_name(enclave)
     folder = str(enclave_path(target, enclave))
     return render_container(Container(enclave, name, variables, folder, image), form)
 
 
-def _check_mounted(root: Path, enclave: str, target: Path) -> None:
+def _check_mounted(keystore: OpenedKeystore, enclave: str, target: Path) -> None:
     """Raise `KeystoreError` if mounting the enclave's folder would also mount other enclaves."""
     from sros_tool.keystore.layout import enclaves_below
-    from sros_tool.keystore.reader import open_keystore
 
-    export = f"`sros distribute_key {quote(str(root))} {quote(enclave)} DIR`"
-    if inner := enclaves_below(root, enclave):
+    export = f"`sros distribute_key {quote(str(keystore.root))} {quote(enclave)} DIR`"
+    if inner := enclaves_below(keystore.root, enclave):
         raise KeystoreError(
             f"the folder of enclave {enclave} also has {', '.join(inner[:3])}",
             "The container would get the private keys of all these enclaves.",
             f"Export this enclave alone, {export}, and name DIR as the keystore.",
         )
-    if open_keystore(root).is_original and target == root.absolute():
+    if keystore.is_original and target == keystore.root.absolute():
         raise KeystoreError(
             f"a container cannot use '{target}' itself",
             "Some files of an enclave are links to other files of the keystore, which the "
@@ -652,7 +649,7 @@ def _check_mounted(root: Path, enclave: str, target: Path) -> None:
 
 
 def node_units(
-    root: Path,
+    keystore: OpenedKeystore,
     names: Iterable[str],
     secure: Callable[[str], EnclaveEnvironment],
     *,
@@ -664,7 +661,7 @@ def node_units(
     """Return systemd units that run nodes in enclaves: file contents by path, and notes.
 
     Args:
-        root: the keystore.
+        keystore: the opened keystore.
         names: the enclaves.
         secure: returns the environment of an enclave for a process that runs there.
         target: the absolute path of the keystore where the units run.
@@ -687,7 +684,7 @@ def node_units(
             secured.variables,
             str(target),
             command=command,
-            below=enclaves_below(root, name),
+            below=enclaves_below(keystore.root, name),
             sros=sros,
         )
     return files, notes
@@ -796,7 +793,7 @@ def _unknown_node_error(
 
 
 def other_node_notes(
-    root: Path, enclave: str, command: Sequence[str], *, now: datetime
+    keystore: OpenedKeystore, enclave: str, command: Sequence[str], *, now: datetime
 ) -> tuple[Note, ...]:
     """Return a note if a command gives its nodes a name that the enclave's permissions lack.
 
@@ -805,7 +802,6 @@ def other_node_notes(
     If the ledger lacks the permissions, sros knows only nodes that offer their standard services:
     then it returns a note only if the permissions have the name in another namespace.
     """
-    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.rights import RecordedRights
     from sros_tool.policy.rights import nodes_from_text, nodes_of_rights
     from sros_tool.runtime.environment import started_nodes, starts_nodes
@@ -814,7 +810,6 @@ def other_node_notes(
     started = list(started_nodes(command))
     if started == [("", "")] and not starts_nodes(command):
         return ()
-    keystore = OpenedKeystore(root)
     state = keystore.enclave(enclave, now=now)
     grant = state.permissions.grant_of(state.subject) if state.permissions else None
     if grant is None or grant.default_allow:

@@ -125,6 +125,7 @@ def _secured_launch_actions(
     """
     from sros_tool.cli.common import enclave_environment
     from sros_tool.errors import SrosError
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.policy.document import read_policy
     from sros_tool.terminal import visible_line
 
@@ -136,7 +137,7 @@ def _secured_launch_actions(
                 "enclave of secured_nodes."
             )
         name = enclave or next((named.path for named in enclaves), "")
-        return enclave_environment(keystore, name) if name else None
+        return enclave_environment(OpenedKeystore(keystore), name) if name else None
     except SrosError as error:
         raise RuntimeError(visible_line(str(error))) from error
 

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.fleet.robots import Fleet
     from sros_tool.keystore.issuing.keyring import Keyring
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.parallel import Tally
     from sros_tool.policy.model import Policy
 
@@ -316,7 +317,7 @@ def check_chosen(
 
 
 def chosen_enclaves(
-    root: Path,
+    keystore: OpenedKeystore,
     names: Sequence[str],
     patterns: Sequence[str],
     robots: Sequence[str],
@@ -331,11 +332,10 @@ def chosen_enclaves(
     check_chosen(names, patterns, robots, all_enclaves=all_enclaves)
     if not (patterns or robots or all_enclaves):
         return tuple(names)  # the verb says what is wrong with a name
-    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.selection import select_enclaves
 
     return select_enclaves(
-        OpenedKeystore(root),
+        keystore,
         names,
         patterns,
         robots=robots,
@@ -659,7 +659,7 @@ def local_zone(environment: Mapping[str, str]) -> tzinfo:
 
 
 def enclave_environment(
-    root: Path,
+    keystore: OpenedKeystore,
     name: str,
     domain: str | None = None,
     rmw: str | None = None,
@@ -671,7 +671,7 @@ def enclave_environment(
     from sros_tool.enclave_environment import loadable_environment
 
     return loadable_environment(
-        root,
+        keystore,
         name,
         domain,
         rmw,

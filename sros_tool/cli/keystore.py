@@ -134,6 +134,7 @@ def create_permission(
       $ sros create_permission keystore --robot r7 robot.xml --fleet fleet.toml
     """
     from sros_tool.keystore.lifecycle.create import create_permission as create
+    from sros_tool.keystore.reader import OpenedKeystore
 
     root, rest = split_root(arguments)
     if len(rest) < (1 if all_enclaves or patterns or robots else 2):
@@ -146,7 +147,7 @@ def create_permission(
     policy = policy_for(file, fleet_file)
     result = create(
         root,
-        chosen_enclaves(root, given, patterns, robots, all_enclaves=all_enclaves),
+        chosen_enclaves(OpenedKeystore(root), given, patterns, robots, all_enclaves=all_enclaves),
         policy,
         now=now(),
         domain=ros_domain(),

@@ -105,10 +105,12 @@ def renew(
     """
     from sros_tool.keystore.expiry import parse_threshold
     from sros_tool.keystore.lifecycle.renew import renew as work
+    from sros_tool.keystore.reader import OpenedKeystore
 
     root, names = split_root(arguments)
     if names or patterns or robots or all_enclaves or all_expiring is None:
-        names = chosen_enclaves(root, names, patterns, robots, all_enclaves=all_enclaves)
+        keystore = OpenedKeystore(root)
+        names = chosen_enclaves(keystore, names, patterns, robots, all_enclaves=all_enclaves)
     threshold = parse_threshold(all_expiring) if all_expiring is not None else None
     with progress("renewing") as step:
         result = work(

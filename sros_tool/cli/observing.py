@@ -117,7 +117,10 @@ def observer_environment(
             domain_from(os.environ)
             return {}
         return {DOMAIN: str(domain_from({DOMAIN: domain}) or 0)}
-    return enclave_environment(keystore or keystore_from_environment(), enclave, domain).variables
+    from sros_tool.keystore.reader import OpenedKeystore
+
+    opened = OpenedKeystore(keystore or keystore_from_environment())
+    return enclave_environment(opened, enclave, domain).variables
 
 
 def observe(

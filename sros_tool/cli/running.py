@@ -45,6 +45,7 @@ from sros_tool.enclave_environment import (
     target_path,
 )
 from sros_tool.errors import KeystoreError, Note, UnavailableError, UsageError
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.runtime.environment import COMPOSE, CONTAINER_FORMS, KUBERNETES, SECRET
 from sros_tool.runtime.units import Job
 from sros_tool.terminal import echo, echo_document, echo_lines
@@ -221,14 +222,15 @@ def env(
     if target_dir is None and in_container:
         target_dir = INSTALLED
     target = None if target_dir is None else target_path(target_dir)
+    keystore = OpenedKeystore(root)
     secured = enclave_environment(
-        root, rest[0], domain, rmw, accept_key=accept_readable_key, target=target
+        keystore, rest[0], domain, rmw, accept_key=accept_readable_key, target=target
     )
     if target and in_container:
         if form == SECRET:
             _refuse_open_output()
         text = container_text(
-            root,
+            keystore,
             rest[0],
             form,
             target=target,
@@ -348,7 +350,8 @@ def run(
             f"Leave `--enclave {shlex.quote(other)}` out, or name the same enclave: `sros run "
             f"{shlex.quote(str(root))} {shlex.quote(other)} -- COMMAND`.",
         )
-    secured = enclave_environment(root, name, domain, rmw, accept_key=accept_readable_key)
+    keystore = OpenedKeystore(root)
+    secured = enclave_environment(keystore, name, domain, rmw, accept_key=accept_readable_key)
     program = shutil.which(command[0])
     if program is None:
         raise UsageError(
@@ -371,7 +374,7 @@ def run(
     elif secured.needs_pin and pin is not None:
         environment[_FAST_DDS_PIN] = pin
     print_notes(
-        [*secured.notes, *(() if policy else other_node_notes(root, name, words, now=now()))]
+        [*secured.notes, *(() if policy else other_node_notes(keystore, name, words, now=now()))]
     )
     names_it = enclave_argument(command) == name or _is_demo(command)
     if not names_it:
@@ -550,17 +553,18 @@ def units(
     notes: list[Note] = []
     names: Sequence[str] = ()
     if rest[1:] or several:
-        names = chosen_enclaves(root, rest[:-1], patterns, robots, all_enclaves=all_enclaves)
+        keystore = OpenedKeystore(root)
+        names = chosen_enclaves(keystore, rest[:-1], patterns, robots, all_enclaves=all_enclaves)
         place = target or Path(INSTALLED)
 
         def secure(name: str) -> EnclaveEnvironment:
             return enclave_environment(
-                root, name, domain, rmw, accept_key=accept_readable_key, target=place
+                keystore, name, domain, rmw, accept_key=accept_readable_key, target=place
             )
 
         with progress("checking"):
             files, notes = node_units(
-                root,
+                keystore,
                 names,
                 secure,
                 target=place,

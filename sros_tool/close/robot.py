@@ -21,6 +21,7 @@ from sros_tool.keystore.layout import (
     CLOSED_PROCESSES,
     list_enclaves,
 )
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.policy.document import read_policy
 from sros_tool.runtime.variables import domain_of
@@ -172,7 +173,7 @@ class LocalRobot:
         """Return the environment of an enclave of the export."""
         shell, domain = self.shell, str(self.domain)
         return loadable_environment(
-            self.export,
+            OpenedKeystore(self.export),
             enclave,
             domain,
             rmw or None,

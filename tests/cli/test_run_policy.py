@@ -11,6 +11,7 @@ import pytest
 
 from sros_tool.cli.common import now
 from sros_tool.enclave_environment import other_node_notes
+from sros_tool.keystore.reader import OpenedKeystore
 from tests.support.harness import Ended, forked, sros
 
 SHOW = "import json, os, sys; print(json.dumps([dict(os.environ), sys.argv]))"
@@ -146,7 +147,8 @@ def test_a_node_that_the_permissions_lack_is_named_before_it_starts(
         (export, "", ""),
     ):
         words = ("true", "--ros-args", *ros_args.split())
-        said = [note.text for note in other_node_notes(root, "/line/talker", words, now=now())]
+        notes = other_node_notes(OpenedKeystore(root), "/line/talker", words, now=now())
+        said = [note.text for note in notes]
         start = "the command names" if missed == "no namespace" else "the command starts"
         assert [text.startswith(f"{start} {missed}, ") for text in said] == [True] * bool(missed)
 
