@@ -1175,7 +1175,8 @@ def join_policies(policies: Sequence[Policy]) -> Policy:
     enclaves: dict[str, Enclave] = {}
     for enclave in (enclave for policy in policies for enclave in policy.enclaves):
         earlier = enclaves.setdefault(enclave.path, enclave)
-        if earlier.source != enclave.source:
+        # Two enclaves can be in one line, and libxml2 counts only 65,535 lines.
+        if earlier.source != enclave.source or earlier != enclave:
             raise PolicyError(
                 f"{enclave.source}: enclave {enclave.path} is in another policy, too",
                 f"The other one is at {earlier.source}.",

@@ -7,6 +7,7 @@ commit are neither followed nor created, except links inside a keystore that sta
 
 from __future__ import annotations
 
+import codecs
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -354,6 +355,36 @@ def _make_folders(folder: Folder, path: str) -> None:
     for folder_path in reversed((PurePosixPath(path), *PurePosixPath(path).parents[:-1])):
         if str(folder_path) != "." and not folder.is_folder(str(folder_path)):
             folder.mkdir(str(folder_path), 0o700)
+
+
+# ── attributes of git ──────────────────────────────────────────────────────────────────────
+
+ATTRIBUTES_FILE = ".gitattributes"
+_CONVERTING = ("working-tree-encoding", "ident", "export-subst")
+"""Attributes by which git puts other content than that of the commit into a checkout or archive."""
+
+
+def converting_attribute(content: bytes, path: str) -> str:
+    """Return an attribute in a file of git attributes that may convert a file, or "".
+
+    ``path`` is relative to the folder of the attributes.  Characters that gitattributes(5) reads in
+    a special way stand for any text here, and later lines that unset an attribute do not count.
+    """
+    for line in content.removeprefix(codecs.BOM_UTF8).split(b"\n"):
+        pattern, *attributes = map(os.fsdecode, line.split() or [b""])
+        named = {attribute.partition("=")[0] for attribute in attributes}
+        converting = next((attribute for attribute in _CONVERTING if attribute in named), "")
+        if converting and _may_match(pattern, path):
+            return converting
+    return ""
+
+
+def _may_match(pattern: str, path: str) -> bool:
+    if pattern.startswith(("#", '"')):
+        return pattern.startswith('"')  # can have spaces and any escape
+    parts = re.split(r"[*?]+|[\[\\].*", pattern.removeprefix("/"))
+    wanted = path if "/" in pattern else PurePosixPath(path).name
+    return bool(re.fullmatch(".*".join(map(re.escape, parts)), wanted, re.IGNORECASE | re.DOTALL))
 
 
 # ── policies, and their parts ──────────────────────────────────────────────────────────────

@@ -45,7 +45,9 @@ from sros_tool.policy.rights import (
     policy_rights,
 )
 from sros_tool.proof.commit_files import (
+    ATTRIBUTES_FILE,
     CommitFiles,
+    converting_attribute,
     includes_files,
     is_whole_policy,
     may_be_policy,
@@ -366,6 +368,7 @@ class _Review:
             )
         for path, keystore in keystores.items():
             yield from self._keystore(path, keystore)
+        yield from self._step_result("files", "", self._converted_step)
         if self.base:
             yield from self._step_result(
                 "files", "", partial(self._unreviewed_step, of_head, head_fleet)
@@ -501,6 +504,23 @@ class _Review:
                 if before.get(where) != (value := after.get(where)):
                     text = "is gone, which" if value is None else f"is {value}, which"
                     lines.append((f"{text} can change which keys Ansible delivers, and how", where))
+        return (_FOUND, Facts(tuple(lines))) if lines else None
+
+    def _converted_step(self) -> tuple[int, Content] | None:
+        """Return the step on reviewed files of which git may put another content into checkouts."""
+        lines = []
+        for folder in sorted({parent for path in self.head.files for parent in Path(path).parents}):
+            path = str(folder / ATTRIBUTES_FILE)
+            entry = self.head.entry(path)
+            if entry is None or entry.mode not in FILES:
+                continue
+            content = self.request.repository.content(entry.id)
+            for file in sorted(self.head.files):
+                if Path(file).is_relative_to(folder) and (
+                    attribute := converting_attribute(content, str(Path(file).relative_to(folder)))
+                ):
+                    text = f"can be another file in a checkout or archive, by {attribute} in {path}"
+                    lines.append((text, file))
         return (_FOUND, Facts(tuple(lines))) if lines else None
 
     def _unreviewed_step(

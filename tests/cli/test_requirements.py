@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -10,7 +11,14 @@ import pytest
 
 from sros_tool.files import templates_dir
 from sros_tool.proof import findings
-from tests.support.harness import copy_of, policy_text, publish, sros, subscribe
+from tests.support.harness import (
+    copy_of,
+    policy_text,
+    publish,
+    sros,
+    subscribe,
+    with_includes,
+)
 
 LISTEN = '<topics subscribe="ALLOW"><topic>{}</topic></topics>'
 WILD = publish("/cmd_*")
@@ -235,6 +243,21 @@ def test_several_policies_of_a_robot_count_as_one(folder: Path, tmp_path: Path) 
     shutil.copy(base, more)
     twice = sros("check", base, more, *words, cwd=tmp_path)
     assert (twice.status, "is in another policy, too" in twice.err) == (2, True)
+    # Two enclaves of one name can be in one line of a file that both policies include.
+    parts = [policy_text({"/mux": publish(name)}) for name in ("/safe", "/cmd_vel")]
+    enclaves = (re.sub(r"(?s).*(<enclave .*</enclave>).*", r"\1", part) for part in parts)
+    (base.parent / "part.xml").write_text("<x><a>{}</a><b>{}</b></x>".format(*enclaves))
+    for part, file in (("a", base), ("b", more)):
+        include = f'<xi:include href="part.xml" xpointer="xpointer(/x/{part}/enclave)"/>'
+        text = policy_text({f"/{part}": publish("/s")}).replace(
+            "<enclaves>", f"<enclaves>{include}"
+        )
+        file.write_text(with_includes(text))
+    for both in (words, ("--requirements", "required.toml", "--json")):
+        hidden = sros("check", "p", *both, cwd=tmp_path)
+        assert (hidden.status, "enclave /mux is in another policy" in hidden.err) == (2, True), (
+            hidden
+        )
 
 
 def test_more_wildcards_than_can_be_decided_are_one_error(

@@ -499,6 +499,38 @@ def _tree(change: Change, *entries: tuple[str, str, str]) -> str:
     return made.stdout.decode().strip()
 
 
+SAFE_ATTRIBUTES = b"""# *.xml ident
+* text=auto eol=crlf -ident
+.git_archival.txt export-subst
+/robot.xml/below ident
+sub/robot.xml ident
+*.ps1 working-tree-encoding=UTF-16LE
+*.bin filter=lfs diff=lfs merge=lfs -text
+"""
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"*.xml working-tree-encoding=ASCII//TRANSLIT",
+        b"\xef\xbb\xbfrobot.xml\tident",
+        b"/r*.XML text=\x85 export-subst",
+        b"rob[o]t.xml ident",
+        b"ro\\bot.xml ident",
+        b'"robot.xml" ident',
+        b"[attr]odd ident\n*.xml odd",
+    ],
+)
+def test_a_checkout_that_is_another_file_is_said(change: Change, line: bytes) -> None:
+    """Fullwidth characters in a comment become elements, or a DENY becomes an `$Id$` of git."""
+    change.commit({".gitattributes": SAFE_ATTRIBUTES})
+    assert change.review("--policy", "robot.xml", "--requirements", "robot.toml").status == 0
+    change.commit({".gitattributes": line + b"\n" + SAFE_ATTRIBUTES})
+    ended = change.review("--policy", "robot.xml", "--requirements", "robot.toml")
+    assert ended.status == 1
+    assert "can be another file in a checkout or archive, by " in ended.out
+
+
 def test_no_policy_hides_behind_an_odd_mode(change: Change) -> None:
     """Git checks these entries out as files, folders and links, and servers accept them."""
     evil = change.git("rev-parse", "HEAD:robot.xml")
