@@ -577,6 +577,7 @@ class _Round:
         confirmation = replace(
             confirmation,
             restart=restart,
+            boot=_boot_digest(self._settings.robot, self._machine.boot()),
             crl_restart=None if crl_restart == restart else crl_restart,
             sequence=sequence,
             release=self._state.release,
@@ -723,6 +724,11 @@ class _Round:
                     certificates_by_expiry.append((until, files))
         certificates_by_expiry.sort(key=lambda pair: pair[0], reverse=True)
         return [files for _, files in certificates_by_expiry[:_MOST_CERTIFICATES]]
+
+
+def _boot_digest(robot: str, boot: str) -> str | None:
+    """Return a SHA-256 for the start of the machine, from which it cannot be told; None without."""
+    return hashlib.sha256(f"{robot} {boot}".encode()).hexdigest() if boot else None
 
 
 def _sha256(folder: Folder, path: str) -> str:

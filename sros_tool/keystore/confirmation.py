@@ -66,6 +66,7 @@ _CERTIFICATE_FILES = (CERTIFICATE_FILE, IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
 
 _KEYS = {"format", "robot", "time", "files"}
 _OF_AGENT = (
+    "boot",
     "crl_restart",
     "sequence",
     "release",
@@ -79,6 +80,7 @@ _OF_AGENT = (
 """Keys that only `sros agent` writes."""
 _OPTIONAL_KEYS = {"certificates", "restart", "dds", *_OF_AGENT}
 _CLOCK_TOLERANCE = timedelta(minutes=1)
+_MOST_BOOTS = 8
 _MOST_CERTIFICATES = 32  # in a file
 _MOST_LIBRARIES, _MOST_UNSEEN = 100, 1_000_000
 _MOST_NUMBER = 2**53 - 1  # what every reader of JSON takes exactly
@@ -178,7 +180,8 @@ class Confirmation:
     that is installed; 0 for none.  ``expiry`` and ``running`` map enclaves to when their files
     expire, and to what their processes have loaded.  ``crl_restart`` are the enclaves of
     ``restart`` whose processes may not have loaded the revocation list, if not all of them: the
-    others lack only their own new documents.  ``problems`` are short sentences, and
+    others lack only their own new documents.  ``boot`` is a SHA-256 that is another one after each
+    start of the computer.  ``problems`` are short sentences, and
     ``requests`` signing requests (PEM) for certificates that expire.  ``crl`` is the newest
     revocation list (PEM) on the robot, if it may differ from the list that was published last: a
     keystore that was restored from a backup learns from it what it has revoked since.
@@ -199,6 +202,7 @@ class Confirmation:
     requests: tuple[str, ...] | None = None
     crl: str | None = None
     crl_restart: tuple[str, ...] | None = None
+    boot: str | None = None
 
     def enclaves(self) -> tuple[str, ...]:
         """Return the names of the enclaves in the confirmation, sorted."""
@@ -388,6 +392,20 @@ class LastMessage(NamedTuple):
     """SHA-256 of the message."""
     enclave: str
     """The enclave whose key signed it."""
+    boots: tuple[str, ...] = ()
+    """The starts of the computer that messages were from, the last one first."""
+    alternated: datetime | None = None
+    """When a message was last from an earlier start than the message before it."""
+
+    def successor(self, boot: str | None, now: datetime) -> tuple[tuple[str, ...], datetime | None]:
+        """Return the values of ``boots`` and ``alternated`` for a message from the start ``boot``.
+
+        No start of a computer comes back after another one: then there are two computers.
+        """
+        if boot is None or boot in self.boots[:1]:
+            return self.boots, self.alternated
+        boots = (boot, *(other for other in self.boots if other != boot))[:_MOST_BOOTS]
+        return boots, now if boot in self.boots else self.alternated
 
 
 @dataclass(frozen=True, slots=True)
@@ -401,6 +419,16 @@ class Received:
     confirmation: Confirmation
     time: datetime
     message: LastMessage | None = None
+
+    def two_computers(self) -> str:
+        """Return a sentence if messages came from two computers within the last day, or ""."""
+        seen = self.message.alternated if self.message else None
+        if seen is None or self.time - seen > timedelta(days=1):
+            return ""
+        return (
+            f"Its messages come in turn from two computers that have its keys, such as by a copied "
+            f"disk, last at {iso(seen)}: what the other one has is not known."
+        )
 
     def clock_note(self) -> str:
         """Return a clause on how far the robot's clock is off; "" for at most a minute."""
@@ -600,7 +628,8 @@ def _message_from(value: Any, label: str) -> LastMessage:
     Raises:
         DocumentError: the value has another form.
     """
-    if not isinstance(value, dict) or value.keys() != set(LastMessage._fields):
+    later = {"boots", "alternated"}  # than release 0.3.0 of sros
+    if not isinstance(value, dict) or value.keys() | later != set(LastMessage._fields):
         raise _invalid_confirmation_error(
             label, 'the keys of its message are not "sequence", "sha256" and "enclave"'
         )
@@ -609,7 +638,16 @@ def _message_from(value: Any, label: str) -> LastMessage:
             label, "the digest of its message is not a SHA-256 digest"
         )
     sequence = _sequence_from(value["sequence"], label)
-    return LastMessage(sequence, value["sha256"], _enclave_from(value["enclave"], label))
+    boots, alternated = value.get("boots", []), value.get("alternated")
+    if not isinstance(boots, list) or not all(map(_is_digest, boots)):
+        raise _invalid_confirmation_error(label, "the boots of its message are not SHA-256 digests")
+    return LastMessage(
+        sequence,
+        value["sha256"],
+        _enclave_from(value["enclave"], label),
+        tuple(boots),
+        None if alternated is None else _moment(alternated, label),
+    )
 
 
 def _confirmation_from(value: Any, label: str) -> Confirmation:
@@ -766,6 +804,12 @@ def _crl_from(value: Any, label: str) -> str:
     return value
 
 
+def _boot_from(value: Any, label: str) -> str:
+    if not _is_digest(value):
+        raise _invalid_confirmation_error(label, "its boot is not a SHA-256 digest")
+    return str(value)
+
+
 _AGENT_READERS: Mapping[str, Callable[[Any, str], Any]] = {
     "sequence": _sequence_from,
     "release": _release_from,
@@ -776,6 +820,7 @@ _AGENT_READERS: Mapping[str, Callable[[Any, str], Any]] = {
     "requests": _requests_from,
     "crl": _crl_from,
     "crl_restart": _restart_from,
+    "boot": _boot_from,
 }
 
 

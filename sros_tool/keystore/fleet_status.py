@@ -1056,8 +1056,12 @@ def _status(
             "keystore: its files are newer then, and the next release replaces them"
         )
         compared_robot = compared_robot._replace(notes=(*compared_robot.notes, text))
+    problems = confirmed.problems if confirmed else None
+    if text := received.two_computers() if received and compared_robot.enclaves else "":
+        problems = (*(problems or ()), text)
     has_list = (
         known.has_list
+        and not text
         and bool(compared_robot.enclaves)
         and received is not None
         and state not in (State.REFUSED, State.LATER)
@@ -1086,7 +1090,7 @@ def _status(
         else None,
         {kind: file.window.not_after for kind, file in validity.items()},
         confirmed.dds if confirmed else None,
-        confirmed.problems if confirmed else None,
+        problems,
         compared_robot.notes,
         has_release=bool(different) and known.has_release(compared_robot),
         short_lived=known.short_lived(validity),

@@ -202,7 +202,9 @@ def test_rounds_follow_what_home_publishes(home: Home, r1: Robot) -> None:
     assert second.release == 3 and first.sequence and second.sequence
     assert second.sequence > first.sequence
     assert second.files["enclaves/r1/a/crl.pem"]
+    r1.boot = "second"
     r1.round()
+    assert first.boot == second.boot != r1.message().boot
     assert r1.asked == [0, 1, 3]
     sros("agent", "status", r1.folder).ok()
     end = validity_of(read_certificate(r1.folder / "enclaves/r1/a/cert.pem")).not_after

@@ -39,6 +39,7 @@ from sros_tool.keystore.delivery.collect import (
 )
 from sros_tool.keystore.delivery.published import read_published
 from sros_tool.keystore.fleet import recorded_fleet
+from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import PUBLISHED, key_on_robot
 from sros_tool.keystore.reader import OpenedKeystore, read_certificate
@@ -284,6 +285,25 @@ def test_two_computers_with_the_keys_of_a_robot_are_noted(home: Home) -> None:
         home.send("r1", release=release)
         remarks = "".join(home.of("r1").remarks)
         assert ("two computers have its keys" in remarks) == is_noted
+
+
+def test_two_computers_that_are_alike_are_seen_by_their_starts(home: Home) -> None:
+    """As by a copied disk: no start of a computer comes back after another one."""
+    first, second, other = ("1" * 64, "2" * 64, "3" * 64)
+    for boot, is_seen in (
+        *((first, False), (first, False), (None, False), (second, False), (second, False)),
+        *((first, True), (other, True), (second, True)),
+    ):
+        home.send("r1", boot=boot)
+        assert home.of("r1").outcome == "kept"
+        (r1,) = fleet_status(OpenedKeystore(home.root), ["r1"]).robots
+        assert any("two computers" in text for text in r1.problems or ()) == is_seen, boot
+        assert not (is_seen and r1.settled)
+    later = NOW + timedelta(days=2)
+    home.send("r1", later, boot=second)
+    home.collect(later)
+    (r1,) = fleet_status(OpenedKeystore(home.root), ["r1"]).robots
+    assert not r1.problems, "only the last day counts"
 
 
 def test_a_message_that_was_replayed(home: Home) -> None:

@@ -101,6 +101,7 @@ VALID: dict[str, Any] = {
     "certificates": {PATH: [DIGEST]},
     "restart": ["/r7"],
     "crl_restart": [],
+    "boot": DIGEST,
     "dds": DDS,
     "sequence": 7,
     "release": 0,
@@ -111,6 +112,7 @@ VALID: dict[str, Any] = {
     "requests": ["-----BEGIN CERTIFICATE REQUEST-----\nMA==\n-----END CERTIFICATE REQUEST-----\n"],
 }
 OF_AGENT = (
+    "boot",
     "crl_restart",
     "sequence",
     "release",
@@ -178,6 +180,7 @@ def hostile() -> list[tuple[str, bytes]]:
                 for wrong in wrongs
             ),
         ),
+        "boot": ("", DIGEST[1:], DIGEST.upper(), f"{DIGEST}\n", CONTROLS, None, 1, []),
         "sequence": (0, -1, True, 1.0, "1", 2**53, 10**400, None, []),
         "release": (-1, True, 1.0, "1", 2**53, None, []),
         "expiry": (
@@ -222,7 +225,7 @@ def test_a_hostile_confirmation_is_refused_in_one_paragraph() -> None:
         "as earlier versions write it"
     )
     assert not any(getattr(without, key) for key in OF_AGENT)
-    for later in ({"dds", *OF_AGENT}, {"crl_restart"}):  # than 0.2.0, than 0.3.0
+    for later in ({"dds", *OF_AGENT}, {"boot", "crl_restart"}):  # than 0.2.0, than 0.3.0
         earlier = {key: value for key, value in VALID.items() if key not in later}
         assert json.loads(render_confirmation(parse_confirmation(_json(earlier), "it"))) == earlier
     with pytest.raises(DocumentError, match="later release of sros, update sros here first"):

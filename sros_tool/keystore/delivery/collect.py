@@ -480,10 +480,13 @@ class _Verifier:
                 "of the last message: this is an old message, or the disk of the robot was "
                 f"restored (then add --restored {robot.name})"
             )
+        arrived = self._arrival(file, last)
+        message = LastMessage(sequence, sha256, verified.enclave)
+        boots, alternated = (before or message).successor(verified.confirmation.boot, arrived)
         received = Received(
             replace(verified.confirmation, requests=None, crl=None),
-            self._arrival(file, last),
-            LastMessage(sequence, sha256, verified.enclave),
+            arrived,
+            message._replace(boots=boots, alternated=alternated),
         )
         if note := received.clock_note():
             remarks.append(note)
