@@ -220,9 +220,13 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
     if not_here := closed.observed.not_here:
         bring = f"sros distribute_key {shlex.quote(str(robot.keystore))} ENCLAVE FOLDER"
         echo(f"not on this machine: {', '.join(not_here)} (to bring one there: {bring})")
-    seen = {process.enclave for process in robot.observed.processes} if robot.observed else set()
-    if left_out := sorted(seen.difference(enclave.path for enclave in policy.enclaves)):
-        echo(f"seen when sros watched, and not in the policy: {', '.join(left_out)}")
+    observed_enclaves = (
+        {process.enclave for process in robot.observed.processes} if robot.observed else set()
+    )
+    if not_in_policy := sorted(
+        observed_enclaves.difference(enclave.path for enclave in policy.enclaves)
+    ):
+        echo(f"seen when sros watched, and not in the policy: {', '.join(not_in_policy)}")
     for right in closed.newly_denied[:_MOST_DENIED]:
         echo(f"used when sros watched, and denied now: {right}")
     if more := closed.newly_denied[_MOST_DENIED:]:
@@ -250,7 +254,7 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
     folder, observed = shlex.quote(str(robot.folder)), closed.observed
     ask = f"sros close {folder} --proof"
     idle = closed.stopped if closed.secured else {*observed.ended}
-    if stopped := sorted(idle.intersection(closed.left)):
+    if stopped := sorted(idle.intersection(closed.pending)):
         ask += "; what does not always run: " + " ".join(f"--without {name}" for name in stopped)
     for proof in closed.proofs:
         echo(f"{_ANSWERS[proof.holds]}: {proof.claim}: {proof.reason}")
@@ -272,7 +276,7 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
         next_command = f"ask again with sros close {folder} --proof, or go back with --undo"
         echo(f"the robot is not proved closed; next: {accept}{next_command}", err=True)
     elif apply:
-        for command, processes in closed.left_by_hand.items():
+        for command, processes in closed.pending_by_hand.items():
             stop = _started_together(processes)
             echo(f"stop {stop}, and start it with:" if stop else "start again with:")
             echo(f"  {command}")
@@ -280,11 +284,11 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
     else:
         steps = f"stop the robot, start each process by the commands in {robot.commands_file}"
         if closed.secured:
-            stop = "" if closed.stopped.issuperset(closed.left) else "stop them, "
+            stop = "" if closed.stopped.issuperset(closed.pending) else "stop them, "
             steps = f"{stop}start them by the first commands in {robot.commands_file}"
-        if not closed.left:
+        if not closed.pending:
             following = ask
-        elif any(name in observed.units for name in closed.left):
+        elif any(name in observed.units for name in closed.pending):
             following = f"sros close {folder} --apply"
         else:
             following = f"{steps}, and ask {ask}"
@@ -314,14 +318,14 @@ def _state(closed: CloseState, *, apply: bool) -> str:
     """Return how far the processes run closed."""
     if not closed.secured:
         not_closed = "nothing was closed" if apply else "nothing is closed yet"
-        return "no process of the robot runs" if closed.stopped >= {*closed.left} else not_closed
+        return "no process of the robot runs" if closed.stopped >= {*closed.pending} else not_closed
     words = {
         name: _EARLIER
         if name in closed.secured
         else "not running"
         if name in closed.stopped
         else "open"
-        for name in closed.left
+        for name in closed.pending
     }
     but = ", ".join(f"{name} ({word})" for name, word in words.items())
     return f"the processes run in their enclaves{', except for ' if but else ''}{but}"

@@ -33,7 +33,7 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
     open_units = {unit for enclave, unit in observed.units.items() if not secured.get(enclave)}
     restart_units(robot, observed, open_units, dry_run=dry_run)
     done = [FileChange(action, str(SYSTEMD / path)) for path, action in changes.items()]
-    by_hand = dry_run or prepared.left_by_hand
+    by_hand = dry_run or prepared.pending_by_hand
     proofs = () if by_hand else proofs_of(robot, prepared, _RESTART_SECONDS)
     total = [*prepared.changes, *done]
     if not proofs:

@@ -26,17 +26,17 @@ def lost_endpoints(
 
 def left_alone(
     before: Observation,
-    everybody: Observation,
+    expected: Observation,
     moved: Collection[tuple[Endpoint, Endpoint]],
     denied: Iterable[DeniedRight],
 ) -> list[str]:
     """Return, as text, what nodes use by a name whose whole other side ``moved`` to another one.
 
-    ``before`` are the nodes to compare, of ``everybody``, with the names that count now; what is
+    ``before`` are the nodes to compare, of ``expected``, with the names that count now; what is
     ``denied`` is left out.
     """
     refused = _denied_endpoints(denied)
-    robot_nodes = [node for node in everybody.nodes if not is_tool(node)]
+    robot_nodes = [node for node in expected.nodes if not is_tool(node)]
     kept = {endpoint for _, endpoint in {*_endpoints_of(robot_nodes)} - refused}
     used = {*_endpoints_of(node for node in before.nodes if not is_tool(node))} - refused
     other = {PUBLISH: SUBSCRIBE, SUBSCRIBE: PUBLISH}

@@ -35,14 +35,14 @@ def proof_of_processes(running: RunningRobot, number: int) -> Proof:
         if finding.severity > NOTE
     ]
     closed = {tuple(process.command): process.enclave for process in robot.processes.processes}
-    left_over = {
+    other_remedies = {
         process.label: f"Stop it: another process runs in {closed[process.program[1]]}."
         for process in near
         if not process.asks_for_security
         and closed.get(process.program[1]) in running.current_enclaves
     }
     for finding in findings:
-        remedy = left_over.get(finding.subject, finding.remedy)
+        remedy = other_remedies.get(finding.subject, finding.remedy)
         robot.shell.say(f"{finding.subject}: {finding.text}. {remedy}")
     wrong = [finding for finding in findings if finding.id != PROCESS_NOT_SEEN.id]
     if findings:
@@ -60,8 +60,8 @@ def proof_of_processes(running: RunningRobot, number: int) -> Proof:
         for process in others
         if not (process.enclave or process.network or process.is_daemon)
     ]
-    said = f"{counted(number, 'enclave')}, and no open process in domain {robot.domain}"
-    return Proof(CLAIM, True, f"{said}{''.join(guests)}")
+    summary = f"{counted(number, 'enclave')}, and no open process in domain {robot.domain}"
+    return Proof(CLAIM, True, f"{summary}{''.join(guests)}")
 
 
 def why_missing(running: RunningRobot, missing: Sequence[str], observed: ObservedProcesses) -> str:

@@ -70,9 +70,9 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     before = make_observation(node for node in compared if node.enclaves[0] not in away)
     proof = proof_of_processes(running, len(expected) - len(missing))
     absence = "not seen" if running.processes.unseen or running.processes.hidden else "not running"
-    for what, names in ((absence, missing), ("of other machines", sorted(not_here))):
+    for label, names in ((absence, missing), ("of other machines", sorted(not_here))):
         if names:
-            proof = proof._replace(reason=f"{proof.reason}; {what}: {', '.join(names)}")
+            proof = proof._replace(reason=f"{proof.reason}; {label}: {', '.join(names)}")
     talk = proof_of_talk(running, nodes, before, away)
     talk = talk._replace(reason=f"{talk.reason}{renamed_text(nodes, fails=talk.fails)}")
     if talk.fails and (present := sorted(not_here.difference(away))):

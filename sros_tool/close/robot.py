@@ -101,7 +101,7 @@ class LocalRobot:
         self.commands_file = self.start / "commands.txt"
         self.observation_file = folder / "observed.json"
         self.processes_file = folder / CLOSED_PROCESSES
-        self.seen_policy = folder / "seen.xml"
+        self.observed_policy = folder / "seen.xml"
         self._check_writers()
         is_watched = self.processes_file.exists()
         self.observed = read_processes(self.processes_file) if is_watched else None

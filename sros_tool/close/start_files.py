@@ -83,7 +83,7 @@ def write_start_files(robot: LocalRobot, state: CloseState) -> list[FileChange]:
 
 def _command_lines(robot: LocalRobot, state: CloseState) -> list[str]:
     """Return the commands that start processes by hand: first those that are due now."""
-    folder, due = robot.folder.absolute(), state.left_by_hand
+    folder, due = robot.folder.absolute(), state.pending_by_hand
     commands = state.observed.commands_by_hand(folder)
     rest = {command: commands[command] for command in commands if command not in due}
     place = "by its command, in the place that starts it today."

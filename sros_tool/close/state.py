@@ -44,7 +44,7 @@ class Proof(NamedTuple):
         return self.holds is False
 
     @property
-    def may_be_left_out(self) -> bool:
+    def is_accepted_by_partial(self) -> bool:
         """Whether ``--partial`` accepts the claim: not without an observer that hears the robot."""
         return self.holds is None and self.claim not in (TALK, SILENCE)
 
@@ -80,7 +80,9 @@ class CloseState(NamedTuple):
 
     def is_proved(self, *, partial: bool) -> bool:
         """Return whether the proof holds; ``partial`` accepts what could not be examined."""
-        claims = [proof.holds or (partial and proof.may_be_left_out) for proof in self.proofs]
+        claims = [
+            proof.holds or (partial and proof.is_accepted_by_partial) for proof in self.proofs
+        ]
         return bool(claims) and all(claims)
 
     @property
@@ -89,7 +91,7 @@ class CloseState(NamedTuple):
         return all(step.state != "open" for step in self.steps)
 
     @property
-    def left(self) -> Sequence[str]:
+    def pending(self) -> Sequence[str]:
         """The enclaves that should have a process with the current files, and have none."""
         names = {process.enclave for process in self.observed.processes} | {*self.new}
         names = names.difference(self.without) | self.secured.keys()
@@ -102,13 +104,13 @@ class CloseState(NamedTuple):
         return {*self.new, *stopped} - self.secured.keys()
 
     @property
-    def left_by_hand(self) -> Mapping[str, Sequence[ClosedProcess]]:
-        """The commands to run by hand for the enclaves in ``left``, with their processes."""
+    def pending_by_hand(self) -> Mapping[str, Sequence[ClosedProcess]]:
+        """The commands to run by hand for the enclaves in ``pending``, with their processes."""
         by_hand = self.observed.commands_by_hand(self.folder.absolute())
         return {
             command: processes
             for command, processes in by_hand.items()
-            if any(process.enclave in self.left for process in processes)
+            if any(process.enclave in self.pending for process in processes)
         }
 
 

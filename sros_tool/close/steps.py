@@ -42,7 +42,7 @@ def steps(robot: LocalRobot, duration: str | None) -> Iterator[CommandStep]:
     learn += ["--watch", duration] if duration else []
     learn += ["--dry-run"] if robot.policy.exists() else []  # it may have been edited
     only_errors = ("--fail-on", "error")
-    both, created = ("-p", policy, str(robot.observer)), ("--template", TEMPLATE)
+    policies, created = ("-p", policy, str(robot.observer)), ("--template", TEMPLATE)
     on_zenoh = robot.shell.environment.get(RMW) == RMW_ZENOH
     watched = robot.policy.exists() and not duration
     yield CommandStep(
@@ -53,7 +53,7 @@ def steps(robot: LocalRobot, duration: str | None) -> Iterator[CommandStep]:
         ("check", policy, "--requirements", needed, *created, *only_errors), guards=True
     )
     yield CommandStep(("create_keystore", keystore, *created, *domain), robot.keystore)
-    yield CommandStep(("generate_artifacts", "-k", keystore, *both), signs=True)
+    yield CommandStep(("generate_artifacts", "-k", keystore, *policies), signs=True)
     if on_zenoh:
         yield CommandStep(("zenoh", keystore))
     exported = *enclaves_to_export(robot), str(robot.export)

@@ -64,8 +64,8 @@ def proof_of_talk(
             number = counted(len(before.nodes), "node")
             but = f", but for {counted(len(denied), 'right')} that the policy denies now: "
             but += ", ".join(f"{right.right.enclave} {right.right.describe()}" for right in denied)
-            seen = f"{number} with {before.endpoint_count} endpoints as before"
-            left = f", without {', '.join(missing)}" if missing else ""
+            compared = f"{number} with {before.endpoint_count} endpoints as before"
+            without = f", without {', '.join(missing)}" if missing else ""
             _, others = nodes.divide_by_profile(now.nodes)
             known = {*map(node_name, before.nodes)}
             new = sorted(
@@ -74,7 +74,7 @@ def proof_of_talk(
                 if node_name(node) not in known and not is_tool(node)
             )
             more = f"; new, without a profile: {first_few(new, MOST_NAMES)}" if new else ""
-            return Proof(TALK, True, f"{seen}{left}{but if denied else ''}{more}")
+            return Proof(TALK, True, f"{compared}{without}{but if denied else ''}{more}")
     return Proof(TALK, False, reason)
 
 

@@ -28,8 +28,8 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
         robot.shell.say(f"{'would remove' if dry_run else 'removed'} {path}")
         if not dry_run:
             remove_file(path)
-    units_of_drop_ins = {path.parent.name.removesuffix(".d") for path in drop_ins}
-    restart_units(robot, observed, {*observed.units.values()} | units_of_drop_ins, dry_run=dry_run)
+    drop_in_units = {path.parent.name.removesuffix(".d") for path in drop_ins}
+    restart_units(robot, observed, {*observed.units.values()} | drop_in_units, dry_run=dry_run)
     changes = [FileChange("remove", str(path)) for path in drop_ins]
     state = current_state(robot)._replace(dry_run=dry_run, changes=changes)
     return state._replace(problems=[*_texts_to_open(robot, observed)])
@@ -60,11 +60,11 @@ def _texts_to_open(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[s
         observed = observed.within(read_policy(robot.policy))
     by_hand = [*chain.from_iterable(observed.commands_by_hand(robot.folder).values())]
     closed = [process for process in by_hand if process.enclave in secured]
-    processes_of = Counter(process.enclave for process in closed)
+    process_counts = Counter(process.enclave for process in closed)
     commands = []
     for process in closed:
         now = secured[process.enclave]
-        is_alone = processes_of[process.enclave] == 1 and not process.launch
+        is_alone = process_counts[process.enclave] == 1 and not process.launch
         if is_alone and not process.container and running.may_use_files(now):
             commands.append(secured_process(now, process.enclave).open_command(robot.domain))
         else:

@@ -40,7 +40,7 @@ _LOOK_SECONDS = 1.0
 """How often processes are looked at while the robot is watched; shorter ones can be missed."""
 _MOST_COMMANDS = 10_000
 """Number of commands of processes that are kept; of others, the start command is not known."""
-_OF_EVERY_SHELL = ("_", "SHLVL", "PWD", "OLDPWD", "COLUMNS", "LINES", DOMAIN)
+_SHELL_VARIABLES = ("_", "SHLVL", "PWD", "OLDPWD", "COLUMNS", "LINES", DOMAIN)
 """Variables that differ between shells, or that the commands set."""
 
 _StartedProcesses = dict[tuple[str, ...], tuple[Process, ProcessOrigin]]
@@ -134,11 +134,11 @@ def _remember(robot: LocalRobot, document: str, started: _StartedProcesses) -> s
     running = RunningRobot(robot)
     learned = json.loads(document)
     observed = _observed_processes(robot, nodes, learned["ended"], running, started)
-    seen_here = {process.enclave for process in observed.processes}
-    not_here = (robot.not_here - seen_here).union(robot.named_elsewhere)
+    enclaves_here = {process.enclave for process in observed.processes}
+    not_here = (robot.not_here - enclaves_here).union(robot.named_elsewhere)
     robot.check_elsewhere()
     # What does not run now is still started by its command.
-    absent = robot.policy_enclaves() - seen_here - not_here
+    absent = robot.policy_enclaves() - enclaves_here - not_here
     kept = [process for process in robot.processes.processes if process.enclave in absent]
     remembered = observed._replace(processes=[*observed.processes, *kept])
     robot.remember(remembered.belonging_elsewhere(not_here))
@@ -147,8 +147,8 @@ def _remember(robot: LocalRobot, document: str, started: _StartedProcesses) -> s
     robot.shell.say(f"saw {counted(len(nodes), 'node')} in {number} of this machine")
     if others := running.in_other_domains():
         robot.shell.say(others)
-    if os.path.lexists(robot.seen_policy):  # of an earlier watch
-        remove_file(robot.seen_policy)
+    if os.path.lexists(robot.observed_policy):  # of an earlier watch
+        remove_file(robot.observed_policy)
     return _lacking_text(robot, learned["added"], nodes) if learned["dry_run"] else ""
 
 
@@ -180,7 +180,7 @@ def _say_variables(robot: LocalRobot, observed: ObservedProcesses, running: Runn
     """Name the variables of processes that their commands do not set, and this shell neither."""
     pids = {process.pid for process in observed.processes}
     for process in running.processes.processes:
-        more = process.environment.keys() - {*robot.shell.environment, *_OF_EVERY_SHELL}
+        more = process.environment.keys() - {*robot.shell.environment, *_SHELL_VARIABLES}
         if process.pid in pids and more:
             robot.shell.say(
                 f"{process.label} has variables that this shell does not have, and that its "
@@ -202,7 +202,7 @@ def _lacking_text(
         return ""
     common = common_parts(robot.folder, policies_dir())
     learned = learn(make_observation(nodes), common)
-    write(draft(robot.seen_policy, learned, common))
+    write(draft(robot.observed_policy, learned, common))
     used, stated = policy_rights(learned.policy()), policy_rights(read_policy(robot.policy))
     rights, meanings = [], []
     for value in lacking:
@@ -216,8 +216,11 @@ def _lacking_text(
         )
         if meaning := likely_meaning(right, used, named):
             meanings.append(meaning)
-    policy, seen_policy = shlex.quote(str(robot.policy)), shlex.quote(str(robot.seen_policy))
-    add = f"sros merge_policy {policy} {seen_policy} --in-place"
+    policy, observed_policy = (
+        shlex.quote(str(robot.policy)),
+        shlex.quote(str(robot.observed_policy)),
+    )
+    add = f"sros merge_policy {policy} {observed_policy} --in-place"
     first = (
         f"{first_few(meanings, MOST_NAMES)}; then restart it with that, and watch again: "
         f"{robot.close_command} --for 1m; otherwise, " * bool(meanings)
