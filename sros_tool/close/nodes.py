@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
@@ -74,17 +74,25 @@ class ObservedNodes:
             )
             yield replace(node, enclaves=moved) if moved else node
 
-    @cached_property
-    def expected(self) -> Observation:
-        """The nodes that the policy has an enclave for, with the names that they should have."""
+    def expected(self, now: Observation | None = None) -> Observation:
+        """Return the nodes of enclaves in the policy, with the names that they should have.
+
+        Where the policy allows a renamed node an endpoint under several names, the name counts that
+        the node has ``now``.
+        """
         names, nodes = {enclave.path for enclave in self.policy.enclaves}, []
         for node in self.in_their_enclaves():
             if new := self.renamed.get(node_name(node)):
-                endpoints = frozenset(self._renamed_endpoints(node, *new).values())
+                endpoints = frozenset(self._current_endpoints(node, now).values())
                 nodes.append(replace(node, ns=new[0], name=new[1], endpoints=endpoints))
             elif names.issuperset(node.enclaves):
                 nodes.append(node)
         return make_observation(nodes)
+
+    def compared(self, away: Collection[str], now: Observation | None = None) -> Observation:
+        """Return the expected nodes that have a profile and whose enclave is not ``away``."""
+        nodes, _ = self.divide_by_profile(self.expected(now).nodes)
+        return make_observation(node for node in nodes if node.enclaves[0] not in away)
 
     @cached_property
     def renamed(self) -> Mapping[str, tuple[str, str]]:
@@ -108,34 +116,60 @@ class ObservedNodes:
                 renamed[old.pop()] = new.pop()
         return renamed
 
-    def _renamed_endpoints(
-        self, node: ObservedNode, ns: str, name: str
-    ) -> dict[Endpoint, Endpoint]:
-        """Map the endpoints of an observed node to those that it should have under another name.
+    @cached_property
+    def _allowed_endpoints(self) -> Mapping[ObservedNode, Mapping[Endpoint, Sequence[Endpoint]]]:
+        """The endpoints that renamed nodes may have now, by those that they had, likeliest first.
 
-        The first possible name that its enclave allows counts; without one, the first.
+        An endpoint that the enclave denies under every possible name has its likeliest name.
         """
         possible = {
-            endpoint: _possible_endpoints(endpoint, node, ns, name) for endpoint in node.endpoints
-        }
-        tried = frozenset(chain.from_iterable(possible.values()))
-        tried_by = make_observation([replace(node, ns=ns, name=name, endpoints=tried)])
-        denied = {
-            endpoint for right in self.denied_rights(tried_by) for endpoint in right.endpoints
-        }
-        return {
-            endpoint: next((new for new in names if new not in denied), names[0])
-            for endpoint, names in possible.items()
-        }
-
-    @cached_property
-    def moved_endpoints(self) -> Collection[tuple[Endpoint, Endpoint]]:
-        """The endpoints of renamed nodes that are renamed, too, with their new names."""
-        return {
-            (before, after)
+            node: {
+                endpoint: _possible_endpoints(endpoint, node, *new) for endpoint in node.endpoints
+            }
             for node in self.as_observed
             if (new := self.renamed.get(node_name(node)))
-            for before, after in self._renamed_endpoints(node, *new).items()
+        }
+        tried = []
+        for node, names in possible.items():
+            ns, name = self.renamed[node_name(node)]
+            candidates = frozenset(chain.from_iterable(names.values()))
+            tried.append(replace(node, ns=ns, name=name, endpoints=candidates))
+        denied = {
+            (right.right.enclave, endpoint)
+            for right in (self.denied_rights(make_observation(tried)) if tried else ())
+            for endpoint in right.endpoints
+        }
+        return {
+            node: {
+                endpoint: [
+                    candidate
+                    for candidate in names
+                    if denied.isdisjoint((enclave, candidate) for enclave in node.enclaves)
+                ]
+                or names[:1]
+                for endpoint, names in endpoints.items()
+            }
+            for node, endpoints in possible.items()
+        }
+
+    def _current_endpoints(
+        self, node: ObservedNode, now: Observation | None
+    ) -> Mapping[Endpoint, Endpoint]:
+        """Map the endpoints of a renamed node to those that it should have under its new name."""
+        name = expand("~", *self.renamed[node_name(node)])
+        seen_nodes = (other for other in (now.nodes if now else ()) if node_name(other) == name)
+        current = {endpoint for other in seen_nodes for endpoint in other.endpoints}
+        return {
+            endpoint: next((allowed for allowed in names if allowed in current), names[0])
+            for endpoint, names in self._allowed_endpoints[node].items()
+        }
+
+    def moved_endpoints(self, now: Observation | None = None) -> Set[tuple[Endpoint, Endpoint]]:
+        """Return the endpoints of renamed nodes that are renamed, too, with their new names."""
+        return {
+            (before, after)
+            for node in self._allowed_endpoints
+            for before, after in self._current_endpoints(node, now).items()
             if before != after
         }
 

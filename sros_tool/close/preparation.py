@@ -71,7 +71,7 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
 def _denied_access(robot: LocalRobot) -> list[str]:
     """Return, as sentences, what the keystore denies to the observed nodes."""
     nodes = ObservedNodes(robot)
-    return [str(right) for right in nodes.denied_rights(nodes.expected)]
+    return [str(right) for right in nodes.denied_rights(nodes.expected())]
 
 
 def _do_steps(

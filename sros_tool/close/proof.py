@@ -12,9 +12,9 @@ from sros_tool.close.process_proof import CLAIM, proof_of_processes, why_missing
 from sros_tool.close.robot import MOST_NAMES, LocalRobot
 from sros_tool.close.running import RunningRobot
 from sros_tool.close.state import SILENCE, CloseState, Proof, current_state
-from sros_tool.close.talk_proof import proof_of_talk, renamed_text
+from sros_tool.close.talk_proof import proof_of_talk
 from sros_tool.errors import UnavailableError
-from sros_tool.graph.observation import Observation, make_observation
+from sros_tool.graph.observation import Observation
 from sros_tool.keystore.layout import list_enclaves
 from sros_tool.runtime.processes import ProcessTable
 from sros_tool.wording import counted, first_few
@@ -61,24 +61,20 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     if needed or expected == {*missing}:
         observed = state.observed.with_current_pids(running.processes)
         return [Proof(CLAIM, False, why_missing(running, sorted(needed) or missing, observed))]
-    nodes = ObservedNodes(robot)
-    compared, _ = nodes.divide_by_profile(nodes.expected.nodes)
-    not_here = robot.not_here
+    nodes, not_here = ObservedNodes(robot), robot.not_here
     # A laptop may be away; a computer whose nodes were seen has to be seen again.
-    may_be_away = not_here - {node.enclaves[0] for node in compared}
-    away = sorted({*missing} | may_be_away | not_here.intersection(robot.without))
-    before = make_observation(node for node in compared if node.enclaves[0] not in away)
+    may_be_away = not_here - {node.enclaves[0] for node in nodes.compared(()).nodes}
+    away = {*missing} | may_be_away | not_here.intersection(robot.without)
     proof = proof_of_processes(running, len(expected) - len(missing))
     absence = "not seen" if running.processes.unseen or running.processes.hidden else "not running"
     for label, names in ((absence, missing), ("of other machines", sorted(not_here))):
         if names:
             proof = proof._replace(reason=f"{proof.reason}; {label}: {', '.join(names)}")
-    talk = proof_of_talk(running, nodes, before, away)
-    talk = talk._replace(reason=f"{talk.reason}{renamed_text(nodes, fails=talk.fails)}")
-    if talk.fails and (present := sorted(not_here.difference(away))):
+    talk = proof_of_talk(running, nodes, away)
+    if talk.fails and (present := sorted(not_here - away)):
         options = " ".join(f"--without {name}" for name in present)
         talk = talk._replace(reason=f"{talk.reason}; if they may be away, add {options}")
-    silence = _proof_of_silence(robot, before, hears=talk.holds is not None)
+    silence = _proof_of_silence(robot, nodes.compared(away), hears=talk.holds is not None)
     return [proof, _proof_of_files(robot), *_proof_of_requirements(robot), talk, silence]
 
 

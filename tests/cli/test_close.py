@@ -21,6 +21,7 @@ from sros_tool.close import (
     apply,
     assignment,
     drop_ins,
+    nodes,
     proof,
     running,
     talk_proof,
@@ -32,7 +33,7 @@ from sros_tool.close.endpoints import left_alone
 from sros_tool.close.processes import ClosedProcess, ObservedProcesses
 from sros_tool.close.robot import LocalRobot, Shell
 from sros_tool.close.steps import steps
-from sros_tool.explain.audit import DeniedRight
+from sros_tool.explain.audit import DeniedRight, audit
 from sros_tool.graph import observe
 from sros_tool.graph.observation import Endpoint, ObservedNode, make_observation
 from sros_tool.keystore.layout import list_enclaves
@@ -765,7 +766,9 @@ def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
     robot.close("--apply")
 
 
-def test_a_renamed_node_is_compared_and_a_new_one_is_named(robot: Robot) -> None:
+def test_a_renamed_node_is_compared_and_a_new_one_is_named(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Or a robot whose node got another name could never be proved closed again."""
     robot.units, of, kept = UNITS, LISTENER[3], ("publish rt/cmd_vel", "publish rt/plan")
     rear = ros_node("rear_camera", of, "publish rt/rear_camera/image", "publish rt/odom", *kept)
@@ -788,6 +791,24 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(robot: Robot) -> None
     assert f"{denied}; new, without a profile: /ghost_node in /listener; compared " in said
     renamed = "compared under a new name: /rear_camera as /nav/stern_camera, with /odom as /nav/o"
     assert f"; {renamed}dom (a name that does not move: write it absolute)\n" in said
+    renamed_alone = policy.read_text()
+    policy.write_text(
+        renamed_alone.replace(">odom</topic>", ">odom</topic><topic>/odom</topic>", 1)
+    )
+    robot.close()
+    robot.nodes, audits = (), []
+
+    def counted_audit(*asked: Any) -> Any:
+        audits.append(asked)
+        return audit(*asked)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(nodes, "audit", counted_audit)
+        said = robot.close("--proof").out
+    assert f"yes: {talk}3 nodes with 57 endpoints as before" in said and f"{renamed}dom (a" in said
+    assert len(audits) == 2, "one of all possible names, one of the nodes"
+    policy.write_text(renamed_alone)
+    robot.close()
     robot.remaining = (TALKER, LISTENER, ros_node("nav/stern_camera", of, *moved))
     said = robot.close("--proof", status=1).out
     assert f"no: {talk}gone: /nav/stern_camera publish /cmd_vel; {renamed}dom" in said
@@ -796,7 +817,7 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(robot: Robot) -> None
     policy.write_text(copied)
     robot.close()
     bow_camera = ros_node("nav/bow_camera", of, "publish rt/nav/bow_camera/image")
-    robot.nodes, robot.remaining = (), (TALKER, LISTENER, stern_camera, bow_camera)
+    robot.remaining = (TALKER, LISTENER, stern_camera, bow_camera)
     said = robot.close("--proof").out
     assert "policy has no profile for them any more: /rear_camera (if they have new names, " in said
     assert "watched again: sros close robot --undo, sros close robot --for 1m)\n" in said
