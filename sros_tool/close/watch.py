@@ -6,7 +6,7 @@ import json
 import os
 import shlex
 import threading
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
 from sros_tool.close.assignment import (
@@ -28,8 +28,9 @@ from sros_tool.graph.learn import common_parts, is_tool
 from sros_tool.graph.observation import ObservedNode, make_observation
 from sros_tool.names import is_expression
 from sros_tool.policy.document import read_policy
+from sros_tool.policy.merge import plan_merge
 from sros_tool.policy.model import ALLOW
-from sros_tool.policy.rights import Right, policy_rights
+from sros_tool.policy.rights import policy_rights
 from sros_tool.runtime.environment import RMW_ZENOH
 from sros_tool.runtime.processes import Process, ProcessOrigin, ProcessTable, process_origin
 from sros_tool.runtime.rmw import RMW
@@ -149,7 +150,7 @@ def _remember(robot: LocalRobot, document: str, started: _StartedProcesses) -> s
         robot.shell.say(others)
     if os.path.lexists(robot.observed_policy):  # of an earlier watch
         remove_file(robot.observed_policy)
-    return _lacking_text(robot, learned["added"], nodes) if learned["dry_run"] else ""
+    return _lacking_text(robot, nodes) if learned["dry_run"] else ""
 
 
 def _observed_processes(
@@ -189,24 +190,22 @@ def _say_variables(robot: LocalRobot, observed: ObservedProcesses, running: Runn
             )
 
 
-def _lacking_text(
-    robot: LocalRobot, lacking: Sequence[Mapping[str, str]], nodes: Iterable[ObservedNode]
-) -> str:
+def _lacking_text(robot: LocalRobot, nodes: Iterable[ObservedNode]) -> str:
     """Return, as a sentence, which rights of nodes the policy lacks; "" if it lacks none.
 
     Writes the rights that the nodes use as a policy of its own.
     """
     from sros_tool.graph.learn import draft, learn, write  # only after another watch
 
+    common, policy = common_parts(robot.folder, policies_dir()), read_policy(robot.policy)
+    learned = learn(make_observation(nodes), common)
+    lacking = plan_merge(policy, learned.policy()).added
     if not lacking:
         return ""
-    common = common_parts(robot.folder, policies_dir())
-    learned = learn(make_observation(nodes), common)
     write(draft(robot.observed_policy, learned, common))
-    used, stated = policy_rights(learned.policy()), policy_rights(read_policy(robot.policy))
+    used, stated = policy_rights(learned.policy()), policy_rights(policy)
     rights, meanings = [], []
-    for value in lacking:
-        right = Right(value["enclave"], ALLOW, value["right"], value["name"])
+    for right in lacking:
         rights.append(f"{right.enclave} {right.right} {right.name}")
         named = (
             other
@@ -216,11 +215,8 @@ def _lacking_text(
         )
         if meaning := likely_meaning(right, used, named):
             meanings.append(meaning)
-    policy, observed_policy = (
-        shlex.quote(str(robot.policy)),
-        shlex.quote(str(robot.observed_policy)),
-    )
-    add = f"sros merge_policy {policy} {observed_policy} --in-place"
+    files = shlex.join((str(robot.policy), str(robot.observed_policy)))
+    add = f"sros merge_policy {files} --in-place"
     first = (
         f"{first_few(meanings, MOST_NAMES)}; then restart it with that, and watch again: "
         f"{robot.close_command} --for 1m; otherwise, " * bool(meanings)

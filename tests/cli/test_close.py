@@ -899,6 +899,7 @@ def test_a_program_that_starts_its_nodes_has_one_enclave(
     export = robot.folder / "robot/export"
     assert f"cd /opt && sros run {export} /listener -- python3 pumps.py\n" in commands
     assert "/talker --" not in commands
+    robot.close("--for", "1s")  # the policy has all rights, in the other enclave
     robot.by_hand, in_one = {"/listener"}, lambda *nodes: [("/listener", *of[1:]) for of in nodes]
     robot.absent = {"/talker"}
     monkeypatch.setattr("tests.cli.test_close.secured", in_one)
