@@ -220,13 +220,8 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
     if not_here := closed.observed.not_here:
         bring = f"sros distribute_key {shlex.quote(str(robot.keystore))} ENCLAVE FOLDER"
         echo(f"not on this machine: {', '.join(not_here)} (to bring one there: {bring})")
-    observed_enclaves = (
-        {process.enclave for process in robot.observed.processes} if robot.observed else set()
-    )
-    if not_in_policy := sorted(
-        observed_enclaves.difference(enclave.path for enclave in policy.enclaves)
-    ):
-        echo(f"seen when sros watched, and not in the policy: {', '.join(not_in_policy)}")
+    if outside := robot.processes.enclaves_outside(policy):
+        echo(f"seen when sros watched, and not in the policy: {', '.join(outside)}")
     for right in closed.newly_denied[:_MOST_DENIED]:
         echo(f"used when sros watched, and denied now: {right}")
     if more := closed.newly_denied[_MOST_DENIED:]:

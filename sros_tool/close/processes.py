@@ -201,6 +201,18 @@ class ObservedProcesses(NamedTuple):
             elsewhere=[enclave for enclave in self.elsewhere if enclave in names],
         )
 
+    def enclaves_outside(self, policy: Policy) -> list[str]:
+        """Return the enclaves of processes with nodes that the policy does not have.
+
+        A Zenoh router has no node, so no policy has its enclave.
+        """
+        nodes = {
+            process.enclave
+            for process in self.processes
+            if not (process.rmw and process.enclave == ROUTER)
+        }
+        return sorted(nodes.difference(enclave.path for enclave in policy.enclaves))
+
     def command_of_new(self, export: Path, enclave: str) -> str:
         """Return the shell command for a process of an enclave of which none was observed."""
         rmw = next((process.rmw for process in self.processes if process.rmw), "")

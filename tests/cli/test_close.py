@@ -38,7 +38,7 @@ from sros_tool.graph import observe
 from sros_tool.graph.observation import Endpoint, ObservedNode, make_observation
 from sros_tool.keystore.layout import list_enclaves
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import ALLOW
+from sros_tool.policy.model import ALLOW, Policy
 from sros_tool.policy.rights import Right
 from sros_tool.runtime.environment import secured_environment
 from sros_tool.runtime.processes import (
@@ -1292,6 +1292,9 @@ def test_the_commands_of_a_robot_on_zenoh_name_its_rmw_and_the_enclaves() -> Non
     )
     router = talker._replace(enclave="/router", command=("rmw_zenohd",))
     assert router.secured_command(Path()) == f"cd /opt && {run.format('/router')} rmw_zenohd"
+    empty = Policy(())
+    assert ObservedProcesses(0, [talker, router]).enclaves_outside(empty) == ["/talker"]
+    assert ObservedProcesses(0, [router._replace(rmw="")]).enclaves_outside(empty) == ["/router"]
     in_domain = "cd /opt && env ROS_DOMAIN_ID=7 RMW_IMPLEMENTATION=rmw_zenoh_cpp python3 talk"
     assert talker.open_command(7) == in_domain
     observed = ObservedProcesses(7, [talker])

@@ -202,6 +202,7 @@ def test_a_robot_on_zenoh_is_closed_and_opened_again(tmp_path: Path) -> None:
     said = apart(lambda: play_on_zenoh(tmp_path))
     assert said["open"].status == 0, said["open"]
     assert "  action /count: /action_client -> /action_server\n" in said["open"].out
+    assert "not in the policy" not in said["open"].out
     assert said["applied"].status == 1
     assert said["closed"].status == 0, said["closed"]
     processes, files, required, talk, silence = proofs(said["closed"]).values()
