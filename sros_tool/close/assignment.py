@@ -21,7 +21,6 @@ from sros_tool.close.processes import (
     ClosedProcess,
     ObservedProcesses,
     is_in_domain,
-    needs_enclave_argument,
     process_text,
 )
 from sros_tool.errors import UsageError
@@ -186,7 +185,7 @@ def with_command_of_unit(process: ClosedProcess) -> ClosedProcess:
 
     If the unit starts another command, such as a script, return the process without its unit.
     """
-    if not (process.unit and needs_enclave_argument(process)):
+    if not (process.unit and process.lacks_enclave_argument):
         return process
     command = ["systemctl", "show", "--property=ExecStart", "--value", process.unit]
     try:

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
+from sros_tool.enclave_environment import RMWS
 from sros_tool.errors import DocumentError
 from sros_tool.policy.model import Policy
 from sros_tool.runtime.environment import RMW_ZENOH, ROS_ARGS, named_enclave
@@ -54,7 +55,8 @@ class ClosedProcess(NamedTuple):
     container: str = ""
     """The id of the Docker container in which it runs; empty outside of containers."""
     rmw: str = ""
-    """rmw_zenoh_cpp for a process on Zenoh; empty on DDS."""
+    """rmw_zenoh_cpp for a process on Zenoh; otherwise the RMW that its environment names; empty if
+    it names none, or one that enforces no security."""
     shares: Sequence[str] = ()
     """The other enclaves whose processes the same command starts, as `multiprocessing` does."""
     chooses: bool = False
@@ -67,9 +69,21 @@ class ClosedProcess(NamedTuple):
     ) -> ClosedProcess:
         """Return a running process with its enclave and what started it."""
         start = enclave, *process.program, origin.folder, process.user, origin.unit
-        rmw = RMW_ZENOH if process.is_zenoh else ""
+        named = process.environment.get(RMW, "")
+        rmw = RMW_ZENOH if process.is_zenoh else named if named in RMWS else ""
         chooses = process.environment.get(ENCLAVE) == enclave
         return cls(*start, known_by, origin.launch, origin.container, rmw, (), chooses)
+
+    @property
+    def is_router(self) -> bool:
+        """Whether the process is a Zenoh router, which has no node."""
+        return self.rmw == RMW_ZENOH and self.enclave == ROUTER
+
+    @property
+    def lacks_enclave_argument(self) -> bool:
+        """Whether its command has to name the enclave, which others look for on Zenoh."""
+        is_node = self.rmw == RMW_ZENOH and not self.is_router
+        return is_node and named_enclave(self.command) != self.enclave
 
     def with_current_pid(self, running: RunningProcesses) -> ClosedProcess:
         """Return a copy with the id that a process with this command has now.
@@ -111,7 +125,7 @@ class ClosedProcess(NamedTuple):
         if self.launch:
             after = launch_verb(self.launch) + 1
             words = launch_words(folder, self.launch[:after], self.launch[after:])
-        elif needs_enclave_argument(self):
+        elif self.lacks_enclave_argument:
             words = (*words, ROS_ARGS, "--enclave", self.enclave)
         enclave = launch_enclave if self.launch else self.enclave
         if enclave:
@@ -136,12 +150,6 @@ def launch_words(folder: Path, before: Sequence[str], after: Sequence[str]) -> S
     """Return a command of ``ros2 launch`` whose processes run in the enclaves of a closed robot."""
     secured = ("--secured", str(folder / "export"), str(folder / "policy.xml"))
     return (*before, *secured, *after)
-
-
-def needs_enclave_argument(process: ClosedProcess) -> bool:
-    """Return whether the command must name the enclave, which others look for on Zenoh."""
-    is_node = bool(process.rmw) and process.enclave != ROUTER
-    return is_node and named_enclave(process.command) != process.enclave
 
 
 class ObservedProcesses(NamedTuple):
@@ -206,11 +214,7 @@ class ObservedProcesses(NamedTuple):
 
         A Zenoh router has no node, so no policy has its enclave.
         """
-        nodes = {
-            process.enclave
-            for process in self.processes
-            if not (process.rmw and process.enclave == ROUTER)
-        }
+        nodes = {process.enclave for process in self.processes if not process.is_router}
         return sorted(nodes.difference(enclave.path for enclave in policy.enclaves))
 
     def command_of_new(self, export: Path, enclave: str) -> str:

@@ -11,7 +11,6 @@ from sros_tool.close.processes import (
     COMPOSE_FILE,
     ClosedProcess,
     launch_words,
-    needs_enclave_argument,
 )
 from sros_tool.close.robot import LocalRobot
 from sros_tool.close.state import CloseState
@@ -48,7 +47,7 @@ def write_start_files(robot: LocalRobot, state: CloseState) -> list[FileChange]:
         variables = environments[observed.started_in(process)]
         if process.unit:
             text = render_environment(variables, "systemd")
-            if needs_enclave_argument(process):
+            if process.lacks_enclave_argument:
                 words = (*process.command, ROS_ARGS, "--enclave", process.enclave)
                 text += f"ExecStart=\nExecStart={' '.join(unit_words(words))}\n"
             files[f"units/{process.unit}.d/{DROP_IN}"] = (

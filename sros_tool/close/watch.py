@@ -179,10 +179,11 @@ def _observed_processes(
 
 def _say_variables(robot: LocalRobot, observed: ObservedProcesses, running: RunningRobot) -> None:
     """Name the variables of processes that their commands do not set, and this shell neither."""
-    pids = {process.pid for process in observed.processes}
+    rmws = {process.pid: process.rmw for process in observed.processes}
     for process in running.processes.processes:
         more = process.environment.keys() - {*robot.shell.environment, *_SHELL_VARIABLES}
-        if process.pid in pids and more:
+        more -= {RMW} if rmws.get(process.pid) else set()
+        if process.pid in rmws and more:
             robot.shell.say(
                 f"{process.label} has variables that this shell does not have, and that its "
                 f"command in {robot.commands_file} does not set: "

@@ -1282,8 +1282,8 @@ def test_a_node_on_zenoh_gets_an_argument_from_its_unit(robot: Robot) -> None:
         assert with_command_of_unit(other) == other
 
 
-def test_the_commands_of_a_robot_on_zenoh_name_its_rmw_and_the_enclaves() -> None:
-    """Without them, a process runs open, or others do not see it."""
+def test_commands_name_the_rmw_and_on_zenoh_the_enclave() -> None:
+    """Without them, a process runs open or on another RMW, or others do not see it."""
     start = "/talker", 1, ("python3", "talk"), "/opt", 0, "", "program"
     talker = ClosedProcess(*start, rmw="rmw_zenoh_cpp")
     run = "sros run export {} --rmw rmw_zenoh_cpp --"
@@ -1292,6 +1292,15 @@ def test_the_commands_of_a_robot_on_zenoh_name_its_rmw_and_the_enclaves() -> Non
     )
     router = talker._replace(enclave="/router", command=("rmw_zenohd",))
     assert router.secured_command(Path()) == f"cd /opt && {run.format('/router')} rmw_zenohd"
+    named = {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}
+    on_cyclone = Process(1, ("talk",), named, datetime.now(UTC))
+    origin = ProcessOrigin("", "/opt")
+    cyclone = ClosedProcess.from_process(on_cyclone, "/talker", origin, "program")
+    started = "cd /opt && sros run export /talker --rmw rmw_cyclonedds_cpp -- talk"
+    assert cyclone.secured_command(Path()) == started
+    assert cyclone.open_command(0) == "cd /opt && env RMW_IMPLEMENTATION=rmw_cyclonedds_cpp talk"
+    other = replace(on_cyclone, environment={"RMW_IMPLEMENTATION": "rmw_other"})
+    assert ClosedProcess.from_process(other, "/talker", origin, "program").rmw == ""
     empty = Policy(())
     assert ObservedProcesses(0, [talker, router]).enclaves_outside(empty) == ["/talker"]
     assert ObservedProcesses(0, [router._replace(rmw="")]).enclaves_outside(empty) == ["/router"]
@@ -1304,6 +1313,18 @@ def test_the_commands_of_a_robot_on_zenoh_name_its_rmw_and_the_enclaves() -> Non
     now: Any = SimpleNamespace(secured=[(process, ProcessEnclave("/export", "/talker"))])
     unseen = talk_proof.unseen_text(now, "/talker", "/talker")
     assert "start process 1 (talk) with `--ros-args --enclave /talker` at its end" in unseen
+
+
+def test_variables_that_a_command_does_not_set_are_named() -> None:
+    variables = {"HOME": "/", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp", "GAIN": "2"}
+    talker = Process(1, ("talk",), variables, datetime.now(UTC))
+    closed = ClosedProcess.from_process(talker, "/talker", ProcessOrigin("", "/opt"), "program")
+    shown: list[str] = []
+    shell = SimpleNamespace(environment={"HOME": "/root"}, say=shown.append)
+    robot: Any = SimpleNamespace(shell=shell, commands_file="commands.txt")
+    now: Any = SimpleNamespace(processes=RunningProcesses((talker,)))
+    watch._say_variables(robot, ObservedProcesses(0, [closed]), now)
+    assert len(shown) == 1 and shown[0].endswith("its command in commands.txt does not set: GAIN")
 
 
 @pytest.mark.parametrize(
