@@ -11,6 +11,7 @@ from sros_tool.checks.requirements import VIOLATED
 from sros_tool.close.export import remove_enclaves
 from sros_tool.close.nodes import ObservedNodes
 from sros_tool.close.problems import problems_of, shared_node_problems, shared_program_problems
+from sros_tool.close.processes import ObservedProcesses
 from sros_tool.close.robot import LocalRobot
 from sros_tool.close.start_files import write_start_files
 from sros_tool.close.state import CloseState, CloseStep, current_state
@@ -62,7 +63,7 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     newly_denied = [right for right in denied if right not in denied_before]
     problems += problems_of(robot, state, partial=partial)
     if not state.secured:
-        _warn_of_rmw(robot)
+        _warn_of_rmw(robot, state.observed)
     return state._replace(
         denied=denied, newly_denied=newly_denied, problems=problems, changes=changes
     )
@@ -125,13 +126,14 @@ def _do(robot: LocalRobot, step: CommandStep) -> tuple[str, str]:
     return "done", ""
 
 
-def _warn_of_rmw(robot: LocalRobot) -> None:
-    """Say so if nodes on the RMW of this shell cannot run secured."""
+def _warn_of_rmw(robot: LocalRobot, observed: ObservedProcesses) -> None:
+    """Say so if nodes on the RMW of their process, or of this shell, cannot run secured."""
     environment = robot.shell.environment
-    rmw = environment.get(RMW) or next(iter(rmw_implementations(environment)), "")
-    if built_without_security(rmw, environment):
-        robot.shell.say(
-            f"WARNING: {rmw} is built without security here: no node starts in an enclave "
-            "with it. Before you stop the robot, find an RMW that enforces security: "
-            "sros doctor"
-        )
+    default = environment.get(RMW) or next(iter(rmw_implementations(environment)), "")
+    for rmw in sorted({process.rmw or default for process in observed.processes}):
+        if built_without_security(rmw, environment):
+            robot.shell.say(
+                f"WARNING: {rmw} is built without security here: no node starts in an enclave "
+                "with it. Before you stop the robot, find an RMW that enforces security: "
+                "sros doctor"
+            )

@@ -39,7 +39,8 @@ class Middleware:
 
     ``rmw`` is a part of the names of its RMWs, and the names of its shared libraries begin with one
     of ``libraries``.  ``vendor`` is its DDS vendor, or None if it is not a DDS; ``trace_variables``
-    are environment variables with which it logs why it denies a topic.
+    are environment variables with which it logs why it denies a topic.  The library
+    ``rmw_library`` has the text ``open_build`` only if it was built without DDS Security.
     """
 
     name: str
@@ -47,16 +48,27 @@ class Middleware:
     libraries: tuple[str, ...] = ()
     vendor: Vendor | None = None
     trace_variables: Mapping[str, str] = field(default_factory=dict)
+    rmw_library: str = ""
+    open_build: bytes = b""
 
 
 MIDDLEWARE = (
-    Middleware("Fast DDS", "rmw_fastrtps", ("libfastdds.so", "libfastrtps.so"), Vendor.FAST),
+    Middleware(
+        "Fast DDS",
+        "rmw_fastrtps",
+        ("libfastdds.so", "libfastrtps.so"),
+        Vendor.FAST,
+        rmw_library="librmw_fastrtps_shared_cpp.so",
+        open_build=b"have the security libraries",
+    ),
     Middleware(
         "Cyclone DDS",
         "rmw_cyclonedds",
         ("libddsc",),
         Vendor.CYCLONE,
         denial_trace_variables("stderr"),
+        rmw_library="librmw_cyclonedds_cpp.so",
+        open_build=b"does not have security support enabled",
     ),
     Middleware("Connext", "rmw_connext", ("libnddsc.so",), Vendor.CONNEXT),
     Middleware("OpenDDS", "rmw_opendds", (), Vendor.OPENDDS),
@@ -132,24 +144,23 @@ def chosen_rmw(named: str | None, environment: Mapping[str, str]) -> str:
 def built_without_security(rmw: str, environment: Mapping[str, str]) -> bool:
     """Return whether an installed RMW surely has no DDS Security, without starting it.
 
-    The library of an rmw_fastrtps has the message "this Fast DDS version doesn't have the security
-    libraries" only if it was built without them (rmw_fastrtps of Jazzy, participant.cpp). False
-    says nothing: only `sros doctor` tries what an RMW enforces.
+    Its library has the message of a node that asks for security in vain only if it was built
+    without DDS Security (rmw_fastrtps of Jazzy, participant.cpp; rmw_cyclonedds of Jazzy,
+    rmw_node.cpp). False says nothing: only `sros doctor` tries what an RMW enforces.
     """
-    if not rmw.startswith("rmw_fastrtps"):
+    middleware = middleware_of(rmw)
+    if not (middleware and middleware.open_build):
         return False
     for prefix in _prefixes(environment):
         if Path(prefix, _RMW_INDEX, rmw).exists():
             try:
-                with Path(prefix, "lib", _FAST_LIBRARY).open("rb") as file:
-                    return _NO_SECURITY in file.read(_MOST_BYTES)
+                with Path(prefix, "lib", middleware.rmw_library).open("rb") as file:
+                    return middleware.open_build in file.read(_MOST_BYTES)
             except OSError:
                 return False
     return False
 
 
-_FAST_LIBRARY = "librmw_fastrtps_shared_cpp.so"
-_NO_SECURITY = b"have the security libraries"
 _MOST_BYTES = 16 * 1024 * 1024
 
 
