@@ -6,7 +6,7 @@ import json
 import os
 import shlex
 import threading
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
 from sros_tool.close.assignment import (
@@ -15,6 +15,7 @@ from sros_tool.close.assignment import (
     process_ids_of_cyclone,
     with_command_of_unit,
 )
+from sros_tool.close.endpoints import node_name
 from sros_tool.close.nodes import ObservedNodes
 from sros_tool.close.processes import ObservedProcesses
 from sros_tool.close.robot import MOST_NAMES, LocalRobot
@@ -26,10 +27,10 @@ from sros_tool.files import policies_dir, remove_file, replace_file
 from sros_tool.folders import make_folders, remove_folders
 from sros_tool.graph.learn import common_parts, is_tool
 from sros_tool.graph.observation import ObservedNode, make_observation
-from sros_tool.names import is_expression
+from sros_tool.names import expand, is_expression
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.merge import plan_merge
-from sros_tool.policy.model import ALLOW
+from sros_tool.policy.model import ALLOW, Policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.runtime.environment import RMW_ZENOH
 from sros_tool.runtime.processes import Process, ProcessOrigin, ProcessTable, process_origin
@@ -191,7 +192,7 @@ def _say_variables(robot: LocalRobot, observed: ObservedProcesses, running: Runn
             )
 
 
-def _lacking_text(robot: LocalRobot, nodes: Iterable[ObservedNode]) -> str:
+def _lacking_text(robot: LocalRobot, nodes: Sequence[ObservedNode]) -> str:
     """Return, as a sentence, which rights of nodes the policy lacks; "" if it lacks none.
 
     Writes the rights that the nodes use as a policy of its own.
@@ -205,7 +206,7 @@ def _lacking_text(robot: LocalRobot, nodes: Iterable[ObservedNode]) -> str:
         return ""
     write(draft(robot.observed_policy, learned, common))
     used, stated = policy_rights(learned.policy()), policy_rights(policy)
-    rights, meanings = [], []
+    rights, meanings = [], [*_lost_namespaces(nodes, policy)]
     for right in lacking:
         rights.append(f"{right.enclave} {right.right} {right.name}")
         named = (
@@ -227,3 +228,24 @@ def _lacking_text(robot: LocalRobot, nodes: Iterable[ObservedNode]) -> str:
         f"({first_few(rights, MOST_NAMES)}); {first}if a process should not have them, stop "
         f"it, and run `{robot.close_command}`; if they are right, add them: {add}"
     )
+
+
+def _lost_namespaces(nodes: Sequence[ObservedNode], policy: Policy) -> Iterator[str]:
+    """Yield a clause for each node that the policy has in one other namespace alone.
+
+    Namespaces in which a node of this name was seen, too, do not count.
+    """
+    seen = {node_name(node) for node in nodes}
+    namespaces: dict[str, set[str]] = {}
+    for enclave in policy.enclaves:
+        for profile in enclave.all_profiles():
+            if not is_expression(f"{profile.ns}{profile.node}"):
+                namespaces.setdefault(profile.node, set()).add(profile.ns)
+    for node in nodes:
+        stated = namespaces.get(node.name, set())
+        lost = [ns for ns in stated if expand("~", ns, node.name) not in seen]
+        if node.ns not in stated and len(lost) == 1:
+            yield (
+                f"perhaps {node_name(node)} is {expand('~', lost[0], node.name)}, started without "
+                f"its namespace (-r __ns:={lost[0]})"
+            )

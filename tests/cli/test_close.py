@@ -858,6 +858,18 @@ def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None
     assert "/talker -- /opt/run talker\n" in commands
 
 
+def test_a_node_that_was_restarted_without_its_namespace(robot: Robot) -> None:
+    left = ros_node("left/listener", LISTENER[3], "subscribe rt/left/chatter")
+    robot.nodes = (TALKER, left)
+    robot.close()
+    robot.nodes = (TALKER, LISTENER)
+    said = robot.close("--for", "1s", status=1).out
+    hint = "perhaps /listener is /left/listener, started without its namespace (-r __ns:=/left)"
+    assert f"; {hint}; then restart it with that, and watch again" in said
+    robot.nodes = (TALKER, left, ros_node("listener", "010f0000071200000000"))
+    assert "without its namespace" not in robot.close("--for", "1s", status=1).out
+
+
 def test_a_process_with_the_name_of_another_is_not_signed(robot: Robot) -> None:
     """Or whoever calls itself /talker while sros watches gets its rights into /talker."""
     twin = ("/", "/", "talker", "010f0000070000000000", ["publish rt/cmd_vel"])
