@@ -98,9 +98,9 @@ _EXPRESSION = re.compile(
     r"(?:~(?=/|\Z))?(?:[A-Za-z0-9_/*?]|\[!?[A-Za-z0-9_/]+(?:-[A-Za-z0-9_]+)*\])*\Z"
 )
 _RANGE = re.compile(r"(.)-(.)")
-MAX_NAMESPACE = 245
+_MAX_NAMESPACE = 245
 """Maximum length of a node's namespace, in characters (RMW_NAMESPACE_MAX_LENGTH)."""
-MAX_NODE_NAME = 255
+_MAX_NODE_NAME = 255
 """Maximum length of a node's name, in characters (RMW_NODE_NAME_MAX_NAME_LENGTH)."""
 _MAX_EXPRESSION = 2000  # characters; the names that an expression can match have at most 255
 
@@ -210,8 +210,8 @@ def check_namespace(ns: str) -> str:
     problem = "" if ns == "/" else expression_problem(text)
     if not problem and text[0] not in "/*":
         problem = "A namespace starts with '/'."
-    if not problem and len(text) > MAX_NAMESPACE and not is_expression(text):
-        problem = f"It has {len(text)} characters, more than {MAX_NAMESPACE}."
+    if not problem and len(text) > _MAX_NAMESPACE and not is_expression(text):
+        problem = f"It has {len(text)} characters, more than {_MAX_NAMESPACE}."
     if problem:
         raise InvalidNameError(f"{ns!r} is not a valid namespace", problem, "")
     return text
@@ -226,8 +226,8 @@ def node_name_problem(name: str) -> str:
         return problem
     if "/" in name or "~" in name:
         return "A node name has no '/' and no '~'; its namespace goes into ns=."
-    if len(name) > MAX_NODE_NAME and not is_expression(name):
-        return f"It has {len(name)} characters, more than {MAX_NODE_NAME}."
+    if len(name) > _MAX_NODE_NAME and not is_expression(name):
+        return f"It has {len(name)} characters, more than {_MAX_NODE_NAME}."
     return ""
 
 
