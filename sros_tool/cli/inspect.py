@@ -44,6 +44,7 @@ if TYPE_CHECKING:
         TokenPlace,
         UnreadableFile,
     )
+    from sros_tool.keystore.reader import OpenedKeystore
 
 _INDENT = "  "
 
@@ -105,15 +106,16 @@ def inspect(
     """
     from sros_tool.errors import DocumentError, UsageError
     from sros_tool.keystore.describe import describe, problems_of
+    from sros_tool.keystore.reader import OpenedKeystore
 
     if not path.exists():
         raise DocumentError(f"'{path}' does not exist")
     if enclave is not None:
         if history:
             raise UsageError("--history is for a whole keystore", "", f"Leave {enclave} out.")
-        path = _enclave_of(path, enclave)
+        path = _enclave_of(OpenedKeystore(path), enclave)
     if history:
-        return _show_history(path, policy, as_json)
+        return _show_history(OpenedKeystore(path), policy, as_json)
     if policy:
         raise UsageError("--policy is for --history", "", "Add --history.")
     described = describe(path, now=now(), authority=authority)
@@ -136,24 +138,21 @@ def inspect(
     return 1 if signature and signature.signature_verified is False else 0
 
 
-def _enclave_of(root: Path, name: str) -> Path:
+def _enclave_of(keystore: OpenedKeystore, name: str) -> Path:
     """Return the folder of an enclave of a keystore."""
-    from sros_tool.keystore.layout import check_keystore
-    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.selection import missing_enclave_error
 
-    check_keystore(root)
-    keystore = OpenedKeystore(root)
+    keystore.check()
     names = keystore.names
     if name not in names:
         raise missing_enclave_error(keystore, name, names)
     return keystore.folder(name)
 
 
-def _show_history(root: Path, policy: Path | None, as_json: bool) -> int:
+def _show_history(keystore: OpenedKeystore, policy: Path | None, as_json: bool) -> int:
     from sros_tool.keystore.describe import history
 
-    changes = history(root, now=now())
+    changes = history(keystore, now=now())
     if policy:
         from sros_tool.policy.document import read_policy
 
@@ -183,7 +182,7 @@ def _show_history(root: Path, policy: Path | None, as_json: bool) -> int:
             echo(
                 f"permissions of {number} were signed from '{policy}', as it is now; others can "
                 f"have the same rights from an earlier version: `sros diff_policy "
-                f"{quote(str(policy))} {quote(str(root))}` compares the rights",
+                f"{quote(str(policy))} {quote(str(keystore.root))}` compares the rights",
                 err=True,
             )
     no_entry = policy is not None and not changes.entries

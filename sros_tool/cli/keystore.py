@@ -773,12 +773,13 @@ def update_keystore(
             "Copy sros.toml elsewhere, undo the edits with --discard-edits, and name the copy with "
             "--template.",
         )
-    present = present_settings(OpenedKeystore(root))
+    keystore = OpenedKeystore(root)
+    present = present_settings(keystore)
     domains = None
     if template_name is not None:
         target = load_template(template_name)
     elif take_edits:
-        target, domains = edited_settings(root, present)
+        target, domains = edited_settings(keystore, present)
     else:
         target = present.without_edits() if discard_edits else present.settings_to_change()
     target = with_values(

@@ -42,6 +42,7 @@ from sros_tool.wording import first_few
 if TYPE_CHECKING:
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.keystore.lifecycle.change import Changed
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.pki.crl import RevocationList
 
 
@@ -482,13 +483,16 @@ def rotate_ca(
     from sros_tool.keystore.lifecycle.rotate import renew_identity_ca
     from sros_tool.keystore.lifecycle.rotate import rotate_ca as work
     from sros_tool.keystore.lifecycle.rotation import RotationStage, rotation_status
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.validity import parse_span
     from sros_tool.xml import read_bytes
 
     if sum((status, go_on, to is not None, finish, same_key)) > 1:
         raise UsageError("give only one of --status, --next, --to, --finish and --same-key")
     if not (go_on or to or finish or same_key):
-        _show_status(rotation_status(root, now=now()), _unconfirmed_robots(root), as_json)
+        keystore = OpenedKeystore(root)
+        status_now = rotation_status(keystore, now=now())
+        _show_status(status_now, _unconfirmed_robots(keystore), as_json)
         return
     if identity_ca and not same_key:
         raise UsageError("--identity-ca has no effect without --same-key", "", "Add --same-key.")
@@ -534,10 +538,11 @@ def rotate_ca(
             "RotationChange",
             authorities=step.files,
             old_keys_elsewhere=step.kept_elsewhere,
-            remarks=() if dry_run else rotation_status(root, now=now()).remarks,
+            remarks=() if dry_run else rotation_status(OpenedKeystore(root), now=now()).remarks,
         )
     elif not dry_run:
-        _print_step(step, rotation_status(root, now=now()), together=finish, same_key=same_key)
+        reached = rotation_status(OpenedKeystore(root), now=now())
+        _print_step(step, reached, together=finish, same_key=same_key)
     cannot = "could not" if dry_run else "cannot"
     cut_off = (
         f"cut off: {', '.join(step.cut_off)} {cannot} talk to robots with the files of this stage "
@@ -584,13 +589,11 @@ def _print_step(
         echo(remark, err=True)
 
 
-def _unconfirmed_robots(root: Path) -> tuple[str, ...] | str:
+def _unconfirmed_robots(keystore: OpenedKeystore) -> tuple[str, ...] | str:
     """Return the robots that have not confirmed the stage of a rotation, or why that is unknown."""
     from sros_tool.keystore.lifecycle.rotate import robots_cut_off
     from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
-    from sros_tool.keystore.reader import OpenedKeystore
 
-    keystore = OpenedKeystore(root)
     rotation = read_rotation(keystore)
     if rotation.stage is RotationStage.NONE:
         return ()

@@ -545,7 +545,7 @@ def describe(
     files = files or FilesReadOnce()
     if path.is_dir():
         if is_keystore(path):
-            return _describe_keystore(path, now)
+            return _describe_keystore(OpenedKeystore(path), now)
         of_enclave = (CERTIFICATE_FILE, PERMISSIONS_FILE, KEY_URI_FILE)
         if any((path / name).exists() for name in of_enclave):
             state = open_enclave(path, now=now, files=files)
@@ -609,20 +609,19 @@ def _describe_file(
     )
 
 
-def _describe_keystore(root: Path, now: datetime) -> DescribedKeystore:
-    keystore = OpenedKeystore(root)
+def _describe_keystore(keystore: OpenedKeystore, now: datetime) -> DescribedKeystore:
     settings = keystore.settings
     authorities: dict[str, AuthorityFile | UnreadableFile] = {}
     for role in ROLES:
-        path = root / ca_certificate(role)
+        path = keystore.root / ca_certificate(role)
         if not path.exists():
             continue
         try:
             file = _describe_certificates(keystore.read(path, "file"), f"'{path}'", now)
-            authorities[role] = AuthorityFile(file, (root / ca_key(role)).exists())
+            authorities[role] = AuthorityFile(file, (keystore.root / ca_key(role)).exists())
         except SrosError as error:
             authorities[role] = UnreadableFile(str(error))
-    names, unread = search_enclaves(root)
+    names, unread = search_enclaves(keystore.root)
     enclaves = [_describe_enclave(keystore, name, now) for name in names]
     governance = _describe_governance(keystore, now)
     problems = [
@@ -641,7 +640,7 @@ def _describe_keystore(root: Path, now: datetime) -> DescribedKeystore:
         gaps = [str(error)]
     problems += [f"ledger: {gap}" for gap in gaps]
     return DescribedKeystore(
-        path=root,
+        path=keystore.root,
         template=settings.name if settings else None,
         ledger=gaps,
         authorities=authorities,
@@ -1011,11 +1010,11 @@ class History(NamedTuple):
     kind: Annotated[Literal["history"], "What PATH is."] = "history"
 
 
-def history(root: Path, *, now: datetime) -> History:
+def history(keystore: OpenedKeystore, *, now: datetime) -> History:
     """Return the entries of a keystore's ledger, with the current state of the recorded items."""
-    issued, revoked_files = _files(root, _active_paths(root)), _files(root, _revoked_paths(root))
-    retired = _files(root, _retired_paths(root))
-    keystore = OpenedKeystore(root)
+    issued = _files(keystore, _active_paths(keystore))
+    revoked_files = _files(keystore, _revoked_paths(keystore))
+    retired = _files(keystore, _retired_paths(keystore))
     ledger = keystore.ledger
     entries = ledger.entries
     # A new CA starts with an empty revocation list, and lists drop expired certificates, so the
@@ -1023,7 +1022,7 @@ def history(root: Path, *, now: datetime) -> History:
     revoked = {entry.serial for entry in entries if entry.what == "revocation"}
     revoked |= {f"{entry.serial:x}" for crl in keystore.revocation_lists for entry in crl.revoked}
     moment = iso(now)
-    settings = _files(root, iter((SETTINGS, FLEET)))
+    settings = _files(keystore, iter((SETTINGS, FLEET)))
 
     def status(entry: Entry) -> HistoryStatus:
         if entry.what in (GAP, RESTORED):
@@ -1046,7 +1045,7 @@ def history(root: Path, *, now: datetime) -> History:
     present_files = {**retired, **revoked_files, **issued}
     places = {**present_files, **settings}
     return History(
-        root,
+        keystore.root,
         tuple(
             HistoryItem(entry, status(entry), (places.get(entry.sha256) or [""])[0])
             for entry in entries
@@ -1063,32 +1062,35 @@ def history(root: Path, *, now: datetime) -> History:
     )
 
 
-def _active_paths(root: Path) -> Iterator[str]:
+def _active_paths(keystore: OpenedKeystore) -> Iterator[str]:
     """Yield the paths from which DDS loads certificates and signed documents.
 
     The files may be missing.
     """
-    yield from (f"{PUBLIC}/{path.name}" for path in sorted((root / PUBLIC).glob("*.cert.pem")))
+    authorities = sorted((keystore.root / PUBLIC).glob("*.cert.pem"))
+    yield from (f"{PUBLIC}/{path.name}" for path in authorities)
     yield from (GOVERNANCE_P7S, CRL)
-    for name in list_enclaves(root):
+    for name in list_enclaves(keystore.root):
         yield from (f"{enclave_folder(name)}/{file}" for file in _ISSUED)
 
 
-def _revoked_paths(root: Path) -> Iterator[str]:
-    for path in revoked_certificates(root):
+def _revoked_paths(keystore: OpenedKeystore) -> Iterator[str]:
+    for path in revoked_certificates(keystore.root):
         yield from (f"{REVOKED}/{path.parent.name}/{file}" for file in _ISSUED)
 
 
-def _retired_paths(root: Path) -> Iterator[str]:
-    yield from (f"{RETIRED}/{path.name}" for path in sorted((root / RETIRED).glob("*.cert.pem")))
+def _retired_paths(keystore: OpenedKeystore) -> Iterator[str]:
+    authorities = sorted((keystore.root / RETIRED).glob("*.cert.pem"))
+    yield from (f"{RETIRED}/{path.name}" for path in authorities)
 
 
-def _files(root: Path, paths: Iterator[str]) -> dict[str, list[str]]:
+def _files(keystore: OpenedKeystore, paths: Iterator[str]) -> dict[str, list[str]]:
     """Map the SHA-256 digests that the ledger uses to the existing files among ``paths``."""
     paths_by_digest: dict[str, list[str]] = {}
     for path in paths:
-        if (root / path).is_file() and not (root / path).is_symlink():
-            for digest in _digests(root / path):
+        file = keystore.root / path
+        if file.is_file() and not file.is_symlink():
+            for digest in _digests(file):
                 paths_by_digest.setdefault(digest, []).append(path)
     return paths_by_digest
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from fnmatch import fnmatchcase
-from pathlib import Path
 from shlex import quote
 from typing import NamedTuple
 
@@ -123,7 +122,7 @@ def select_to_revoke(
     chosen |= dict.fromkeys(_robots_enclaves(keystore, robots, True, unrecorded))
     below = [name for enclaves in unrecorded.values() for name in enclaves.below]
     left = {name for enclaves in unrecorded.values() for name in enclaves.naming} - chosen.keys()
-    return tuple(chosen), tuple(_unrecorded_notes(keystore.root, sorted(below), sorted(left)))
+    return tuple(chosen), tuple(_unrecorded_notes(keystore, sorted(below), sorted(left)))
 
 
 def _possible_enclaves(
@@ -144,7 +143,9 @@ def _possible_enclaves(
     return sorted(name for name in possible if has_enclave(keystore.root, name))
 
 
-def _unrecorded_notes(root: Path, below: list[str], left: list[str]) -> Iterator[Note]:
+def _unrecorded_notes(
+    keystore: OpenedKeystore, below: list[str], left: list[str]
+) -> Iterator[Note]:
     if below:
         yield Note(
             "fleet.revoked-unrecorded",
@@ -156,7 +157,7 @@ def _unrecorded_notes(root: Path, below: list[str], left: list[str]) -> Iterator
             "fleet.unrecorded-enclaves",
             f"Still valid, because the fleet does not record whose it is: {_names_text(left)}, "
             "with the name of a robot that you revoke in the path. If the key was on that robot, "
-            f"run `sros revoke {quote(str(root))} {arguments_for(root, left)}`.",
+            f"run `sros revoke {quote(str(keystore.root))} {arguments_for(keystore.root, left)}`.",
         )
 
 
@@ -238,7 +239,7 @@ def missing_enclave_error(
     """
     root = keystore.root
     if revocation := revocation_of(keystore, name):
-        return _revoked_enclave_error(root, revocation)
+        return _revoked_enclave_error(keystore, revocation)
     missing = f"enclave {name} does not exist in keystore '{root}'"
     names = sorted(existing_enclaves)
     if below := [existing for existing in names if name and existing.startswith(f"{name}/")]:
@@ -306,7 +307,8 @@ def revocation_of(keystore: OpenedKeystore, name: str) -> Entry | None:
     return next(kept, of_enclave[-1])
 
 
-def _revoked_enclave_error(root: Path, entry: Entry) -> SrosError:
+def _revoked_enclave_error(keystore: OpenedKeystore, entry: Entry) -> SrosError:
+    root = keystore.root
     reason = "" if entry.reason in ("", "unspecified") else f" ({entry.reason})"
     folder = root / REVOKED / entry.serial
     return KeystoreError(

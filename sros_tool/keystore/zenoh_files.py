@@ -481,7 +481,7 @@ def zenoh_documents(
         among: the enclaves whose rights these configurations have; () for all.
     """
     root = keystore.root
-    of_network = _domains(network, domains, root)
+    of_network = _domains(network, domains, keystore)
     existing = keystore.names if existing is None else existing
     names = sorted({*existing, *change.issued}.difference(change.gone))
     for router in network.router_names():
@@ -653,8 +653,11 @@ def _router_files(
     return files
 
 
-def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int, ...]:
+def _domains(
+    network: ZenohNetwork, domains: DomainSet, keystore: OpenedKeystore
+) -> tuple[int, ...]:
     """Return the ROS domains of the network, all of which the governance has."""
+    root = keystore.root
     if unserved := [domain for domain in network.domains if domain not in domains]:
         raise UsageError(
             f"the Zenoh network has domain {unserved[0]}, and keystore '{root}' only {domains}",

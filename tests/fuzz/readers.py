@@ -236,7 +236,7 @@ def _log(data: bytes, _place: Place) -> None:
 def _ledger(data: bytes, place: Place) -> None:
     place.replace("ledger.jsonl", data)
     _ = OpenedKeystore(place.keystore).ledger
-    history(place.keystore, now=NOW)
+    history(OpenedKeystore(place.keystore), now=NOW)
 
 
 def _zenoh(data: bytes, place: Place) -> None:
@@ -249,7 +249,7 @@ def _zenoh(data: bytes, place: Place) -> None:
 def _rotation(data: bytes, place: Place) -> None:
     place.replace("rotation.json", data)
     read_rotation(OpenedKeystore(place.keystore))
-    rotation_status(place.keystore, now=NOW)
+    rotation_status(OpenedKeystore(place.keystore), now=NOW)
 
 
 def _answer(data: bytes, place: Place) -> None:

@@ -65,7 +65,7 @@ def see(root: Path) -> Seen:
 def settled(root: Path) -> Seen:
     """As `see`, when all is done: nothing is left behind, and the ledger knows everything."""
     assert not remains(root.parent)
-    assert not history(root, now=LATER).unexplained
+    assert not history(OpenedKeystore(root), now=LATER).unexplained
     for folder, folders, files in os.walk(root / "enclaves"):
         assert folders or files, f"{folder} is empty"
         assert all(Path(folder, file).exists() for file in files)

@@ -57,14 +57,17 @@ def see(root: Path) -> State:
         # One that is on its way out may be a broken link for a moment.
         assert not path.exists() or path.stat().st_mode & 0o777 == 0o600, path
     lists = tuple(len(each.revoked) for each in OpenedKeystore(root).revocation_lists)
-    on = tuple((each.state, each.enclaves) for each in rotation_status(root, now=LATER).authorities)
+    on = tuple(
+        (each.state, each.enclaves)
+        for each in rotation_status(OpenedKeystore(root), now=LATER).authorities
+    )
     return tuple(names), str(read_rotation(OpenedKeystore(root)).stage), on, lists
 
 
 def settled(root: Path) -> State:
     """As `see`, when all is done: nothing is left behind, and the ledger knows everything."""
     assert not remains(root.parent)
-    assert not history(root, now=LATER).unexplained
+    assert not history(OpenedKeystore(root), now=LATER).unexplained
     return see(root)
 
 

@@ -59,7 +59,7 @@ def settled(root: Path) -> State:
     """As `see`, when all is done: nothing is left behind, and the ledger knows everything."""
     assert not remains(root.parent)
     check_whole(root)
-    assert not history(root, now=LATER).unexplained
+    assert not history(OpenedKeystore(root), now=LATER).unexplained
     assert not present_settings(OpenedKeystore(root)).edits
     now = see(root)
     one = ("ca",) if now[0] == "sros2" else ("identity_ca", "permissions_ca")

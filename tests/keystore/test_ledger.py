@@ -152,7 +152,7 @@ def test_a_keystore_without_a_ledger_gets_one(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
     (root / LEDGER).unlink()
     assert OpenedKeystore(root).ledger.entries == ()
-    assert len(history(root, now=NOW).unexplained) == 5
+    assert len(history(OpenedKeystore(root), now=NOW).unexplained) == 5
     with pytest.raises(KeystoreError, match="not certain that"):
         renew(root, ["/a"], now=NOW)
     policy = tmp_path / "p.xml"
@@ -161,7 +161,7 @@ def test_a_keystore_without_a_ledger_gets_one(tmp_path: Path) -> None:
     renew(root, ["/a"], now=NOW)
     both = [("certificate", "/a"), ("permissions", "/a")]
     assert told(root) == [("gap", ""), ("permissions", "/a"), *both]
-    assert history(root, now=NOW).unexplained == (
+    assert history(OpenedKeystore(root), now=NOW).unexplained == (
         "enclaves/governance.p7s",
         "public/identity_ca.cert.pem",
         "public/permissions_ca.cert.pem",
@@ -173,7 +173,7 @@ def test_a_keystore_without_a_ledger_gets_one(tmp_path: Path) -> None:
 
 def statuses(root: Path, now: datetime) -> dict[tuple[str, str], list[str]]:
     found: dict[tuple[str, str], list[str]] = {}
-    for item in history(root, now=now).entries:
+    for item in history(OpenedKeystore(root), now=now).entries:
         found.setdefault((item.entry.what, item.entry.enclave), []).append(str(item.status))
     return found
 
@@ -201,18 +201,18 @@ def test_every_item_has_its_status(tmp_path: Path) -> None:
     assert found["permissions", "/a"] == ["expired", "current"]
     assert found["permissions", "/c"] == ["expired"]
     assert found["certificate", "/a"] == ["superseded", "current"]
-    paths = {item.path for item in history(root, now=end).entries}
+    paths = {item.path for item in history(OpenedKeystore(root), now=end).entries}
     assert "enclaves/a/cert.pem" in paths
     assert any(path.startswith("revoked/") for path in paths)
 
 
 def test_files_without_an_entry_are_listed(tmp_path: Path) -> None:
     root, other = made(tmp_path / "ks", "/a", "/b"), made(tmp_path / "other", "/a")
-    assert history(root, now=NOW).unexplained == ()
+    assert history(OpenedKeystore(root), now=NOW).unexplained == ()
     for file in ("cert.pem", "permissions.p7s"):
         (root / "enclaves/a" / file).write_bytes((other / "enclaves/a" / file).read_bytes())
     (root / "enclaves/b/cert.pem").write_bytes(b"no certificate")
-    assert history(root, now=NOW).unexplained == (
+    assert history(OpenedKeystore(root), now=NOW).unexplained == (
         "enclaves/a/cert.pem",
         "enclaves/a/permissions.p7s",
         "enclaves/b/cert.pem",

@@ -75,7 +75,7 @@ def test_renewing(new_key: bool, root: Path) -> None:
     sros("renew", root, "--all-expiring", "20y").ok()
     check(root, "/a", "/b/c", "/d")
     # The ledger begins with what was there, taken on trust.
-    found = history(root, now=NOW)
+    found = history(OpenedKeystore(root), now=NOW)
     assert {item.entry.enclave for item in found.entries} == {"", "/a", "/b/c", "/d"}
     assert found.unexplained == ()
 
@@ -139,7 +139,7 @@ def test_a_commit_that_fails_leaves_the_modes(root: Path, monkeypatch: pytest.Mo
     before = snapshot(root)
     opened = open_to_others(root)
     with monkeypatch.context() as broken:
-        broken.setattr("sros_tool.keystore.transaction.write_manifest", full)
+        broken.setattr("sros_tool.keystore.transaction._write_manifest", full)
         assert sros("renew", root, "/a").status == 2
     assert snapshot(root) == before
     assert open_to_others(root) == opened
@@ -198,7 +198,11 @@ def test_revoking(root: Path, tmp_path: Path) -> None:
     sros("crl", root, "--refresh").ok()
     check(root, "/a", "/b/c")
     assert len(OpenedKeystore(root).revocation_lists[0].revoked) == 1
-    revoked = {each.entry.what for each in history(root, now=NOW).entries if each.entry.serial}
+    revoked = {
+        each.entry.what
+        for each in history(OpenedKeystore(root), now=NOW).entries
+        if each.entry.serial
+    }
     assert revoked == {"revocation", "certificate", "ca"}
 
 
@@ -213,13 +217,13 @@ def test_rotating_with_a_revocation_in_every_stage(root: Path) -> None:
         check(root, *names, f"/new{number}")
         sros("revoke", root, f"/new{number}").ok()
         check(root, *names)
-    (state,) = rotation_status(root, now=NOW).authorities
+    (state,) = rotation_status(OpenedKeystore(root), now=NOW).authorities
     assert state.state == "issuing"
     assert state.serial != f"{old.serial_number:x}"
     assert len(list((root / "public").glob("*_ca.cert.pem"))) == 2
     assert all(path.is_symlink() for path in (root / "public").glob("*_ca.cert.pem"))
     assert (root / "private/ca.key.pem").stat().st_mode & 0o777 == 0o600
-    found = history(root, now=NOW)
+    found = history(OpenedKeystore(root), now=NOW)
     assert found.unexplained == ()
     assert {each.status for each in found.entries if each.entry.what == "ca"} == {
         HistoryStatus.CURRENT,

@@ -74,7 +74,7 @@ def test_revoking_another_drops_it_too_and_the_ledger_keeps_it(tmp_path: Path) -
     }
     (found,) = [
         item
-        for item in history(root, now=late).entries
+        for item in history(OpenedKeystore(root), now=late).entries
         if item.entry.serial == f"{serial:x}" and item.entry.what == "certificate"
     ]
     assert found.status is HistoryStatus.REVOKED

@@ -188,7 +188,7 @@ def test_signing_records_everything_but_the_key(home: Path, robot: Path) -> None
     assert key_digest(issued.public_key()) == signed.keys[NAME]  # type: ignore[arg-type]
     entries = [entry for entry in OpenedKeystore(home).ledger.entries if entry.enclave == NAME]
     assert [entry.what for entry in entries] == ["certificate", "permissions", "answer"]
-    assert not history(home, now=NOW).unexplained
+    assert not history(OpenedKeystore(home), now=NOW).unexplained
     with tarfile.open(fileobj=io.BytesIO(signed.archive)) as tar:
         names = {member.name for member in tar if member.isfile()}
         assert names == {SEAL, *(f"{FOLDER}/{file}" for file in SENT)}

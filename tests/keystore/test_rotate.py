@@ -102,7 +102,7 @@ def openssl(*words: object) -> None:
 
 
 def states(root: Path) -> list[tuple[str, str, int]]:
-    found = rotation_status(root, now=NOW).authorities
+    found = rotation_status(OpenedKeystore(root), now=NOW).authorities
     return [(each.roles[0], each.state, each.enclaves) for each in found]
 
 
@@ -226,7 +226,7 @@ def test_an_expired_ca_is_replaced(separate: Path) -> None:
 def test_the_status_says_when_it_is_time(
     days: int, identity: str, permissions: str, separate: Path
 ) -> None:
-    remarks = rotation_status(separate, now=NOW + timedelta(days=days)).remarks
+    remarks = rotation_status(OpenedKeystore(separate), now=NOW + timedelta(days=days)).remarks
     wanted = [text for text in (identity, permissions) if text]
     assert len(remarks) == len(wanted)
     assert all(text in remark for text, remark in zip(wanted, remarks, strict=True))
@@ -237,12 +237,12 @@ def test_what_fast_dds_cannot_tell_apart_is_said(kind: str, separate: Path) -> N
     """ros2/sros2 makes CAs without identifiers; Fast DDS 2.9.1 was run with those."""
     rotate_ca(separate, now=NOW)
     rotate_ca(separate, now=NOW)
-    fast = rotation_status(separate, now=NOW).remarks[0]
+    fast = rotation_status(OpenedKeystore(separate), now=NOW).remarks[0]
     assert fast.startswith("Fast DDS: restart the processes one by one")
     foreign = foreign_ca(kind)
     path = separate / "public/permissions_ca.cert.pem"
     path.write_bytes(path.read_bytes() + foreign)
-    fast = rotation_status(separate, now=NOW).remarks[0]
+    fast = rotation_status(OpenedKeystore(separate), now=NOW).remarks[0]
     assert fast.startswith("Fast DDS: the old permissions CA has ")
     assert fast.endswith("Restart all processes together.")
 
@@ -557,7 +557,7 @@ def test_death_at_every_step(stage: RotationStage | None, tmp_path: Path) -> Non
         for name in NAMES:
             assert open_enclave(enclave_path(root, name), now=NOW).problems == (), (step, name)
             check_enclave_whole(enclave_path(root, name))
-        rotation_status(root, now=NOW)
+        rotation_status(OpenedKeystore(root), now=NOW)
         if stage is not None or shape_after_tidy(root) == start:
             verb(root)()
         assert shape(root) == wanted, step

@@ -33,7 +33,7 @@ def root(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 def standing(root: Path) -> dict[str, tuple[HistoryStatus, str]]:
     """By the digests of CAs and lists, what the history says of each, and where it lies."""
-    found = history(root, now=NOW)
+    found = history(OpenedKeystore(root), now=NOW)
     assert not found.unexplained
     return {
         item.entry.sha256: (item.status, item.path)
@@ -58,10 +58,18 @@ def test_the_history_knows_both_cas_and_their_lists(root: Path) -> None:
             if stage is RotationStage.RETIRE:
                 expected = (HistoryStatus.RETIRED, f"retired/{first.serial_number:x}.cert.pem")
             assert standing(root)[digest(first)] == expected
-        lists = [each for each in history(root, now=NOW).entries if each.entry.what == "crl"]
+        lists = [
+            each
+            for each in history(OpenedKeystore(root), now=NOW).entries
+            if each.entry.what == "crl"
+        ]
         current = [each for each in lists if each.status is HistoryStatus.CURRENT]
         assert len(current) == (1 if stage is RotationStage.RETIRE else 2)
-    gone = [each for each in history(root, now=NOW).entries if each.entry.enclave == "/c"]
+    gone = [
+        each
+        for each in history(OpenedKeystore(root), now=NOW).entries
+        if each.entry.enclave == "/c"
+    ]
     # Its permissions were put away with its certificate; the new CA's list names neither.
     assert Counter(each.status for each in gone) == {HistoryStatus.REVOKED: 3}
 
@@ -135,10 +143,10 @@ def test_a_stranger_in_the_file_of_a_ca_is_named(root: Path, tmp_path: Path) -> 
     """Fast DDS would trust it: the first certificate of a file does not vouch for the next."""
     create_keystore(tmp_path / "other", template=load_template("production"), now=NOW)
     file = f"public/{next(iter(OpenedKeystore(root).authority_files))}.cert.pem"
-    assert not history(root, now=NOW).unexplained
+    assert not history(OpenedKeystore(root), now=NOW).unexplained
     with (root / file).open("ab") as stream:
         stream.write((tmp_path / "other/public/identity_ca.cert.pem").read_bytes())
-    assert history(root, now=NOW).unexplained == (file,)
+    assert history(OpenedKeystore(root), now=NOW).unexplained == (file,)
     assert f"NOT IN THE LEDGER  {file}" in sros("inspect", root, "--history").out
 
 

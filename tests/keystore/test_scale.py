@@ -109,7 +109,9 @@ def test_revoking_a_robot_and_renewing_the_others(root: Path) -> None:
     done = sros("renew", root, "--all-expiring", "100y").ok()
     assert f"renewed {len(rest)} enclaves: " in done.out
     assert all((root / f"enclaves{name}/cert.pem").read_bytes() != before[name] for name in rest)
-    made = history(root, now=parse_iso(OpenedKeystore(root).ledger.entries[-1].time))
+    made = history(
+        OpenedKeystore(root), now=parse_iso(OpenedKeystore(root).ledger.entries[-1].time)
+    )
     assert (made.gaps, made.unexplained) == ((), ())
     current = [e for e in made.entries if e.status is HistoryStatus.CURRENT and e.entry.enclave]
     assert len(current) == 2 * len(rest)

@@ -124,7 +124,7 @@ def test_parts_are_sealed_and_read_as_one_ledger(root: Path) -> None:
     assert len(whole.entries) == whole.lines
     assert [entry.number for entry in whole.entries if entry.what == "sealed"] == [1, 2]
     assert {name: (root / name).read_bytes() for name in sealed} == sealed
-    assert not history(root, now=NOW).unexplained
+    assert not history(OpenedKeystore(root), now=NOW).unexplained
     sros(*CHECK, root).ok()
 
 

@@ -173,7 +173,7 @@ def _lives(folder: Path) -> list[Window]:
 
 def check_history(root: Path, now: datetime) -> dict[str, int]:
     """The ledger explains every file, and nothing that is served has ended or is revoked."""
-    found = history(root, now=now)
+    found = history(OpenedKeystore(root), now=now)
     assert not found.unexplained
     counts = dict.fromkeys(HistoryStatus, 0)
     for item in found.entries:

@@ -108,7 +108,7 @@ def sound(root: Path) -> None:
     for name in list_enclaves(root):
         assert open_enclave(enclave_path(root, name), now=LATER).problems_in_keystore == (), name
     # No ledger has the CA that ros2/sros2 made.
-    left = set(history(root, now=LATER).unexplained)
+    left = set(history(OpenedKeystore(root), now=LATER).unexplained)
     assert left <= {"public/identity_ca.cert.pem", "public/permissions_ca.cert.pem"}
 
 
@@ -566,7 +566,7 @@ def test_an_edit_is_found_and_taken_over_or_undone(case: str, root: Path, tmp_pa
     assert (note.id, "--take-edits" in note.text) == ("keystore.edited", True)
     (note,) = create_enclaves(root, ["/late"], now=NOW).notes
     assert note.id == "keystore.edited"
-    target, domains = edited_settings(root, present_settings(OpenedKeystore(root)))
+    target, domains = edited_settings(OpenedKeystore(root), present_settings(OpenedKeystore(root)))
     if looser:
         with pytest.raises(UsageError, match="looser"):
             update_keystore(root, target, domains, now=LATER, replace_edits=True)
@@ -720,12 +720,12 @@ def test_edits_that_contradict_each_other(root: Path) -> None:
     _stronger_settings(root)
     _governance(root)
     with pytest.raises(KeystoreError, match="differ"):
-        edited_settings(root, present_settings(OpenedKeystore(root)))
+        edited_settings(OpenedKeystore(root), present_settings(OpenedKeystore(root)))
 
 
 def test_without_an_edit_there_is_nothing_to_take(root: Path) -> None:
     with pytest.raises(KeystoreError, match=r"no file .* was edited"):
-        edited_settings(root, present_settings(OpenedKeystore(root)))
+        edited_settings(OpenedKeystore(root), present_settings(OpenedKeystore(root)))
 
 
 def test_a_keystore_from_before_the_record(root: Path) -> None:

@@ -166,7 +166,7 @@ def sign_request(
             request, renew=renew, named=bool(only_enclaves) and not refuse_revoked
         )
         signer.keep_zenoh()
-        files = _answer_files(root, issued, change.zenoh)
+        files = _answer_files(change.keystore, issued, change.zenoh)
         number = change.keystore.ledger_file.next_number()
         sealed = seal(files, number, change.permissions)
         if not change.is_guess:
@@ -389,9 +389,9 @@ class _Signer:
         change, root, name = self._change, self._root, request.name
         known, authority = change.known, change.permissions.certificate
         stated = self._stated_rights[name].enclave
-        _check_name(root, name, renew, has_enclave(root, name))
+        _check_name(change.keystore, name, renew, has_enclave(root, name))
         if stated is not None:
-            refuse_less_protected(root, change.governance, stated_protections([stated]))
+            refuse_less_protected(change.keystore, change.governance, stated_protections([stated]))
         present = change.keystore.certificate_of(name) if renew else None
         _check_key(request, known, present)
         if not (self._replace_keys and self._keep_only_key_of(request)):
@@ -507,16 +507,18 @@ def _check_free(answer: Path, force: bool) -> None:
         )
 
 
-def _check_name(root: Path, name: str, renew: bool, has_enclave_already: bool) -> None:
+def _check_name(
+    keystore: OpenedKeystore, name: str, renew: bool, has_enclave_already: bool
+) -> None:
     if has_enclave_already and not renew:
         raise KeystoreError(
-            f"enclave {name} already exists in keystore '{root}'",
+            f"enclave {name} already exists in keystore '{keystore.root}'",
             "The sender of the request would get the rights of this enclave.",
             "If that is intended, add --renew; otherwise create the request for another name.",
         )
     if renew and not has_enclave_already:
         raise KeystoreError(
-            f"enclave {name} does not exist in keystore '{root}'",
+            f"enclave {name} does not exist in keystore '{keystore.root}'",
             "Only an existing enclave can be renewed.",
             "Leave --renew out.",
         )
@@ -617,7 +619,7 @@ def _earlier_rights(
     return change.recorded.rights_to_sign(name, old.digest, old.grant)
 
 
-def _answer_files(root: Path, issued: Issued, zenoh: KeptZenoh) -> dict[str, bytes]:
+def _answer_files(keystore: OpenedKeystore, issued: Issued, zenoh: KeptZenoh) -> dict[str, bytes]:
     """Map the paths of the answer's files to their content, sorted by path."""
     name = issued.issuance.name
     folder = enclave_folder(name)
@@ -625,19 +627,19 @@ def _answer_files(root: Path, issued: Issued, zenoh: KeptZenoh) -> dict[str, byt
         f"{folder}/{CERTIFICATE_FILE}": pem(issued.certificate),
         f"{folder}/{PERMISSIONS_FILE}": issued.document,
     }
-    shared = {GOVERNANCE_FILE: GOVERNANCE_P7S, **shared_files(root, name)}
+    shared = {GOVERNANCE_FILE: GOVERNANCE_P7S, **shared_files(keystore.root, name)}
     for file in ZENOH_FILES if name in zenoh.files else ():
         path = f"{folder}/{file}"
         if path in zenoh.written:
             files[path] = zenoh.written[path]
-        elif (root / path).is_file():
+        elif (keystore.root / path).is_file():
             shared[file] = path
-    with Folder(root) as opened:
+    with Folder(keystore.root) as opened:
         for file, source in shared.items():
             files[f"{folder}/{file}"] = data = opened.read_inside(source)
             if holds_private_key(data):
                 raise KeystoreError(
-                    f"'{root / source}' contains a private key",
+                    f"'{keystore.root / source}' contains a private key",
                     "The key would get into the answer, and so to the robot.",
                     "Remove the key from the file.",
                 )

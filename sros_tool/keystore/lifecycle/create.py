@@ -668,7 +668,7 @@ def _raise_protection(
     change.remarks += (
         Note("keystore.governance-by-policy", text),
         restart_note(mismatch(governance, after)),
-        exports_note(root, change.names),
+        exports_note(change.keystore, change.names),
         Note(
             "keystore.earlier-governance",
             "The signature of the former governance stays valid: anyone who can change the files "
@@ -680,12 +680,13 @@ def _raise_protection(
 
 
 def refuse_less_protected(
-    root: Path, governance: Governance, stated_protections: Sequence[StatedProtection]
+    keystore: OpenedKeystore, governance: Governance, stated_protections: Sequence[StatedProtection]
 ) -> None:
     """Raise `KeystoreError` if a policy demands more protection than the governance gives.
 
     Used when requests are signed, because all robots would need a changed governance.
     """
+    root = keystore.root
     for name, level in less_protected(governance, stated_protections):
         kinds = "data=ENCRYPT" if name.level is Level.ENCRYPT else "metadata=SIGN"
         raise KeystoreError(
@@ -734,18 +735,18 @@ def _restart_text(mismatch: Mismatch, *, revoked: bool) -> str:
     )
 
 
-def exports_note(root: Path, names: Sequence[str]) -> Note:
+def exports_note(keystore: OpenedKeystore, names: Sequence[str]) -> Note:
     """Return a note that robots need new files, with the commands that deliver them."""
-    if published := publish_command(root):
+    if published := publish_command(keystore.root):
         text = (
             f"Robots have the former files: publish the new ones ({published}); if nodes run from "
             "an export, export them again."
         )
         return Note("keystore.export-again", text)
-    shown = quote(str(root))
+    shown = quote(str(keystore.root))
     text = "Robots have the former files: export the new ones (`sros distribute_key "
     text += f"{shown} ENCLAVE TARGET --force`)"
-    remote = [name for name in names if key_on_robot(enclave_path(root, name))]
+    remote = [name for name in names if key_on_robot(keystore.folder(name))]
     if remote:
         text += f"; for {', '.join(remote)}, answer the request again (`sros sign_request "
         text += f"{shown} REQUEST --renew`)"

@@ -28,7 +28,7 @@ from sros_tool.keystore.layout import (
     ROLES,
     ROTATION,
 )
-from sros_tool.keystore.reader import OpenedKeystore, open_keystore
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.certificates import (
     digest,
     issued_by,
@@ -178,9 +178,9 @@ def render_rotation(rotation: Rotation) -> bytes:
     return json.dumps(content, indent=2).encode() + b"\n"
 
 
-def rotation_status(root: Path, *, now: datetime) -> RotationStatus:
+def rotation_status(keystore: OpenedKeystore, *, now: datetime) -> RotationStatus:
     """Return the stage of a keystore, its trusted CAs with their validity, and remarks."""
-    keystore = open_keystore(root)
+    keystore.check()
     names = keystore.names
     rotation = read_rotation(keystore)
     by_file = {replacement.file: replacement for replacement in rotation.replacements}
@@ -210,7 +210,7 @@ def rotation_status(root: Path, *, now: datetime) -> RotationStatus:
         if rotation.stage is RotationStage.NONE
         else _restart_remarks(keystore, rotation)
     )
-    return RotationStatus(root, rotation, tuple(states), len(names), tuple(remarks))
+    return RotationStatus(keystore.root, rotation, tuple(states), len(names), tuple(remarks))
 
 
 def _count(

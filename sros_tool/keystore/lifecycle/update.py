@@ -148,13 +148,16 @@ class KeystoreUpdate(Changed):
 # ── what is, and what shall be ─────────────────────────────────────────────────────────────
 
 
-def edited_settings(root: Path, present_settings: PresentSettings) -> tuple[Template, DomainSet]:
+def edited_settings(
+    keystore: OpenedKeystore, present_settings: PresentSettings
+) -> tuple[Template, DomainSet]:
     """Return the settings and domains that the edited files of a keystore state.
 
     Raises:
         KeystoreError: nothing was edited, both files were edited to different protection, or
             settings cannot state the governance.
     """
+    root = keystore.root
     edits = present_settings.edits
     if not edits:
         raise KeystoreError(
@@ -201,7 +204,9 @@ def edited_settings(root: Path, present_settings: PresentSettings) -> tuple[Temp
     return replace(written, protection=protection), governance.domains().closed()
 
 
-def _checked_target(root: Path, present_settings: PresentSettings, target: Template) -> Template:
+def _checked_target(
+    keystore: OpenedKeystore, present_settings: PresentSettings, target: Template
+) -> Template:
     """Return ``target`` with the places of the current CA keys.
 
     Raises:
@@ -217,7 +222,7 @@ def _checked_target(root: Path, present_settings: PresentSettings, target: Templ
                 f"Leave authorities.{name} out; `sros rotate_ca --{name.replace('_', '-')}` makes "
                 "a CA with a key elsewhere.",
             )
-    if not target.separate_authorities and len(OpenedKeystore(root).authority_files) > 1:
+    if not target.separate_authorities and len(keystore.authority_files) > 1:
         raise UsageError(
             "a keystore with separate CAs cannot change back to one CA for both purposes",
             "With one CA, every enclave can sign its own permissions (Cyclone DDS 0.10.2, Fast DDS "
@@ -300,7 +305,8 @@ def update_keystore(
                 f"First apply or undo the edit: {edit_remedy(root)}",
             )
         goal = _Goal(
-            _checked_target(root, present, target), domains.closed() if domains else present.domains
+            _checked_target(change.keystore, present, target),
+            domains.closed() if domains else present.domains,
         )
         pending = _pending_stages(present, goal)
         done = pending[:1] if next_stage else pending
@@ -494,7 +500,7 @@ class _Updater:
         if change.restart:
             disturbed = mismatch(self._present.governance, governance)
             change.remarks.append(restart_note(disturbed, revoked=revoked))
-            change.remarks.append(exports_note(self._root, names))
+            change.remarks.append(exports_note(change.keystore, names))
         change.remarks += self._kept_open_notes()
         change.remarks += self._open_tasks(settings)
         ends = [right.works_until for right in rights if right.works_until]
