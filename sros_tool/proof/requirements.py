@@ -209,8 +209,8 @@ def demand(requirement: Requirement) -> str:
         case Widest(rights=rights, enclaves=enclaves):
             if not any(names for _, names in rights):
                 rights_text = _rights_text(rights).replace(" nothing", "")
-                return f"no wildcard may let {enclaves_text(enclaves)} {rights_text}"
-            return f"wildcards may let {enclaves_text(enclaves)} only {_rights_text(rights)}"
+                return f"{enclaves_text(enclaves)} may use no wildcard to {rights_text}"
+            return f"{enclaves_text(enclaves)} may use wildcards only to {_rights_text(rights)}"
         case NothingBut(rights=rights, enclaves=enclaves):
             return f"{enclaves_text(enclaves)} may do nothing but {_rights_text(rights)}"
         case NotBoth(first=first, second=second):
@@ -845,7 +845,7 @@ class DroppedRequirement:
         """Return a clause with the part of the requirement that the new file still demands."""
         if not self.kept:
             return "the new file has no such requirement"
-        return f"only this is left of it: {'; '.join(self.now)}"
+        return f"the new file demands less: {'; '.join(self.now)}"
 
 
 def dropped_requirements(

@@ -136,7 +136,7 @@ def test_what_is_no_longer_demanded(folder: Path, tmp_path: Path) -> None:
     head = f"{new}: warning: a requirement that was removed or weakened [requirement.dropped]"
     assert ended.out.splitlines().count(head) == 3
     assert (
-        "    only /mux may publish /cmd_vel: only this is left of it: "
+        "    only /mux may publish /cmd_vel: the new file demands less: "
         "only /mux, /web may publish /cmd_vel\n"
         "      required.toml:2: required before\n"
     ) in ended.out

@@ -117,7 +117,7 @@ def test_each_says_what_it_demands() -> None:
         "nobody may request */set_parameters",
         "/robot/mux has to be able to publish /x and call action /go",
         "at most 1 enclave may execute action /go",
-        "no wildcard may let * reply",
+        "* may use no wildcard to reply",
         "topic /camera/*, action /go has to be encrypted",
         "/web/* must not influence / except through /robot/mux",
         "service /x has to be signed",
@@ -210,5 +210,5 @@ def test_proposals_have_no_name_that_the_file_could_not_have() -> None:
     text = render_requirements(suggest(rights, [world]), 'a "file"\n')
     found = parse_requirements(text.encode(), "r.toml")
     assert [demand(each) for each in found][:1] == ["only /e may publish /ok"]
-    assert "wildcards may let * only publish /fine*" in map(demand, found)
+    assert "* may use wildcards only to publish /fine*" in map(demand, found)
     assert "\x1b" not in text

@@ -117,7 +117,7 @@ def test_dropping_a_requirement_is_a_consent_of_its_own(change: Change) -> None:
     words = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
     failed = change.review(*words)
     lines = (
-        "  robot.toml: warning: only /a may publish /x: only this is left of it: only /a, /b may "
+        "  robot.toml: warning: only /a may publish /x: the new file demands less: only /a, /b may "
         f"publish /x [requirement.dropped] (required before: git:{change.base[:12]}:robot.toml:1)",
         "  robot.xml:6: error: /b: may publish /x, but only /a may publish /x "
         "[requirement.violated]",

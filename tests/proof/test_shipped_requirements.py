@@ -110,7 +110,7 @@ MUTATIONS = [
               "controller publish /cmd_vel_nav", "velocity_mux subscribe /cmd_vel_nav",
               "velocity_mux publish /cmd_vel", "base subscribe /cmd_vel"),
              publish("speed_limit")),
-    Mutation("lidar_driver", "wildcards may let * only publish /front_camera/image_raw/*",
+    Mutation("lidar_driver", "* may use wildcards only to publish /front_camera/image_raw/*",
              ("lidar publish /scan_",), publish("scan_*")),
 ]  # fmt: skip
 
