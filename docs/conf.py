@@ -50,12 +50,13 @@ html_theme_options = {"navigation_with_keys": True}
 
 
 def _mark_lines(code: re.Match[str]) -> str:
-    """Mark the lines of a block of code, so that the rest of a long line is indented further."""
+    """Mark commands, and lines of code so that the rest of a long line is indented further."""
     marked = []
     for line in code[2].splitlines(keepends=True):
         text = re.sub(r"<[^>]+>", "", line)
         rest = min(len(text) - len(text.lstrip(" ")), 12) + 2
-        marked.append(f'<span class="line" style="--rest: {rest}ch">{line}</span>')
+        kind = "line command" if text.startswith("$ ") else "line"
+        marked.append(f'<span class="{kind}" style="--rest: {rest}ch">{line}</span>')
     return f"{code[1]}{''.join(marked)}</pre>"
 
 
