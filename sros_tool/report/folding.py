@@ -17,7 +17,6 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import (
     Callable,
-    Collection,
     Container,
     Iterable,
     Iterator,
@@ -57,6 +56,8 @@ _SELF = -1
 _TITLE_LETTERS = 30
 """Maximum length of the title of a frame, in characters; a frame is as wide as a card."""
 _ENCLAVE = "enclave"
+_Part = tuple[int, tuple[int, ...]]
+"""What is seen of a unit: the number of its kind, and the units in its texts as symbols."""
 
 
 class Folding(NamedTuple):
@@ -268,6 +269,7 @@ class _Draft:
         """Return the folding; its picture is unchanged if nothing can be folded."""
         if self._of and not self._has_marks():
             self._kinds: dict[object, int] = {}
+            self._common_kinds: set[int] = set()
             self._seen = tuple(self._sightings())
             classes = self._find_classes()
             if self._picture.focus:
@@ -334,7 +336,10 @@ class _Draft:
                 *(edge.violates, (edge.kind, edge.name) in targets),
                 *((used.protection, used.wildcard) if used else ()),
             )
-            yield self._kind(drawn), units, edge
+            kind = self._kind(drawn)
+            if edge.common:
+                self._common_kinds.add(kind)
+            yield kind, units, edge
 
     def _stated_edges(self) -> Iterator[Edge]:
         """Yield, as they are stated, the rights that the picture changes or does not show.
@@ -368,7 +373,7 @@ class _Draft:
         named = self._named_by(usual)
         for unit, *later_units in classes.values():
             family = self._units[unit].family
-            near = family in usual and _are_alike(parts[unit], parts[usual[family]])
+            near = family in usual and self._are_alike(parts[unit], parts[usual[family]])
             if not later_units and not (near and 2 * named[unit] <= sizes[family]):
                 self._symbols[unit] = -unit - 2
         before = [0] * len(parts)
@@ -391,9 +396,9 @@ class _Draft:
         unread = (self._unread.get(name, ()) for name in names)
         return tuple(sorted([*names, *chain.from_iterable(unread)], key=name_order))
 
-    def _parts_by_unit(self) -> list[Counter[object]]:
+    def _parts_by_unit(self) -> list[Counter[_Part]]:
         """Return the parts of the picture that name each unit, with symbols in place of units."""
-        parts: list[Counter[object]] = [Counter() for _ in self._units]
+        parts: list[Counter[_Part]] = [Counter() for _ in self._units]
         for kind, units, _what in self._seen:
             for unit in set(units):
                 parts[unit][kind, self._symbols_around(units, unit)] += 1
@@ -403,6 +408,16 @@ class _Draft:
         return tuple(
             _SELF if other_unit == unit else self._symbols[other_unit] for other_unit in units
         )
+
+    def _are_alike(self, view: Iterable[_Part], other: Iterable[_Part]) -> bool:
+        """Return whether two drawings of units have at least half of their content in common.
+
+        Rights that every node needs do not count: they would make any two enclaves alike.
+        """
+        own, others = (
+            {part for part in parts if part[0] not in self._common_kinds} for parts in (view, other)
+        )
+        return 2 * len(own & others) >= max(len(own), len(others))
 
     def _named_by(self, families: Container[int]) -> Counter[int]:
         """Return how many other units of its family have rights to names of each unit."""
@@ -423,7 +438,7 @@ class _Draft:
         self._inside = {n: number for number, members in self._classes.items() for n in members}
         self._enclaves: dict[str, tuple[str, ...]] = {}
         self._names: dict[tuple[str, str], tuple[str, ...]] = {}
-        self._are_alike: dict[object, list[str]] | None = None
+        self._names_of_form: dict[object, list[str]] | None = None
         different, differing_parts = self._differing_units()
         edges = tuple(sorted(set(self._edges(differing_parts)), key=edge_order))
         picture = replace(
@@ -554,12 +569,12 @@ class _Draft:
         """Yield the real names that a drawn name with labels stands for."""
         if len(name.named) == 1 and name.units[0] in self._inside:
             return self._per_unit(name, self._inside[name.units[0]])
-        if self._are_alike is None:
-            self._are_alike = defaultdict(list)
+        if self._names_of_form is None:
+            self._names_of_form = defaultdict(list)
             for real in self._picture.names:
                 if (text := self._text(real.name)).named:
-                    self._are_alike[real.kind, self._text_form(text)].append(real.name)
-        return self._are_alike[kind, self._text_form(name)]
+                    self._names_of_form[real.kind, self._text_form(text)].append(real.name)
+        return self._names_of_form[kind, self._text_form(name)]
 
     def _text_form(self, text: UnitText) -> object:
         return text.form, tuple(self._symbols[unit] for unit in text.units)
@@ -618,7 +633,7 @@ class _Draft:
             and self._is_drawn(n)
             and self._inside.get(n) != self._inside[usual]
         }
-        seen: dict[int, dict[object, Edge | str]] = {n: {} for n in (*near.keys(), *near.values())}
+        seen: dict[int, dict[_Part, Edge | str]] = {n: {} for n in (*near.keys(), *near.values())}
         for kind, units, part in self._seen:
             for unit in seen.keys() & set(units):
                 seen[unit].setdefault((kind, self._symbols_around(units, unit)), part)
@@ -626,7 +641,7 @@ class _Draft:
         differing_parts: set[Edge | str] = set()
         for n in sorted(near, key=self._unit_name_order):
             own_parts, near_parts = seen[n], seen[near[n]]
-            if _are_alike(own_parts, near_parts):
+            if self._are_alike(own_parts, near_parts):
                 more = [part for key, part in own_parts.items() if key not in near_parts]
                 fewer = [part for key, part in near_parts.items() if key not in own_parts]
                 differing_parts.update(more)
@@ -664,7 +679,7 @@ class _Draft:
                 yield f"{enclave} {deny}{part.right} {self._text(part.name).fill(word)}"
 
 
-def _classes(views: Sequence[Counter[object]], before: Sequence[int]) -> dict[int, list[int]]:
+def _classes(views: Sequence[Counter[_Part]], before: Sequence[int]) -> dict[int, list[int]]:
     """Divide classes of units, so that only units with equal views stay in the same class."""
     numbers: dict[object, int] = {}
     classes: dict[int, list[int]] = defaultdict(list)
@@ -673,11 +688,6 @@ def _classes(views: Sequence[Counter[object]], before: Sequence[int]) -> dict[in
             key = before[unit], frozenset(view.items())
             classes[numbers.setdefault(key, len(numbers))].append(unit)
     return classes
-
-
-def _are_alike(view: Collection[object], other: Collection[object]) -> bool:
-    """Return whether two drawings of units have at least half of their content in common."""
-    return 2 * len(set(view).intersection(other)) >= max(len(view), len(other))
 
 
 def _unfolded(picture: Picture) -> Folding:

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sros_tool.fleet.robots import Robot
+from sros_tool.names import NODE_SERVICES
 from sros_tool.policy.model import ALLOW, DENY
 from sros_tool.policy.rights import Right
 from sros_tool.report.compose import PictureSource, compose, overlay
@@ -88,6 +89,24 @@ def test_a_robot_that_differs_stands_alone_and_says_in_what(
     assert len(marked) == 1
     assert {each.path for each in folding.picture.enclaves} >= {"/r5/base", "/{r1…r12}/base"}
     assert any(link.differs for scene in folding.scenes() for link in scene.links)
+
+
+def test_what_every_node_needs_makes_nothing_alike(tmp_path: Path) -> None:
+    """A battery has parameters as cameras have, and is no camera that differs."""
+    sensors = {
+        name: group("topics", "publish", f"/{name}/image", f"/{name}/info", f"/{name}/state")
+        for name in ("left_camera", "right_camera")
+    }
+    sensors["battery"] = group("topics", "publish", "/charge")
+    enclaves = {
+        f"/{name}": own
+        + group("topics", "publish", "/rosout", "/parameter_events")
+        + group("services", "reply", *(f"/{name}/{service}" for service in NODE_SERVICES))
+        for name, own in sensors.items()
+    }
+    folding = Folding.of(picture_of(tmp_path, enclaves))
+    assert [units.members for units in folding.equal] == [("left_camera", "right_camera")]
+    assert not folding.different
 
 
 @pytest.mark.parametrize("more", ["/parameter_*", "/left/*", "/left/more"])
