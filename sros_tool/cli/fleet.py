@@ -793,6 +793,8 @@ def _remedies(root: Path, to_dos: Collection[str]) -> Mapping[str, str]:
         "renew": f"`sros renew {where} --all-expiring 30d`, then {publish or 'deliver'}",
         "take it out of the fleet file": "remove the robot from the fleet file, and run "
         f"`sros generate_artifacts -k {where} -p POLICY --fleet FILE`",
+        "upgrade the DDS": "upgrade the package of the library, which is named below, on the "
+        "robot, and restart the robot's processes",
     }
     return {
         name: known[name] for name in known if known[name] and any(name in text for text in to_dos)

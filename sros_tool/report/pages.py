@@ -15,7 +15,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
-from itertools import groupby, starmap
+from itertools import groupby
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -121,7 +121,8 @@ def _page_data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> d
     for each right.
     """
     return {
-        "headlines": picture.headlines,
+        "headlines": picture.answers,
+        "notes": picture.notes,
         "overlay": as_plain(picture.overlay),
         "of_every_node": OF_EVERY_NODE,
         "join_needs_right": picture.join_needs_right,
@@ -209,11 +210,13 @@ def _table(rows: list[dict[str, Any]]) -> list[list[Any]]:
 Json = Mapping[str, Any]
 _SKIPPED = "skipped"
 _MOST_NAMES = 4
+_MOST_OPEN_ROWS = 20
 
 
 def render_demo_page(result: Json, made: str) -> str:
     """Return the HTML page of a demo's result; ``made`` says by which release of sros, and when."""
-    scenarios = starmap(_demo_scenario, enumerate(result["scenarios"]))
+    is_only = len(result["scenarios"]) == 1
+    scenarios = (_demo_scenario(scenario, is_only=is_only) for scenario in result["scenarios"])
     body = "\n".join((_demo_head(result, made), *scenarios, _demo_vulnerabilities(result)))
     title = f"sros demo on {result['dds']}"
     return _document(title, f"<main>{body}</main>", _asset("demo.css"))
@@ -226,7 +229,7 @@ def without_folders(value: Any, folders: Sequence[str]) -> Any:
             value = value.replace(folder, "…") if len(folder) > 1 else value
         return value
     if isinstance(value, Mapping):
-        return {key: without_folders(each, folders) for key, each in value.items()}
+        return {key: without_folders(item, folders) for key, item in value.items()}
     if isinstance(value, Sequence):
         return [without_folders(item, folders) for item in value]
     return value
@@ -282,21 +285,8 @@ def _demo_head(result: Json, made: str) -> str:
     return (
         f"<header><h1>sros demo: {good} of {len(rows)} attempts ended as they should</h1>"
         f"<p>On a real middleware: {', '.join(facts)}. {_sentence(made)}</p>"
-        f'<ul class="tiles">{shown}</ul><p class="soft">{_sentence(why)}</p>'
-        f"{_demo_contents(result['scenarios'])}</header>"
+        f'<ul class="tiles">{shown}</ul><p class="soft">{_sentence(why)}</p></header>'
     )
-
-
-def _demo_contents(scenarios: Sequence[Json]) -> str:
-    """Return links to the scenarios, where there are several."""
-    if len(scenarios) < 2:
-        return ""
-    lines = (
-        f'<li><a href="#scenario-{number}">{escape(each["title"])}: '
-        f"{_number_as_expected(each['rows'])} of {len(each['rows'])}</a></li>"
-        for number, each in enumerate(scenarios)
-    )
-    return f'<ul class="contents">{"".join(lines)}</ul>'
 
 
 def _demo_vulnerabilities(result: Json) -> str:
@@ -341,10 +331,18 @@ def _untried_attempts(scenario: Json) -> Sequence[str]:
     return keystore["not_tried"] if keystore else ()
 
 
-def _demo_scenario(number: int, scenario: Json) -> str:
+def _demo_scenario(scenario: Json, *, is_only: bool) -> str:
+    """Return a section, folded if it is long or one of several and nothing needs a look."""
     rows = scenario["rows"]
-    good = _number_as_expected(rows)
-    parts = [f'<section id="scenario-{number}"><h2>{escape(scenario["title"])}</h2>']
+    good, not_tried = _number_as_expected(rows), _untried_attempts(scenario)
+    opened = sum(bool(row.get("open_because")) for row in rows)
+    is_good = good == len(rows) and not not_tried
+    kind = ("good" if is_good and rows else "") if scenario["as_expected"] else "error"
+    summary = f'<h2>{escape(scenario["title"])}</h2> <span class="chip {kind}">{good} of '
+    summary += f"{len(rows)} as they should</span>"
+    summary += f' <span class="chip warning">{opened} open</span>' if opened else ""
+    is_open = " open" if (is_only and len(rows) <= _MOST_OPEN_ROWS) or not is_good else ""
+    parts = [f'<section><details class="scenario"{is_open}><summary>{summary}</summary>']
     if scenario.get("cast"):
         members = (
             f"<b>{escape(member['part'])}</b> {escape(member['enclave'])}"
@@ -359,13 +357,12 @@ def _demo_scenario(number: int, scenario: Json) -> str:
         elsewhere = keystore["elsewhere"]
         played += f"; the keys of {elsewhere} are elsewhere" if elsewhere else ""
         parts.append(f'<p class="soft">{played}.</p>')
-    if not_tried := _untried_attempts(scenario):
+    if not_tried:
         names = escape("; ".join(not_tried))
         parts.append(f"<p>Not tried, and needed for a proof: {names}.</p>")
     if rows:
-        count = f"{escape(scenario['name'])}: {good} of {len(rows)} attempts ended as they should"
-        parts += [f'<p class="soft">{count}</p>', _demo_table(rows)]
-    return "\n".join((*parts, "</section>"))
+        parts += [f'<p class="soft">Scenario {escape(scenario["name"])}</p>', _demo_table(rows)]
+    return "\n".join((*parts, "</details></section>"))
 
 
 def _demo_table(rows: Sequence[Json]) -> str:
@@ -446,7 +443,7 @@ def render_fleet_page(
     """
     tiles = "".join(
         f'<li class="tile {_fleet_class(state)}"><b>{number}</b> {words.get(state, state)}</li>'
-        for state, number in status["counts"].items()
+        for state, number in sorted(status["counts"].items(), key=_urgency)
     )
     if outdated := len(status["outdated_dds"]):
         tiles += f'<li class="tile warning"><b>{outdated}</b> with a DDS to upgrade</li>'
@@ -472,8 +469,7 @@ def render_fleet_page(
         f'<ul class="tiles">{tiles}</ul>{trusted}</header>'
     )
     heads = "".join(f'<th scope="col">{name}</th>' for name in _FLEET_COLUMNS)
-    worst_first = sorted(rows, key=lambda row: _FLEET_CLASSES.index(_fleet_class(row[0])))
-    lines = "".join(_fleet_row(row, words) for row in worst_first)
+    lines = "".join(_fleet_row(row, words) for row in sorted(rows, key=_urgency))
     table = (
         f'<table class="rows fleet"><thead><tr>{heads}</tr></thead><tbody>{lines}</tbody></table>'
     )
@@ -513,6 +509,11 @@ def _fleet_row(row: Sequence[str], words: Mapping[str, str]) -> str:
         for label, text in zip(_FLEET_COLUMNS[2:], texts, strict=True)
     )
     return f'<tr><td>{chip}</td><th scope="row">{escape(robots)}</th>{cells}</tr>'
+
+
+def _urgency(row: Sequence[Any]) -> int:
+    """Return the sort key of a row or count that begins with a state: the worst comes first."""
+    return _FLEET_CLASSES.index(_fleet_class(row[0]))
 
 
 def _fleet_class(state: str) -> str:

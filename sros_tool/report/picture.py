@@ -514,16 +514,25 @@ class Picture:
 
     @property
     def headlines(self) -> tuple[str, ...]:
-        """The answers of the picture, as sentences without a full stop."""
+        """The answers of the picture and its `notes`, as sentences without a full stop."""
+        return (*self.answers, *self.notes)
+
+    @property
+    def answers(self) -> tuple[str, ...]:
+        """What the picture answers, and what it lacks, as sentences without a full stop."""
         requirements = self.requirements.sentences() if self.requirements else ()
+        focus = (focus.sentence for focus in self.focus)
+        exports = map(_sentence_on_export, self.exports)
+        return (*focus, *exports, *requirements, *self._unread_sentences())
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the drawing shows as one, and what differs, as sentences without a full stop."""
         equal = (f"{units.title} are drawn as one" for units in self.equal)
         more = len(self.different) - _SAID
         different = [unit.sentence() for unit in self.different[:_SAID]]
         different += [f"{more} more differ"] if more > 0 else []
-        focus = (focus.sentence for focus in self.focus)
-        exports = map(_sentence_on_export, self.exports)
-        unread = self._unread_sentences()
-        return (*focus, *exports, *requirements, *equal, *different, *unread)
+        return (*equal, *different)
 
     def _unread_sentences(self) -> Iterator[str]:
         if not self.unread:

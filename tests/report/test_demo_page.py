@@ -66,9 +66,11 @@ def test_what_was_not_tried_is_said_and_nothing_of_it_is_green() -> None:
     cast = [{"part": "guest", "enclave": "/a", "nodes": [], "why": f"why {HOSTILE[0]}"}]
     shown["scenarios"] = [{**shown["scenarios"][0], "keystore": keystore, "cast": cast}] * 2
     page = html.fromstring(render_demo_page(shown, ""))
-    links = {each.get("href"): each.text_content() for each in page.cssselect(".contents a")}
-    assert links == dict.fromkeys(("#scenario-0", "#scenario-1"), "every way in: 1 of 2")
-    assert all(page.cssselect(f"section{link} h2") for link in links)
+    for scenario in page.cssselect("details.scenario"):
+        assert "open" in scenario.attrib
+        (summary,) = scenario.cssselect("summary")[:1]
+        assert summary.text_content() == "every way in 1 of 2 as they should"
+        assert not summary.cssselect(".good")
     tiles = {each.text_content(): each.get("class", "") for each in page.cssselect("li.tile")}
     assert "good" not in tiles["1 of 2 attempts ended as they should"]
     assert {"1 skipped", "3 left out", "4 not tried, but needed for a proof"} <= set(tiles)
@@ -108,6 +110,27 @@ def test_every_row_is_told_with_what_came_of_it() -> None:
     assert "3 of 5" in page and "heard 0 of 50; control" in page
     attacks = html.fromstring(page).xpath("//tr[@class='attack']")
     assert [each.text_content() for each in attacks] == ["joining", "looking"]
+
+
+def test_scenarios_are_folded_unless_something_needs_a_look() -> None:
+    known = row("names read", open_because="names are in clear")
+    wrong = row("heard", observed="heard", as_expected=False)
+    shown = result(row("a"), known, wrong)
+    rows_of = ([row("a")], [row("a"), known], [row("a"), wrong])
+    shown["scenarios"] = [
+        {**shown["scenarios"][0], "rows": rows, "as_expected": wrong not in rows}
+        for rows in rows_of
+    ]
+    page = html.fromstring(render_demo_page(shown, ""))
+    told = [
+        ("open" in scenario.attrib, [chip.text for chip in scenario.cssselect("summary > .chip")])
+        for scenario in page.cssselect("details.scenario")
+    ]
+    assert told == [
+        (False, ["1 of 1 as they should"]),
+        (False, ["2 of 2 as they should", "1 open"]),
+        (True, ["1 of 2 as they should"]),
+    ]
 
 
 def test_no_place_of_the_machine_is_told() -> None:

@@ -389,6 +389,7 @@ def test_everything_can_be_done_with_the_keyboard(browser: Browser, robot_page: 
         page.keyboard.press("Enter")
         assert page.locator("#details").is_visible()
         page.keyboard.press("Escape")
+        assert page.evaluate("document.activeElement.getAttribute('aria-label')") == third
         page.focus("#tab-map")
         page.keyboard.press("ArrowRight")
         assert page.locator("#panel-names").is_visible()
@@ -463,14 +464,25 @@ def test_no_text_leaves_its_card_and_nothing_is_wider_than_the_window(
             return inner.right > box.right + 1 || inner.bottom > box.bottom + 1;
         });
     }).map(card => card.textContent)"""
+    small = """() => [...document.querySelectorAll('#map text')].filter(
+        text => parseFloat(getComputedStyle(text).fontSize) * text.getScreenCTM().a < 11
+    ).map(text => text.textContent)"""
+    sideways = "(map => map.scrollWidth > map.clientWidth)(document.querySelector('#canvas'))"
     with opened(browser, robot_page, size) as page:
         page.click("#tab-map")
         for scene in ("0", "1"):
             page.evaluate("document.querySelectorAll('.fold').forEach(f => f.open = true)")
             page.select_option("#scene", scene)
-            assert page.evaluate(outside) == []
+            for wanted in (width, 1280, 390):
+                page.set_viewport_size({"width": wanted, "height": 800})
+                assert page.evaluate(outside) == [] == page.evaluate(small), wanted
+                assert not page.evaluate(sideways), wanted
+            page.set_viewport_size({"width": width, "height": 800})
         page.select_option("#filter-enclave", "/mobile_robot/planner")
-        assert page.evaluate(outside) == []
+        assert page.evaluate(outside) == [] == page.evaluate(small)
+        page.click("#map .card.enclave >> nth=0")
+        assert page.evaluate(outside) == [] == page.evaluate(small)
+        page.click("#close")
         for tab in ("map", "names", "timeline", "findings"):
             page.click(f"#tab-{tab}")
             wide = page.evaluate("document.documentElement.scrollWidth")
@@ -625,14 +637,46 @@ def test_a_phone_shows_first_who_may_drive_and_what_everybody_may_do(
         assert "everybody may publish" in details(page)
         assert "everybody may publish" in " ".join(texts(page, "#map .card.names"))
         page.click("#tab-map")
-        said = "May publish /cmd_vel: everybody with an identity, /mobile_robot/velocity_mux"
-        assert page.inner_text("#headlines").startswith(said)
+        said = page.inner_text("#headlines")
+        driver = "May publish /cmd_vel: everybody with an identity, /mobile_robot/velocity_mux"
+        assert said.startswith(driver)
+        anybody = "On DDS, everybody with an identity may use some names without a right: 3 names"
+        assert anybody in said
         # What was chosen stands alone with its neighbors, all in sight.
         canvas = "document.querySelector('#canvas')"
         fits = f"{canvas}.scrollWidth <= {canvas}.clientWidth"
         assert page.locator("#map .card").count() == 5 and page.evaluate(fits)
         page.click("#close")
         assert page.locator("#map .card").count() > 50 and page.locator("#back").is_hidden()
+
+
+def test_a_robot_of_unknown_names_says_who_may_do_most_and_equal_findings_are_one(
+    browser: Browser, tmp_path: Path
+) -> None:
+    enclaves = {"/a": publish("/a/in"), "/b": publish("/b/out"), "/c": publish("/c/state")}
+    enclaves |= {"/writer": publish("/x", "/y"), "/reader": subscribe("/?", "/x")}
+    (tmp_path / "p.xml").write_text(policy_text(enclaves))
+    sros("create_keystore", "ks", "--template", "production", cwd=tmp_path).ok()
+    sros("generate_artifacts", "-k", "ks", "-p", "p.xml", cwd=tmp_path)
+    sros("view", "p.xml", "-o", "p.html", cwd=tmp_path).ok()
+    sros("view", "ks", "-o", "ks.html", cwd=tmp_path).ok()
+    most = (
+        "May publish or call most names (2 of 5): /writer",
+        "May subscribe to or serve most names (2 of 5): /reader",
+    )
+    with opened(browser, tmp_path / "p.html") as page:
+        said = page.inner_text("#headlines").split("\n")
+        unknown = "What strangers may do is not stated here: a keystore's governance says it."
+        assert [line for line in said if line] == [*most, unknown]
+    with opened(browser, tmp_path / "ks.html") as page:
+        said = page.inner_text("#headlines").split("\n")
+        closed = "On DDS, strangers, who have no identity, may use none of these names"
+        assert any(line.startswith(closed) for line in said)
+        page.click("#headlines .link-button >> nth=0")
+        assert "/writer" in details(page)
+        page.click("#tab-findings")
+        assert "5 enclaves" in page.inner_text("#findings")
+        assert page.locator("#findings .finding").count() < 5
 
 
 def test_it_prints_every_part(browser: Browser, robot_page: Path) -> None:

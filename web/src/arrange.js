@@ -1,16 +1,20 @@
-// Places parts of the picture that were asked for, by dagre's layered layout.
+// Places parts of the picture that were asked for, by dagre's layered layout, and fits drawings that
+// are wider than the window into it.
 
 import dagre from "@dagrejs/dagre";
 import { curveBumpX, line } from "d3-shape";
 import { KINDS, counted, sends } from "./words.js";
 
 const SIZES = { letter: 7.4, smallLetter: 6.2, line: 16, small: 14, pad: 7 };
+const WRAP = { enclave: 22, names: 35 };
+const GAP = 90;
+const MARGIN = 14;
 export const MOST_BUNDLES = 160;
 const MOST_NAMES = 8;
 const SHOWN_NAMES = 4;
 
 // As the drawing on paper cuts names: after a slash or an underscore, where one is near.
-export function wrapped(text, letters) {
+function wrapped(text, letters) {
   const lines = [];
   while (text.length > letters) {
     const head = text.slice(0, letters);
@@ -36,17 +40,12 @@ function widthOf(card, around, least) {
   return Math.max(least, Math.round(room + around));
 }
 
-// In a narrow drawing, three columns fit a phone.
-const WIDE = { enclave: 22, around: 24, name: 35, gap: 90, margin: 14 };
-const NARROW = { enclave: 15, around: 18, name: 14, gap: 26, margin: 8 };
-const sized = (narrow) => (narrow ? NARROW : WIDE);
-
-export function enclaveCard(id, path, notes = [], narrow = false) {
-  const card = { id, role: "enclave", members: [path], lines: wrapped(path, sized(narrow).enclave), notes, tags: "" };
-  return { ...card, width: widthOf(card, sized(narrow).around, 100), height: height(card) };
+function enclaveCard(id, path, notes = []) {
+  const card = { id, role: "enclave", members: [path], lines: wrapped(path, WRAP.enclave), notes, tags: "" };
+  return { ...card, width: widthOf(card, 24, 100), height: height(card) };
 }
 
-export function namesCard(id, bundle, narrow = false) {
+function namesCard(id, bundle) {
   const shown = bundle.names.slice(0, bundle.names.length > MOST_NAMES ? SHOWN_NAMES : MOST_NAMES);
   const rest = bundle.names.length - shown.length;
   const card = {
@@ -55,7 +54,7 @@ export function namesCard(id, bundle, narrow = false) {
     kind: bundle.kind,
     level: bundle.protection.level,
     members: bundle.names,
-    lines: shown.flatMap((name) => wrapped(name, sized(narrow).name)),
+    lines: shown.flatMap((name) => wrapped(name, WRAP.names)),
     notes: [...(rest ? [`and ${rest} more ${KINDS[bundle.kind]}s`] : []), ...[bundle.open, bundle.lacks].filter(Boolean)],
     tags: "",
     lacks: bundle.lacks,
@@ -64,7 +63,7 @@ export function namesCard(id, bundle, narrow = false) {
 }
 
 // One link for all that an enclave may do with a bundle on one side of it.
-export function linkOf(source, target, bundle, ties) {
+function linkOf(source, target, bundle, ties) {
   return {
     source,
     target,
@@ -79,12 +78,12 @@ export function linkOf(source, target, bundle, ties) {
 }
 
 // The names that fit a filter: senders on the left, listeners on the right.
-export function columns(bundles, narrow = false) {
+export function columns(bundles) {
   const cards = new Map();
   const links = [];
   bundles.slice(0, MOST_BUNDLES).forEach((bundle, number) => {
     const id = `n${number}`;
-    cards.set(id, namesCard(id, bundle, narrow));
+    cards.set(id, namesCard(id, bundle));
     const groups = new Map();
     for (const tie of bundle.ties) {
       const key = `${sends(tie) ? "s" : "l"}${tie.enclave} ${tie.deny} ${tie.mark}`;
@@ -93,7 +92,7 @@ export function columns(bundles, narrow = false) {
     }
     for (const ties of groups.values()) {
       const side = `${sends(ties[0]) ? "s" : "l"}${ties[0].enclave}`;
-      if (!cards.has(side)) cards.set(side, enclaveCard(side, ties[0].enclave, [], narrow));
+      if (!cards.has(side)) cards.set(side, enclaveCard(side, ties[0].enclave));
       const ends = sends(ties[0]) ? [side, id] : [id, side];
       links.push(linkOf(...ends, bundle, ties));
     }
@@ -105,7 +104,7 @@ export function columns(bundles, narrow = false) {
     const width = Math.max(0, ...column.map((card) => card.width));
     for (const card of column) card.width = width;
   }
-  const scene = arranged(all, links, narrow);
+  const scene = arranged(all, links);
   return { ...scene, heads: heads(scene.cards) };
 }
 
@@ -124,7 +123,7 @@ function heads(cards) {
 
 // What flows to a name, or from it, so many hops far.  Names by which information goes between
 // the very same enclaves stand on one card.
-export function flowScene({ start, hops, steps }, upstream, most, narrow = false) {
+export function flowScene({ start, hops, steps }, upstream, most) {
   const ends = new Map();
   for (const { hop, bundle, tie, near } of steps) {
     if (hop > most || (!near && hop === most)) continue;
@@ -147,7 +146,7 @@ export function flowScene({ start, hops, steps }, upstream, most, narrow = false
   const links = [];
   [...merged].forEach(([key, { bundle, near, far }], number) => {
     const id = `n${number}`;
-    cards.push({ ...namesCard(id, bundle, narrow), chosen: key === "start" });
+    cards.push({ ...namesCard(id, bundle), chosen: key === "start" });
     for (const [side, before] of [[far, upstream], [near, !upstream]]) {
       for (const [path, ties] of side) {
         const pair = before ? [`e${path}`, id] : [id, `e${path}`];
@@ -157,15 +156,14 @@ export function flowScene({ start, hops, steps }, upstream, most, narrow = false
   });
   const used = new Set(links.flatMap((link) => [link.source, link.target]));
   for (const [path, hop] of hops) {
-    if (used.has(`e${path}`)) cards.push(enclaveCard(`e${path}`, path, [counted(hop, "hop")], narrow));
+    if (used.has(`e${path}`)) cards.push(enclaveCard(`e${path}`, path, [counted(hop, "hop")]));
   }
-  return arranged(cards, links, narrow);
+  return arranged(cards, links);
 }
 
-function arranged(cards, links, narrow) {
-  const { gap, margin } = sized(narrow);
+function arranged(cards, links) {
   const graph = new dagre.graphlib.Graph({ multigraph: true });
-  graph.setGraph({ rankdir: "LR", nodesep: 9, edgesep: 4, ranksep: gap, marginx: margin, marginy: 34 });
+  graph.setGraph({ rankdir: "LR", nodesep: 9, edgesep: 4, ranksep: GAP, marginx: MARGIN, marginy: 34 });
   graph.setDefaultEdgeLabel(() => ({}));
   for (const card of cards) graph.setNode(card.id, { width: card.width, height: card.height });
   links.forEach((link, number) => graph.setEdge(link.source, link.target, {}, `${number}`));
@@ -200,4 +198,163 @@ function arranged(cards, links, narrow) {
     frames: [],
     onlookers: [],
   };
+}
+
+// ── fitting ──────────────────────────────────────────────────────────────────────────────────
+
+// Columns become as narrow as this, and no narrower: then the drawing is moved sideways.
+const LEAST = { enclave: 100, names: 120 };
+const NARROW_GAP = 26;
+const SLIM = 200; // below this width of names, letters are small and the lock is below the symbol
+const TOP = 46;
+const LEAD = 24;
+
+// The scene for a window of this width, with letters as large as before: narrower columns, whose
+// texts take more lines.  Cards keep their order in their column.
+export function fitted(scene, room) {
+  if (scene.width <= room || !scene.cards.length) return scene;
+  const columnsOf = byColumn(scene.cards);
+  const widths = fittingWidths(columnsOf, room);
+  const gap = Math.max(NARROW_GAP, Math.floor((room - 16) * 0.07));
+  const slim = widths.some((width, at) => columnsOf[at][0].role === "names" && width < SLIM);
+  const frameOf = (card) => scene.frames.find((frame) => contains(frame, card));
+  let x = 8;
+  const placed = columnsOf.map((cards, at) => {
+    const left = x;
+    x += widths[at] + gap;
+    return cards.map((card) => ({ ...rewrapped(card, widths[at], slim), x: left, frame: frameOf(card) }));
+  });
+  settle(placed, scene.links);
+  const cards = placed.flat();
+  const box = new Map(cards.map((card) => [card.id, card]));
+  const before = new Map(scene.cards.map((card) => [card.id, card]));
+  const port = (id, y) => {
+    const [old, now] = [before.get(id), box.get(id)];
+    return now.y + (y === undefined ? now.height / 2 : ((y - old.y) / old.height) * now.height);
+  };
+  const links = scene.links.map(({ path, ...link }) => ({ ...link, y1: port(link.source, link.y1), y2: port(link.target, link.y2) }));
+  const frames = scene.frames.map((frame) => around(frame, cards.filter((card) => card.frame === frame)));
+  const width = x - gap + 8;
+  const height = Math.max(...cards.map((card) => card.y + card.height)) + MARGIN;
+  return { ...scene, width, height, slim, cards, links, frames, heads: fittedHeads(scene, before, box) };
+}
+
+// Cards from left to right in columns, and in each column from the top.
+function byColumn(cards) {
+  const found = [];
+  const middle = (card) => card.x + card.width / 2;
+  for (const card of [...cards].sort((a, b) => middle(a) - middle(b))) {
+    const last = found.at(-1);
+    if (last && middle(card) - middle(last[0]) < 8) last.push(card);
+    else found.push([card]);
+  }
+  for (const column of found) column.sort((a, b) => a.y - b.y);
+  return found;
+}
+
+function fittingWidths(columnsOf, room) {
+  const gap = Math.max(NARROW_GAP, Math.floor((room - 16) * 0.07));
+  const natural = columnsOf.map((cards) => Math.max(...cards.map((card) => card.width)));
+  const least = columnsOf.map((cards, at) => Math.min(natural[at], cards[0].role === "names" ? LEAST.names : LEAST.enclave));
+  const sum = (numbers) => numbers.reduce((total, number) => total + number, 0);
+  const spare = room - 16 - gap * (columnsOf.length - 1) - sum(least);
+  const share = Math.min(1, Math.max(0, spare / Math.max(1, sum(natural) - sum(least))));
+  return least.map((width, at) => Math.floor(width + (natural[at] - width) * share));
+}
+
+// The card with its texts in lines of this width.
+function rewrapped(card, width, slim) {
+  const names = card.role === "names";
+  const letter = slim ? 6.8 : SIZES.letter;
+  const around = (names ? (slim ? 30 : 62) : slim ? 14 : 24) + (names && slim ? 14 : 0) * card.tags.length;
+  const whole = [];
+  for (const text of card.lines) {
+    if (text.startsWith("  ") && whole.length) whole.push(whole.pop() + text.trim());
+    else whole.push(text);
+  }
+  const lines = whole.flatMap((text) => wrapped(text, Math.floor((width - around) / letter)));
+  const notes = card.notes.flatMap((text) => inWords(text, Math.floor((width - (names && slim ? 34 : 18)) / SIZES.smallLetter)));
+  const fit = { ...card, width, slim, lines, notes };
+  return { ...fit, height: Math.max(height(fit), names && slim ? 46 : 0) };
+}
+
+function inWords(text, letters) {
+  const lines = [""];
+  for (const word of text.split(" ")) {
+    const line = lines.at(-1);
+    if (line && line.length + 1 + word.length > letters) lines.push(word);
+    else lines[lines.length - 1] = line ? `${line} ${word}` : word;
+  }
+  return lines;
+}
+
+// Gives all cards their y: the tallest column has no gaps, and cards of the others come near the
+// cards that they are linked with.
+function settle(placed, links) {
+  const near = new Map(placed.flat().map((card) => [card.id, []]));
+  for (const { source, target } of links) {
+    near.get(source).push(target);
+    near.get(target).push(source);
+  }
+  const extent = (column) => column.reduce((sum, card) => sum + card.height + 9, 0);
+  const tallest = placed.reduce((best, column, at) => (extent(column) > extent(placed[best]) ? at : best), 0);
+  const order = placed.map((_, at) => at).sort((a, b) => Math.abs(a - tallest) - Math.abs(b - tallest));
+  const middles = new Map();
+  for (const at of order) {
+    const wanted = (card) => {
+      const ends = near.get(card.id).filter((end) => middles.has(end)).map((end) => middles.get(end));
+      return ends.length ? ends.reduce((sum, end) => sum + end, 0) / ends.length : 0;
+    };
+    stack(placed[at], at === tallest ? () => 0 : wanted);
+    for (const card of placed[at]) middles.set(card.id, card.y + card.height / 2);
+  }
+}
+
+// As near to the wanted middles as the other cards of the column allow: pools of cards that touch
+// move together (isotonic regression).
+function stack(column, wanted) {
+  let offset = 0;
+  const offsets = column.map((card, at) => {
+    if (card.frame && card.frame !== column[at - 1]?.frame) offset += LEAD;
+    const own = offset;
+    offset += card.height + 9;
+    return own;
+  });
+  const pools = [];
+  column.forEach((card, at) => {
+    pools.push({ top: Math.max(TOP, wanted(card) - card.height / 2 - offsets[at]), count: 1 });
+    while (pools.length > 1 && pools.at(-2).top > pools.at(-1).top) {
+      const last = pools.pop();
+      const pool = pools.at(-1);
+      pool.top = (pool.top * pool.count + last.top * last.count) / (pool.count + last.count);
+      pool.count += last.count;
+    }
+  });
+  const tops = pools.flatMap(({ top, count }) => Array(count).fill(top));
+  column.forEach((card, at) => {
+    card.y = Math.round(tops[at] + offsets[at]);
+  });
+}
+
+function contains(frame, card) {
+  return frame.x <= card.x && card.x + card.width <= frame.x + frame.width && frame.y <= card.y && card.y <= frame.y + frame.height;
+}
+
+function around(frame, cards) {
+  const [first, last] = [cards[0], cards.at(-1)];
+  const letters = Math.floor((first.width + 4) / SIZES.smallLetter);
+  const title = frame.title.length > letters ? `\u2026${frame.title.slice(1 - letters)}` : frame.title;
+  const y = first.y - LEAD;
+  return { title, x: first.x - 6, y, width: first.width + 12, height: last.y + last.height + 6 - y };
+}
+
+// A heading stays at the same part of the card below it, in words below each other.
+function fittedHeads(scene, before, box) {
+  return (scene.heads ?? []).map((head) => {
+    const below = [...before.values()].find((card) => card.x <= head.x && head.x <= card.x + card.width);
+    if (!below) return head;
+    const now = box.get(below.id);
+    const x = now.x + ((head.x - below.x) / below.width) * now.width;
+    return { ...head, x, lines: inWords(head.text, Math.floor((now.width + 20) / 8)) };
+  });
 }

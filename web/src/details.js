@@ -55,14 +55,18 @@ function longList(items) {
   return el("div", {}, el("ul", { class: "plain" }, items.slice(0, MOST)), more);
 }
 
-export function findingItem(finding, onEnclave) {
+// A finding; `enclaves` are all that have this very finding, each with a link.
+export function findingItem(finding, enclaves = [], onEnclave = null) {
+  const links = enclaves.map((path) => el("li", {}, link(path, () => onEnclave(path))));
+  const many = links.length > 1;
   return el(
     "li",
     { class: `finding ${finding.severity}` },
     el("span", { class: `chip ${finding.severity}`, text: finding.severity }),
     " ",
     el("code", { text: finding.id }),
-    el("p", {}, finding.enclave && onEnclave ? [link(finding.enclave, () => onEnclave(finding.enclave)), ": "] : [], finding.text),
+    many ? el("details", {}, el("summary", { text: `${links.length} enclaves` }), el("ul", { class: "plain" }, links)) : null,
+    el("p", {}, links.length === 1 ? [link(enclaves[0], () => onEnclave(enclaves[0])), ": "] : [], finding.text),
     finding.remedy ? el("p", { class: "soft", text: finding.remedy }) : null,
   );
 }
@@ -92,7 +96,7 @@ export function enclaveDetails(model, path, act) {
     parts.push(section("It cannot be used", el("ul", { class: "plain" }, items)));
   }
   if (found.length) {
-    parts.push(section("Findings", el("ul", { class: "plain" }, found.map((each) => findingItem(each)))));
+    parts.push(section("Findings", el("ul", { class: "plain" }, found.map((finding) => findingItem(finding)))));
   }
   for (const [right, group] of byRight(ties)) {
     const names = group.flatMap(({ tie, bundle }) =>

@@ -57,6 +57,7 @@ export function drawScene(node, scene, { overlay, problems, choose }) {
   root
     .attr("viewBox", `0 0 ${scene.width} ${scene.height}`)
     .classed("dense", scene.links.length > 200)
+    .classed("slim", Boolean(scene.slim))
     .attr("role", "group")
     .attr("aria-label", "Map of who may do what");
   root
@@ -99,7 +100,12 @@ export function drawScene(node, scene, { overlay, problems, choose }) {
     .attr("x", (head) => head.x)
     .attr("y", 16)
     .attr("text-anchor", (head) => head.anchor)
-    .text((head) => head.text.toUpperCase());
+    .selectAll("tspan")
+    .data((head) => (head.lines ?? [head.text]).map((text, at, all) => ({ text: at < all.length - 1 ? `${text} ` : text, x: head.x })))
+    .join("tspan")
+    .attr("x", (line) => line.x)
+    .attr("dy", (_, at) => (at ? 13 : 0))
+    .text((line) => line.text.toUpperCase());
   const cards = new Map(scene.cards.map((card) => [card.id, card]));
   const rank = (link) => (link.violates ? 5 : link.deny ? 4 : link.differs ? 3 : { both: 0, first: 1, second: 2 }[link.mark]);
   const links = root
@@ -152,6 +158,13 @@ export function drawScene(node, scene, { overlay, problems, choose }) {
       return any;
     },
     card: (belongs) => drawn.filter(belongs).node(),
+    // The card that an earlier drawing had as this element.
+    again(node) {
+      const before = select(node).datum();
+      const same = drawn.filter((card) => card.id === before?.id).node();
+      if (same) drawn.attr("tabindex", (card) => (card.id === before.id ? 0 : -1));
+      return same;
+    },
   };
 }
 
@@ -170,33 +183,35 @@ function drawCard(group, card, problems) {
     group
       .append("path")
       .attr("class", "glyph")
-      .attr("transform", "translate(10 9)")
+      .attr("transform", card.slim ? "translate(7 9)" : "translate(10 9)")
       .attr("d", GLYPHS[card.kind]);
     if (LOCKS[card.level]) {
       group
         .append("path")
         .attr("class", `lock lock-${card.level}`)
-        .attr("transform", `translate(${card.width - 23} 8)`)
+        .attr("transform", card.slim ? "translate(7 26)" : `translate(${card.width - 23} 8)`)
         .attr("d", LOCKS[card.level]);
     }
   }
+  const left = card.slim ? (names ? 26 : 8) : names ? 32 : 12;
   let y = 19;
   for (const text of card.lines) {
-    group.append("text").attr("x", names ? 32 : 12).attr("y", y).text(`${text} `);
+    group.append("text").attr("x", left).attr("y", y).text(`${text} `);
     y += 16;
   }
   for (const text of card.notes) {
     const kind = names && /^(nobody|everybody) may /.test(text) ? "small lack" : "small";
-    group.append("text").attr("class", kind).attr("x", names ? 32 : 12).attr("y", y - 1).text(`${text} `);
+    group.append("text").attr("class", kind).attr("x", left).attr("y", y - 1).text(`${text} `);
     y += 14;
   }
   [...card.tags].reverse().forEach((tag, number) => {
-    const x = card.width - (LOCKS[card.level] ? 32 : 12) - 18 * number;
+    const x = card.width - (card.slim ? 6 + 13 * number : (LOCKS[card.level] ? 32 : 12) + 18 * number);
     group.append("text").attr("class", "tag").attr("x", x).attr("y", 19).attr("text-anchor", "end").text(`${tag} `);
   });
   if (problems) {
-    group.append("circle").attr("class", "alarm").attr("cx", card.width - 14).attr("cy", 14).attr("r", 7);
-    group.append("text").attr("class", "alarm-text").attr("x", card.width - 14).attr("y", 18).attr("text-anchor", "middle").text("!");
+    const [x, at] = card.slim ? [card.width - 4, 2] : [card.width - 14, 14];
+    group.append("circle").attr("class", "alarm").attr("cx", x).attr("cy", at).attr("r", 7);
+    group.append("text").attr("class", "alarm-text").attr("x", x).attr("y", at + 4).attr("text-anchor", "middle").text("!");
   }
 }
 

@@ -1,11 +1,12 @@
 // Puts the page together: tabs, search, filters, the map, and what was chosen.
 
-import { MOST_BUNDLES, columns, flowScene } from "./arrange.js";
+import { MOST_BUNDLES, columns, fitted, flowScene } from "./arrange.js";
 import { cardDetails, enclaveDetails, equalDetails, findingItem, nameDetails } from "./details.js";
 import { byId, counted, el, svg } from "./dom.js";
 import { drawScene, legend } from "./draw.js";
+import { headlines } from "./headlines.js";
 import { Model } from "./model.js";
-import { drivers, namesTable } from "./table.js";
+import { namesTable } from "./table.js";
 import { timeline } from "./timeline.js";
 import { KINDS, LEVELS, markText } from "./words.js";
 
@@ -33,7 +34,7 @@ function currentScene() {
     const { kind, name, upstream, hops } = state.flow;
     const flow = model.flow(kind, name, upstream);
     const most = Math.max(1, ...flow.hops.values());
-    const scene = flowScene(flow, upstream, Math.min(hops, most), isSmall());
+    const scene = flowScene(flow, upstream, Math.min(hops, most));
     const within = [...flow.hops.values()].filter((hop) => hop <= hops).length;
     const verb = upstream ? "can influence" : "can be influenced by";
     scene.title = `${counted(within, "enclave")} ${verb} ${name} within ${counted(hops, "hop")}`;
@@ -43,7 +44,7 @@ function currentScene() {
   }
   if (filtering()) {
     const bundles = model.filtered({ ...state.filters, common: state.scene > 0 });
-    const scene = columns(bundles, isSmall());
+    const scene = columns(bundles);
     const names = bundles.reduce((sum, bundle) => sum + bundle.names.length, 0);
     scene.title = `${counted(names, "name")} ${names === 1 ? "fits" : "fit"}`;
     if (bundles.length > MOST_BUNDLES) scene.title += `; drawn are the first ${MOST_BUNDLES} groups of them: filter further`;
@@ -60,14 +61,15 @@ function alone() {
   const bundles = path
     ? model.filtered({ enclave: path, common: state.scene > 0 }).map((each) => ({ ...each, ties: each.ties.filter((tie) => tie.enclave === path) }))
     : [{ ...model.bundle(kind ?? card.kind, names[0]), names }];
-  return { ...columns(bundles, true), title: path ? `What ${path} may use` : `Who may use ${names[0]}` };
+  return { ...columns(bundles), title: path ? `What ${path} may use` : `Who may use ${names[0]}` };
 }
 
 function showMap() {
   const scene = currentScene();
-  state.shown = scene;
-  state.drawing = drawScene(byId("map"), scene, { overlay: model.overlay, problems, choose });
-  byId("legend").replaceChildren(...legend(scene, model.overlay, model.equal, { el, svg }));
+  state.room = roomForMap();
+  state.shown = fitted(scene, state.room);
+  state.drawing = drawScene(byId("map"), state.shown, { overlay: model.overlay, problems, choose });
+  byId("legend").replaceChildren(...legend(state.shown, model.overlay, model.equal, { el, svg }));
   const why = scene.id === "essential" ? " that every node needs (parameters, log, time)" : "";
   const summary = scene.shown
     ? `${counted(model.enclaves.length, "enclave")}, ${counted(scene.shown, "name")}${scene.hidden ? `; left out: ${counted(scene.hidden, "name")}${why}` : ""}`
@@ -95,12 +97,17 @@ function showFocus() {
   canvas.scrollTop = (asked.y + asked.height / 2) * state.zoom - canvas.clientHeight / 2;
 }
 
+const roomForMap = () => byId("canvas").clientWidth - 2;
+
+// Draws the map again where another width is left for it.
+function resized() {
+  if (roomForMap() === state.room || byId("panel-map").hidden) return;
+  showMap();
+}
+
 function zoom(step) {
   const { width } = state.shown;
-  const room = byId("canvas").clientWidth - 2;
-  // On a small screen the letters stay readable, and the map is moved instead.
-  const least = isSmall() ? 0.76 : 0.72;
-  if (step === 0) state.zoom = Math.min(1.15, Math.max(least, room / width));
+  if (step === 0) state.zoom = Math.min(1.15, Math.max(1, state.room / width));
   else state.zoom = Math.min(2.5, Math.max(0.05, state.zoom * (step > 0 ? 1.2 : 1 / 1.2)));
   byId("map").setAttribute("width", Math.round(width * state.zoom));
   byId("map").setAttribute("height", Math.round(state.shown.height * state.zoom));
@@ -184,11 +191,10 @@ function chosen(what) {
     state.opener = document.activeElement;
     state.scrolled = window.scrollY;
     byId("details").hidden = false;
-    zoom(0);
   }
   byId("details").scrollTop = 0;
   byId("details-content").querySelector("h2").focus({ preventScroll: true });
-  if (isSmall()) showMap();
+  if (isSmall() || roomForMap() !== state.room) showMap();
   else light();
 }
 
@@ -207,10 +213,10 @@ function close() {
     showMap();
     window.scrollTo(0, state.scrolled);
   } else {
-    zoom(0);
+    resized();
     light();
   }
-  const opener = state.opener?.checkVisibility() ? state.opener : document.querySelector("#map [tabindex='0']");
+  const opener = state.opener?.checkVisibility() ? state.opener : (state.opener && state.drawing.again(state.opener)) || document.querySelector("#map [tabindex='0']");
   if (was) opener?.focus({ preventScroll: true });
 }
 
@@ -270,9 +276,7 @@ function showTab(name) {
     byId(tab.getAttribute("aria-controls")).hidden = !on;
   }
   document.body.dataset.tab = name;
-  if (name !== "map" || !state.drawing) return;
-  zoom(0);
-  light();
+  if (name === "map" && state.drawing) resized();
 }
 
 function tabKeys(event) {
@@ -288,23 +292,25 @@ function fillLists() {
   const order = { error: 0, warning: 1, note: 2 };
   const sorted = [...model.findings].sort((a, b) => order[a.severity] - order[b.severity]);
   const none = el("p", { class: "soft", text: "There are no findings." });
-  const item = (each) => findingItem(each, act.enclave);
-  const list = el("ul", { class: "plain cards" }, sorted.slice(0, MOST_FINDINGS).map(item));
-  if (sorted.length > MOST_FINDINGS) {
-    const rest = sorted.slice(MOST_FINDINGS);
+  const same = new Map();
+  for (const { enclave, ...finding } of sorted) {
+    const key = JSON.stringify(finding);
+    if (!same.has(key)) same.set(key, { finding, enclaves: [] });
+    if (enclave) same.get(key).enclaves.push(enclave);
+  }
+  const items = [...same.values()].map(({ finding, enclaves }) => findingItem(finding, enclaves, act.enclave));
+  const list = el("ul", { class: "plain cards" }, items.slice(0, MOST_FINDINGS));
+  if (items.length > MOST_FINDINGS) {
+    const rest = items.slice(MOST_FINDINGS);
     const more = el("button", { type: "button", text: `Show ${rest.length} more` });
-    more.addEventListener("click", () => more.parentElement.replaceWith(...rest.map(item)));
+    more.addEventListener("click", () => more.parentElement.replaceWith(...rest));
     list.append(el("li", {}, more));
   }
   byId("findings").replaceChildren(sorted.length ? list : none);
   byId("tab-findings").textContent = sorted.length ? `Findings (${sorted.length})` : "Findings";
   const opens = (kind, name) => model.bundle(kind, name) && (() => act.name(kind, name));
-  // A focus has its own answer, and in a comparison there are two.
-  if (!model.overlay && model.scenes[0].id !== "focus") {
-    const said = drivers(model.rows, opens, () => showTab("names"));
-    if (said.length) byId("headlines").append(el("div", { class: "drivers" }, said));
-    byId("headlines").hidden = !byId("headlines").children.length;
-  }
+  byId("headlines").replaceChildren(...headlines(model, opens, act, () => showTab("names")));
+  byId("headlines").hidden = !byId("headlines").children.length;
   const lacking = model.bundles.filter((each) => each.lacks && !each.ties.every((tie) => tie.common));
   byId("names").replaceChildren(
     ...namesTable(
@@ -316,7 +322,7 @@ function fillLists() {
   byId("timeline").replaceChildren(...timeline(model.validities, act.enclave));
   byId("tab-differences").hidden = !model.overlay;
   if (!model.overlay) return;
-  const items = model.differences.map((each) =>
+  const differences = model.differences.map((each) =>
     el(
       "li",
       {},
@@ -326,14 +332,12 @@ function fillLists() {
       each.notes.length ? el("span", { class: "soft", text: ` (${each.notes.join("; ")})` }) : null,
     ),
   );
-  const same = el("p", { class: "soft", text: "There is no difference." });
-  byId("differences").replaceChildren(items.length ? el("ul", { class: "plain differences" }, items) : same);
-  byId("tab-differences").textContent = `Differences (${items.length})`;
+  const equal = el("p", { class: "soft", text: "There is no difference." });
+  byId("differences").replaceChildren(differences.length ? el("ul", { class: "plain differences" }, differences) : equal);
+  byId("tab-differences").textContent = `Differences (${differences.length})`;
 }
 
 function start() {
-  byId("headlines").replaceChildren(...model.headlines.map((text) => el("p", { text: `${text}.` })));
-  byId("headlines").hidden = !model.headlines.length;
   const any = (text) => ["", text];
   options("scene", model.scenes.map((scene, at) => [String(at), scene.title]));
   byId("scene-label").hidden = model.scenes.length < 2;
@@ -391,7 +395,7 @@ function start() {
       byId("search").focus();
     }
   });
-  window.addEventListener("resize", () => zoom(0));
+  window.addEventListener("resize", resized);
   // A small screen has no room for the columns of the whole map, and the table fits.
   if (isSmall()) for (const fold of document.querySelectorAll(".fold")) fold.open = false;
   fillLists();

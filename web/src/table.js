@@ -3,16 +3,15 @@
 import { counted, el } from "./dom.js";
 import { KINDS, LEVELS, RECEIVES, SENDS, noneText } from "./words.js";
 
-const SHOWN = 4;
+export const SHOWN = 4;
 const MOST = 400;
-const DRIVERS = 3;
 // What usually moves a robot stands first, then what is open to everybody; what only one side may
 // use is last.  Each part is in the order of names.
 const MOVES = /(^|\/)(cmd_vel|[^/]*commands?$|joint_trajectory|follow_joint_trajectory)/;
 
-const moves = (name) => MOVES.test(name);
+export const moves = (name) => MOVES.test(name);
 
-function rank(row) {
+export function rank(row) {
   return row.names.some(moves) ? (row.lacks ? 1 : 0) : row.all_send || row.all_receive ? 2 : row.lacks ? 4 : 3;
 }
 
@@ -34,22 +33,7 @@ function folded(items) {
   return [...items.slice(0, SHOWN), el("details", {}, el("summary", { text: `and ${rest.length} more` }), rest)];
 }
 
-// Who may drive the robot, for the top of the map; `onRest` shows the names that are left out.
-export function drivers(rows, opens, onRest) {
-  const found = rows.filter((row) => rank(row) < 2).sort((a, b) => rank(a) - rank(b));
-  const said = found.slice(0, DRIVERS).map((row) => {
-    const name = row.names.find(moves);
-    const all = [...(row.all_send ? [row.everybody] : []), ...row.senders];
-    const rest = all.length > SHOWN ? ` and ${all.length - SHOWN} more` : "";
-    const who = all.length ? `${all.slice(0, SHOWN).join(", ")}${rest}` : noneText(row, row.receivers);
-    return el("p", {}, `May ${SENDS[row.kind]} `, button(row.kind, name, opens), `: ${who}`);
-  });
-  const rest = found.length - said.length;
-  const more = { type: "button", class: "link-button", text: `and ${rest} more in the table`, onclick: onRest };
-  return rest ? [...said, el("p", {}, el("button", more))] : said;
-}
-
-function button(kind, name, opens) {
+export function nameButton(kind, name, opens) {
   const open = opens(kind, name);
   return open ? el("button", { type: "button", class: "link-button", text: name, onclick: open }) : el("code", { text: name });
 }
@@ -59,6 +43,9 @@ function button(kind, name, opens) {
 export function namesTable(rows, lacking, opens) {
   const ordered = rows.map((row) => [rank(row), row]).sort((a, b) => a[0] - b[0]).map(([, row]) => row);
   const body = el("tbody");
+  // A protection that all names have is said once.
+  const levels = [...new Set(rows.map((row) => row.level))];
+  const same = levels.length === 1 ? ` Protection of all: ${levelText(levels[0])}.` : "";
   const search = el("input", { type: "search", id: "search-names", autocomplete: "off", spellcheck: "false", placeholder: "such as cmd_vel" });
   const only = el("input", { type: "checkbox", id: "only-lacking" });
   const basics = el("input", { type: "checkbox", id: "with-common" });
@@ -68,27 +55,29 @@ export function namesTable(rows, lacking, opens) {
     const fit = ordered.filter(
       (row) => (basics.checked || !row.common) && (row.lacks || !only.checked) && (!text || mentions(row, text)),
     );
-    body.replaceChildren(...fit.slice(0, MOST).map((row) => line(row, opens)));
+    body.replaceChildren(...fit.slice(0, MOST).map((row) => line(row, opens, !same)));
     const names = fit.reduce((sum, row) => sum + row.names.length, 0);
     const shared = names > fit.length ? " (names with the same rights share a row)" : "";
     const first = fit.length > MOST ? `; shown are the first ${MOST}` : "";
-    status.textContent = `${counted(names, "name")} in ${counted(fit.length, "row")}${shared}${first}.`;
+    status.textContent = `${counted(names, "name")} in ${counted(fit.length, "row")}${shared}${first}.${same}`;
   }
   search.addEventListener("input", show);
   only.addEventListener("change", show);
   basics.addEventListener("change", show);
   show();
-  const head = ["Name", "May publish or call", "May subscribe or serve", "Protection"].map((text) => el("th", { scope: "col", text }));
+  const head = ["Name", "May publish or call", "May subscribe or serve", ...(same ? [] : ["Protection"])].map((text) => el("th", { scope: "col", text }));
   return [
     el("label", { class: "search" }, "Name or enclave ", search),
-    el("p", { class: "choices" }, el("label", {}, only, ` only names that one side may use (${lacking})`), el("label", {}, basics, " also names that every node needs")),
+    el("p", { class: "choices" }, lacking ? el("label", {}, only, ` only names that one side may use (${lacking})`) : null, el("label", {}, basics, " also names that every node needs")),
     status,
     el("table", { class: "names" }, el("thead", {}, el("tr", {}, head)), body),
   ];
 }
 
-function line(row, opens) {
-  const names = row.names.map((name) => el("div", {}, button(row.kind, name, opens)));
+const levelText = (level) => LEVELS[level].replace("protection ", "");
+
+function line(row, opens, withLevel) {
+  const names = row.names.map((name) => el("div", {}, nameButton(row.kind, name, opens)));
   const denied = row.denied.length ? el("div", {}, el("span", { class: "chip deny", text: "DENY" }), " ", list(row.denied, "")) : null;
   return el(
     "tr",
@@ -102,6 +91,6 @@ function line(row, opens) {
     ),
     el("td", { "data-head": `May ${SENDS[row.kind]}` }, list(row.senders, noneText(row, row.receivers), row.all_send && row.everybody)),
     el("td", { "data-head": `May ${RECEIVES[row.kind]}` }, list(row.receivers, noneText(row, row.senders), row.all_receive && row.everybody), denied),
-    el("td", { "data-head": "Protection" }, LEVELS[row.level].replace("protection ", "")),
+    withLevel ? el("td", { class: "level", "data-head": "Protection" }, levelText(row.level)) : null,
   );
 }

@@ -1,0 +1,84 @@
+// What the page claims before anything else: its answers, who may drive the robot, or else who may do
+// most, and what permissions do not control.
+
+import { counted, el } from "./dom.js";
+import { SHOWN, moves, nameButton, rank } from "./table.js";
+import { SENDS, noneText, sends } from "./words.js";
+
+const DRIVERS = 3;
+
+function button(text, onclick) {
+  return el("button", { type: "button", class: "link-button", text, onclick });
+}
+
+// `opens(kind, name)` returns what shows a name; `act.enclave` shows an enclave, and `showTable` the
+// names that are left out.
+export function headlines(model, opens, act, showTable) {
+  const parts = model.headlines.map((text) => el("p", { text: `${text}.` }));
+  // A focus has its own answer, and in a comparison there are two.
+  if (!model.overlay && model.scenes[0].id !== "focus") {
+    const said = drivers(model.rows, opens, showTable);
+    const widest = said.length ? [] : [widestLine(model, act)];
+    parts.push(el("div", { class: "drivers" }, said, widest.filter(Boolean), openLine(model, showTable)));
+  }
+  const [first, ...rest] = model.notes;
+  if (rest.length) {
+    const summary = `${first}; ${counted(rest.length, "more note")} on the drawing`;
+    parts.push(el("details", { class: "notes" }, el("summary", { text: summary }), rest.map((text) => el("p", { text: `${text}.` }))));
+  } else if (first) parts.push(el("p", { class: "notes", text: `${first}.` }));
+  return parts;
+}
+
+// Who may drive the robot; where nothing is known to move it, who may use its names if they are few.
+function drivers(rows, opens, showTable) {
+  const moving = rows.filter((row) => rank(row) < 2).sort((a, b) => rank(a) - rank(b));
+  const own = rows.filter((row) => !row.common);
+  const few = own.length <= DRIVERS ? own : [];
+  const shown = moving.length ? moving : few;
+  const said = shown.slice(0, DRIVERS).map((row) => {
+    const name = row.names.find(moves) ?? row.names[0];
+    const all = [...(row.all_send ? [row.everybody] : []), ...row.senders];
+    const more = all.length > SHOWN ? ` and ${all.length - SHOWN} more` : "";
+    const who = all.length ? `${all.slice(0, SHOWN).join(", ")}${more}` : noneText(row, row.receivers);
+    return el("p", {}, `May ${SENDS[row.kind]} `, nameButton(row.kind, name, opens), `: ${who}`);
+  });
+  const left = shown.length - said.length;
+  return left ? [...said, el("p", {}, button(`and ${left} more in the table`, showTable))] : said;
+}
+
+// Which enclaves may use most names, apart from those that every node needs.
+function widestLine(model, act) {
+  const names = new Set();
+  const used = { true: new Map(), false: new Map() };
+  for (const bundle of model.bundles) {
+    for (const tie of bundle.ties) {
+      if (tie.common) continue;
+      for (const name of bundle.names) names.add(`${bundle.kind} ${name}`);
+      if (tie.deny) continue;
+      const of = used[sends(tie)];
+      if (!of.has(tie.enclave)) of.set(tie.enclave, new Set());
+      of.get(tie.enclave).add(bundle);
+    }
+  }
+  const most = (isSending, verbs) => {
+    const numbers = [...used[isSending]].map(([path, bundles]) => [path, [...bundles].reduce((sum, { names: own }) => sum + own.length, 0)]);
+    const top = Math.max(0, ...numbers.map(([, number]) => number));
+    const [first, ...others] = numbers.filter(([, number]) => number === top).map(([path]) => path);
+    if (!first) return null;
+    const also = others.length ? ` and ${others.length} more` : "";
+    return el("p", {}, `May ${verbs} most names (${top} of ${names.size}): `, button(first, () => act.enclave(first)), also);
+  };
+  return [most(true, "publish or call"), most(false, "subscribe to or serve")].filter(Boolean);
+}
+
+// What may be used without a right.  Only a keystore's governance says it, and only of DDS.
+function openLine(model, showTable) {
+  if (!model.bundles.some((bundle) => bundle.protection.data)) {
+    return el("p", { class: "soft", text: "What strangers may do is not stated here: a keystore's governance says it." });
+  }
+  const open = model.bundles.filter(({ protection }) => !protection.read_control || !protection.write_control);
+  const number = open.reduce((sum, bundle) => sum + bundle.names.length, 0);
+  if (!number) return el("p", { text: "On DDS, strangers, who have no identity, may use none of these names, and enclaves only those that they have a right to." });
+  const who = open.some(({ protection }) => protection.strangers) ? "everybody, even without an identity," : "everybody with an identity";
+  return el("p", { class: "lack" }, `On DDS, ${who} may use some names without a right: `, button(counted(number, "name"), showTable));
+}
