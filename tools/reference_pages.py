@@ -12,7 +12,7 @@ import click
 from sros_tool.checks.kind import all_kinds
 from sros_tool.keystore.template import load_template, settings_values, template_names
 from sros_tool.policy.model import Level
-from sros_tool.runtime.vendor_log import LOG_TEXTS
+from sros_tool.runtime.log_texts import LOG_TEXTS
 from tools.distributions_page import distributions_page
 from tools.page_parts import cell, page_text, table_text
 from tools.steps import CHECKOUT
@@ -104,7 +104,7 @@ def _log_texts() -> str:
         causes = [fault.title for fault in each.faults]
         meaning = each.cause or "; or ".join(causes) or "the text alone does not show a cause"
         text = each.pattern.pattern.replace("`", "'").replace("|", "\\|")
-        row = (f"`{text}`", cell(meaning), cell(each.remedy or each.unseen))
+        row = (f"`{text}`", cell(meaning), cell(each.remedy or each.remedy_without_fault))
         by_vendor.setdefault(vendor, []).append(row)
     for vendor, rows in by_vendor.items():
         parts += [f"## {vendor}", table_text("text", "meaning", "what to do", rows=iter(rows))]

@@ -1109,7 +1109,8 @@ _ONLY_TESTS = (
 
 
 def _finding_lines(finding: LogFinding) -> Iterator[str]:
-    from sros_tool.runtime.vendor_log import UNKNOWN, plain_refusal
+    from sros_tool.runtime.log_texts import UNKNOWN
+    from sros_tool.runtime.vendor_log import plain_refusal
 
     times = f"  ({finding.count} times)" if finding.count > 1 else ""
     by = f" of {finding.process}" if finding.process else ""

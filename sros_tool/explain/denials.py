@@ -1,6 +1,6 @@
 """Read denied topics in the logs of secured nodes, and propose the missing rights.
 
-The texts of the logs are in `sros_tool.runtime.vendor_log`.  Fast DDS names the topic and, in a
+The texts of the logs are in `sros_tool.runtime.log_texts`.  Fast DDS names the topic and, in a
 line nearby, whether it is for a writer or a reader.  Cyclone DDS first checks whether a topic may
 be used at all; only the next message of rcl has the direction.  Cyclone DDS logs nothing if the
 governance protects the discovery of the topic.
@@ -47,8 +47,8 @@ from sros_tool.policy.model import Policy
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.rights import profile_rights
 from sros_tool.runtime.vendor_log import (
-    DIRECTIONS,
-    PEER,
+    ENDPOINT_KINDS,
+    REMOTE_ENDPOINT,
     SECURITY_DIRECTORY,
     denied_topic,
     labelled_line,
@@ -123,7 +123,7 @@ def _denials_of(process: str, numbered: list[tuple[int, str]]) -> Iterator[Denia
             vendor, match = denied
             topic = match["topic"]
             remote, direction = _direction(lines[index : index + 1 + _NEAR_LINES], topic)
-            by_rule = "deny" in match["how"].lower()
+            by_rule = "deny" in match["rule"].lower()
             yield Denial(
                 topic, direction, enclave, by_rule, remote, vendor, process, number, folder
             )
@@ -135,9 +135,9 @@ def _direction(lines: list[str], topic: str) -> tuple[bool, str]:
         other = denied_topic(line)
         if other and other[1]["topic"] != topic:
             break
-        if PEER.search(line):
+        if REMOTE_ENDPOINT.search(line):
             return True, PUBLISH if "riter" in line else SUBSCRIBE
-        named = {kind: bool(words.search(line)) for kind, words in DIRECTIONS.items()}
+        named = {kind: bool(words.search(line)) for kind, words in ENDPOINT_KINDS.items()}
         writer, reader = named["writer"], named["reader"]
         if topic.startswith(("rq/", "rr/")) and not (writer or reader):
             # A client writes requests and reads replies, a server does the opposite.

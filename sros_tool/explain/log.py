@@ -37,26 +37,25 @@ from sros_tool.names import ACTION_SEPARATOR, SERVICE_ENDS, check_enclave_name, 
 from sros_tool.pki.certificates import IDENTITY_DIGITS
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.patterns import covers
+from sros_tool.runtime.log_texts import NO_ENCLAVE, RUNS_OPEN, UNKNOWN, LogText
 from sros_tool.runtime.vendor_log import (
-    CONTINUED,
-    DOMAIN_OF_LINE,
-    NO_ENCLAVE,
-    RUNS_OPEN,
+    CONTINUATION,
+    LINE_DOMAIN,
     SECURITY_DIRECTORY,
-    UNKNOWN,
+    denied_topic,
+    labelled_line,
+    log_lines,
+    matching_text,
+    plain_refusal,
+    plain_text,
+    vendor_of_line,
+)
+from sros_tool.runtime.zenoh_log import (
     ZENOH_IDS,
     ZENOH_LINE,
     DroppedMessage,
-    LogText,
-    denied_topic,
     dropped_messages,
-    labelled_line,
-    log_lines,
-    log_text,
-    plain_refusal,
-    plain_text,
-    style_of,
-    zenoh_text,
+    matching_zenoh_text,
 )
 from sros_tool.translate import grant_rights
 from sros_tool.translate_zenoh.rights import name_of_key
@@ -322,7 +321,7 @@ def _joined_lines(lines: list[str]) -> Iterator[tuple[int, str]]:
     """Yield lines with their numbers; an error stack of OpenSSL is joined to the line before."""
     number, current = 0, ""
     for index, line in enumerate(lines, 1):
-        if current and CONTINUED.match(line):
+        if current and CONTINUATION.match(line):
             if len(current) < _LONGEST:
                 current += " " + line
             continue
@@ -351,7 +350,7 @@ def _log_hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
         meaning, match = _meaning_of(line, rest)
         if match:
             fields = {name: value or "" for name, value in match.groupdict().items()}
-            if domain := DOMAIN_OF_LINE.search(line):
+            if domain := LINE_DOMAIN.search(line):
                 fields["domain"] = domain[1]
             yield _Hit(number, text, process, enclaves.get(process, ""), meaning, fields)
 
@@ -364,22 +363,22 @@ def _rejoined_message(process: str, line: str, rest: str, following: str) -> str
     if not UNKNOWN.pattern.search(rest):  # first, because it is fast
         return ""
     other, end = labelled_line(following)
-    if other not in ("", process) or log_text(line) or log_text(following):
+    if other not in ("", process) or matching_text(line) or matching_text(following):
         return ""
     if denied_topic(line) or denied_topic(following) or SECURITY_DIRECTORY.search(following):
         return ""
     return next(
-        (candidate for candidate in (rest + end, f"{rest} {end}") if log_text(candidate)), ""
+        (candidate for candidate in (rest + end, f"{rest} {end}") if matching_text(candidate)), ""
     )
 
 
 def _meaning_of(line: str, rest: str) -> tuple[LogText, re.Match[str] | None]:
     """Return the meaning of a line, and its match, if any; ``rest`` is the line without label."""
-    if meaning := zenoh_text(line):
+    if meaning := matching_zenoh_text(line):
         return meaning
     if ZENOH_LINE.search(rest):  # what is not in the table is no trouble of security
         return UNKNOWN, None
-    if meaning := log_text(line):
+    if meaning := matching_text(line):
         return meaning
     return UNKNOWN, None if denied_topic(line) else UNKNOWN.pattern.search(rest)
 
@@ -542,7 +541,7 @@ class _Examiner:
         """Return the finding for one group of equal messages."""
         first = hits[0]
         meaning = first.meaning
-        vendor = style_of(first.text) if meaning is UNKNOWN else meaning.vendor
+        vendor = vendor_of_line(first.text) if meaning is UNKNOWN else meaning.vendor
         named = self._find(first.enclave)
         if meaning.id == "files-missing" and first.enclave == "/" and named is None:
             first = replace(first, meaning=NO_ENCLAVE)
@@ -574,8 +573,8 @@ class _Examiner:
             return replace(plain, enclave=enclave.name, found=_nodes(answer), checked=True)
         causes = causes or list(self._wrong_domain_cause(enclave, answer, first))
         remedies = list(dict.fromkeys(remedy for _, remedy in causes if remedy))
-        unseen = self._with_names(meaning.unseen, enclave, first)
-        nothing_found = f"{_nothing_found(enclave)} {unseen}".rstrip()
+        remedy = self._with_names(meaning.remedy_without_fault, enclave, first)
+        nothing_found = f"{_nothing_found(enclave)} {remedy}".rstrip()
         return replace(
             plain,
             enclave=enclave.name,
@@ -632,7 +631,9 @@ class _Examiner:
 
     def _with_peer_causes(self, finding: LogFinding, hits: Sequence[_Hit]) -> LogFinding:
         """Return the finding with causes and remedies in the enclaves of the peers in the log."""
-        shown = dict.fromkeys(hit.fields["peer"] for hit in hits if hit.fields.get("peer"))
+        shown = dict.fromkeys(
+            hit.fields["participant"] for hit in hits if hit.fields.get("participant")
+        )
         names = (
             [self._keystore.peer(peer) for peer in islice(shown, _MOST_PEERS)]
             if self._keystore

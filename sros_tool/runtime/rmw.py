@@ -1,7 +1,7 @@
 """The RMWs of ROS 2: their middleware, how to recognize it, and which RMWs are installed.
 
 To add a vendor to sros, add its rules in `sros_tool.dds.decision.vendors`, its row in `MIDDLEWARE`
-here, and its log texts in `sros_tool.runtime.vendor_log`.
+here, and its log texts in `sros_tool.runtime.log_texts`.
 """
 
 from __future__ import annotations

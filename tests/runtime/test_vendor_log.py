@@ -76,3 +76,4 @@ def test_what_is_no_refusal(line: str) -> None:
 
 def test_security_that_is_not_built_in() -> None:
     assert missing_security("This Fast DDS version doesn't have the security libraries")
+    assert missing_security("the Cyclone DDS being used does not have security support enabled.")
