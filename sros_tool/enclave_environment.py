@@ -93,7 +93,6 @@ def loadable_environment(
     from sros_tool.keystore.layout import (
         KEY_FILE,
         enclave_path,
-        has_enclave,
     )
     from sros_tool.keystore.participant import JoinContext
     from sros_tool.keystore.selection import missing_enclave_error
@@ -123,7 +122,7 @@ def loadable_environment(
         _check_release(environment)
     check_enclave_name(name)
     keystore.check()
-    if not has_enclave(keystore.root, name):
+    if not keystore.has_enclave(name):
         raise missing_enclave_error(keystore, name, keystore.names)
     folder = keystore.folder(name)
     state = keystore.enclave(name, now=now)

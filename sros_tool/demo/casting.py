@@ -306,7 +306,7 @@ def _read_enclaves(keystore: OpenedKeystore, now: datetime, domain: int) -> _Enc
             rights[name] = grant._replace(rules=rules)
             governances[name] = state.governance
             if newest or serials:
-                revocations = _content(enclave_path(keystore.root, name) / CRL_FILE)
+                revocations = _content(keystore.folder(name) / CRL_FILE)
                 without_list += (
                     [name] if not revocations or revocations != (newest or revocations) else []
                 )

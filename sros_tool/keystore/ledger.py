@@ -430,7 +430,7 @@ class LedgerFile:
         from sros_tool.keystore.ledger_index import IndexUpdate
 
         if index := self._opened().ledger_index:
-            return IndexUpdate(index)
+            return IndexUpdate(self.root, index)
         with _open(self.root, self._follow_link) or io.BytesIO() as file:
             made, is_sound = self._new_index(file, self._opened().head)
             return made if is_sound else None
@@ -552,7 +552,7 @@ class LedgerFile:
             made, is_sound = self._new_index(file, head)
             root = made.root()
             if root == head.index_root or is_sound:
-                made.save(self.root)
+                made.save()
                 index = LedgerIndex.open(self.root, head.lines, head.last, root)
         last_size = index.state.size - index.state.sealed_size if index else 0
         ends_so = index and _last_line(file, last_size) == head.last
@@ -674,7 +674,7 @@ class LedgerFile:
         """
         from sros_tool.keystore.ledger_index import IndexUpdate
 
-        index = IndexUpdate(None)
+        index = IndexUpdate(self.root, None)
 
         def indexed() -> Iterator[bytes]:
             for line in self._every_line(last_part, index.seal):
@@ -1114,7 +1114,7 @@ def append(
     if index:
         with suppress(SrosError):  # a damaged index is made again by the next change
             root = index.root()
-            transaction.after_commit(lambda: index.save(transaction.root))
+            transaction.after_commit(index.save)
     head = f"sros ledger 2\n{head}index {root}\n" if root else f"sros ledger 1\n{head}"
     transaction.write(LEDGER_HEAD, sign(head.encode(), "the head of the ledger"))
 

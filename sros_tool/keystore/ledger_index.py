@@ -256,12 +256,13 @@ class LedgerIndex:
 
 
 class IndexUpdate:
-    """The index of a ledger to which lines are added; ``base`` is the current one, None without.
+    """The index of the ledger in a keystore's ``folder``, to which lines are added.
 
-    Without a base, all lines of the ledger have to be added.
+    ``base`` is the current index; without one, all lines of the ledger have to be added.
     """
 
-    def __init__(self, base: LedgerIndex | None) -> None:
+    def __init__(self, folder: Path, base: LedgerIndex | None) -> None:
+        self._folder = folder
         self.state = base.state if base else IndexState(0, 0, 0, "", 0, 0)
         self._base = base
         self._added: dict[int, bytearray] = {}
@@ -316,42 +317,42 @@ class IndexUpdate:
         self._digests = bytes(digests)
         return self.state.root(self._digests)
 
-    def save(self, root: Path) -> None:
-        """Write the index of the keystore ``root``, after `root` and the commit of the ledger.
+    def save(self) -> None:
+        """Write the index to the keystore, after `root` and the commit of the ledger.
 
         Nothing is written by root in a keystore of another user, who could lead it to another file;
         then, and if the process stops here, the next change makes the index again.
         """
         try:
-            if not _is_own(root):
+            if not _is_own(self._folder):
                 return
             if self._base is None:
-                self._make(root)
+                self._make()
                 return
-            _check_file(root / LEDGER_INDEX)
-            _remove_journals(root, LEDGER_INDEX)
-            with closing(_connect(root / LEDGER_INDEX, "rw")) as connection:
-                self._write(root, connection)
+            _check_file(self._folder / LEDGER_INDEX)
+            _remove_journals(self._folder, LEDGER_INDEX)
+            with closing(_connect(self._folder / LEDGER_INDEX, "rw")) as connection:
+                self._write(connection)
         except (OSError, sqlite3.Error, ValueError, SrosError):
             from sros_tool.folders import Folder
 
-            with suppress(OSError, SrosError), Folder(root) as folder:
+            with suppress(OSError, SrosError), Folder(self._folder) as folder:
                 folder.unlink(LEDGER_INDEX, missing_ok=True)
 
-    def _make(self, root: Path) -> None:
+    def _make(self) -> None:
         from sros_tool.folders import Folder  # a question does not load what writes
 
-        with Folder(root) as folder:
+        with Folder(self._folder) as folder:
             folder.unlink(_NEW, missing_ok=True)
             folder.write(_NEW, b"", 0o600)
-            _remove_journals(root, _NEW)
-            with closing(_connect(root / _NEW, "rw", is_new=True)) as connection:
-                self._write(root, connection)
+            _remove_journals(self._folder, _NEW)
+            with closing(_connect(self._folder / _NEW, "rw", is_new=True)) as connection:
+                self._write(connection)
             folder.replace(_NEW, LEDGER_INDEX)
 
-    def _write(self, root: Path, connection: sqlite3.Connection) -> None:
+    def _write(self, connection: sqlite3.Connection) -> None:
         with connection:
-            lines = enumerate(self._new_sealed_lines(root), self._sealed_before + 1)
+            lines = enumerate(self._new_sealed_lines(), self._sealed_before + 1)
             connection.executemany("REPLACE INTO lines VALUES (?, ?)", lines)
             buckets = ((bucket, *parts) for bucket, parts in self._buckets.items())
             connection.executemany("REPLACE INTO buckets VALUES (?, ?, ?)", buckets)
@@ -359,30 +360,30 @@ class IndexUpdate:
             row = (*self.state, self._digests)
             connection.execute("INSERT INTO state VALUES (?, ?, ?, ?, ?, ?, ?)", row)
 
-    def _new_sealed_lines(self, root: Path) -> Iterator[bytes]:
+    def _new_sealed_lines(self) -> Iterator[bytes]:
         """Yield the lines of the parts that were sealed since ``base``."""
         from sros_tool.folders import Folder
 
-        with Folder(root) as folder:
+        with Folder(self._folder) as folder:
             for part in self._sealed:
                 with folder.open(part) as file:
                     yield from (line.removesuffix(b"\n") for line in file)
 
 
-def _is_own(root: Path) -> bool:
-    """Return whether ``root`` belongs to this user, and nobody else can write to it."""
-    state = root.stat()
+def _is_own(folder: Path) -> bool:
+    """Return whether ``folder`` belongs to this user, and nobody else can write to it."""
+    state = folder.stat()
     return state.st_uid == os.geteuid() and not state.st_mode & 0o022
 
 
-def _remove_journals(root: Path, name: str) -> None:
+def _remove_journals(keystore_folder: Path, name: str) -> None:
     """Remove the files that SQLite would read next to an index; this version writes none.
 
     A journal names files that SQLite removes, and a link would lead it to another file.
     """
     from sros_tool.folders import Folder
 
-    with Folder(root) as folder:
+    with Folder(keystore_folder) as folder:
         for end in ("-journal", "-wal", "-shm"):
             folder.unlink(f"{name}{end}", missing_ok=True)
 

@@ -53,6 +53,7 @@ from sros_tool.keystore.layout import (
     enclave_names,
     enclave_path,
     how_to_add_domains,
+    is_enclave,
     is_original_keystore,
     key_on_robot,
 )
@@ -499,6 +500,10 @@ class OpenedKeystore:
     def folder(self, name: str) -> Path:
         """Return the folder of an enclave."""
         return enclave_path(self.root, name)
+
+    def has_enclave(self, name: str) -> bool:
+        """Return whether the keystore has an enclave now, without listing all enclaves."""
+        return is_enclave(self.folder(name))
 
     def enclave(self, name: str, *, now: datetime, domain: int | None = None) -> OpenedEnclave:
         """Return an enclave of the keystore, as `open_enclave` does."""

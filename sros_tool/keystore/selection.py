@@ -29,7 +29,6 @@ from sros_tool.keystore.layout import (
     SETTINGS,
     enclaves_below,
     folder_of_closed_robot,
-    has_enclave,
 )
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.reader import OpenedKeystore
@@ -140,7 +139,7 @@ def _possible_enclaves(
     possible = set(recorded)
     for folder in folders:
         possible.update((folder, *enclaves_below(keystore.root, folder)))
-    return sorted(name for name in possible if has_enclave(keystore.root, name))
+    return sorted(name for name in possible if keystore.has_enclave(name))
 
 
 def _unrecorded_notes(

@@ -201,7 +201,7 @@ def kill(*_: object) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def kill_within(update: IndexUpdate, root: Path, connection: sqlite3.Connection) -> None:
+def kill_within(update: IndexUpdate, connection: sqlite3.Connection) -> None:
     connection.execute("DELETE FROM buckets")
     connection.commit()
     kill()

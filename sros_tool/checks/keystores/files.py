@@ -40,7 +40,6 @@ from sros_tool.keystore.layout import (
     ZENOH_FILES,
     UnreadPath,
     enclave_folder,
-    enclave_path,
     hidden_enclaves,
 )
 from sros_tool.owners import other_writers, replaceable_on_the_way, user_name
@@ -275,7 +274,7 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
 
 def _hidden_enclave_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
     for name in hidden_enclaves(keystore.root):
-        folder = str(enclave_path(keystore.root, name))
+        folder = str(keystore.opened.folder(name))
         yield HIDDEN_ENCLAVE.found(name, "its folder or one above it begins with a dot", folder)
 
 
@@ -284,7 +283,7 @@ def _has_links(keystore: CheckedKeystore) -> bool:
 
     The enclaves of an export have copies, even if somebody adds files to make it look original.
     """
-    files = [enclave_path(keystore.root, name) / IDENTITY_CA_FILE for name in keystore.names]
+    files = [keystore.opened.folder(name) / IDENTITY_CA_FILE for name in keystore.names]
     return not any(map(os.path.lexists, files)) or any(map(os.path.islink, files))
 
 

@@ -26,7 +26,6 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_CA_FILE,
     ROLES,
     enclave_folder,
-    enclave_path,
     folder_of_closed_robot,
     is_original_keystore,
 )
@@ -358,10 +357,10 @@ def _revocation_list_findings(
         older = [enclave for enclave in enclaves if enclave.list_number < newest.list_number]
         if not older:
             continue
-        path = enclave_path(keystore.root, newest.name) / CRL_FILE
+        path = keystore.opened.folder(newest.name) / CRL_FILE
         crl = load_crl(keystore.opened.read(path, "revocation list"), f"'{path}'")
         for summary in older:
-            folder = str(enclave_path(keystore.root, summary.name))
+            folder = str(keystore.opened.folder(summary.name))
             of = f"the list of {newest.name} has number {newest.list_number}"
             if crl.revokes(summary.serial):
                 yield REVOKED_BY_NEWER_LIST.found(

@@ -27,7 +27,6 @@ from sros_tool.keystore.layout import (
     ROLES,
     SETTINGS,
     ca_certificate,
-    enclave_path,
     search_enclaves,
 )
 from sros_tool.keystore.ledger import Ledger
@@ -219,7 +218,7 @@ class CheckedEnclave:
     @cached_property
     def folder(self) -> Path:
         """Folder of the enclave."""
-        return enclave_path(self.keystore.root, self.name)
+        return self.keystore.opened.folder(self.name)
 
     @property
     def accepts_expiry(self) -> str:

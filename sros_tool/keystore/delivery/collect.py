@@ -51,7 +51,6 @@ from sros_tool.keystore.layout import (
     IDENTITY,
     confirmation_file,
     enclave_folder,
-    has_enclave,
 )
 from sros_tool.keystore.ledger import REPORTED, Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
@@ -675,7 +674,7 @@ class _Renewals:
         if owner != robot:
             whose = f"an enclave of {owner.name}" if owner else "not an enclave of a robot"
             raise _RefusedError(f"{name} is {whose}")
-        if not has_enclave(keystore.root, name):
+        if not keystore.has_enclave(name):
             raise _RefusedError("the keystore does not have this enclave, or it was revoked")
         present = keystore.certificate_of(name)
         if present.serial_number in self._revoked:

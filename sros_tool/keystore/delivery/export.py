@@ -38,7 +38,6 @@ from sros_tool.keystore.layout import (
     check_readable,
     enclave_folder,
     enclave_path,
-    has_enclave,
     key_on_robot,
     search_enclaves,
 )
@@ -171,7 +170,7 @@ def _token_notes(files: Mapping[str, bytes]) -> Iterator[Note]:
 def _notes(keystore: OpenedKeystore, target: Path) -> Iterator[Note]:
     """Yield a note for each enclave in ``target`` that the keystore does not have now."""
     for name in search_enclaves(target)[0]:
-        if not has_enclave(keystore.root, name):
+        if not keystore.has_enclave(name):
             yield Note(
                 "export.not-in-keystore",
                 f"'{target}' also has enclave {name}, which keystore '{keystore.root}' does not "
@@ -211,7 +210,7 @@ def exported_files(
     """
     keystore.check()
     for name in names:
-        if not has_enclave(keystore.root, check_enclave_name(name)):
+        if not keystore.has_enclave(check_enclave_name(name)):
             raise missing_enclave_error(keystore, name, keystore.names)
     check_readable(keystore.root, names)
     files: dict[str, bytes] = {}

@@ -50,7 +50,6 @@ from sros_tool.keystore.layout import (
     SEAL,
     ZENOH_FILES,
     enclave_folder,
-    has_enclave,
 )
 from sros_tool.keystore.ledger import document_entry
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
@@ -325,7 +324,7 @@ def _check_distinct(requests: Sequence[SigningRequest]) -> None:
 
 def _is_certified(keystore: OpenedKeystore, request: SigningRequest) -> bool:
     """Return whether the enclave of a request already has a certificate for the request's key."""
-    if not has_enclave(keystore.root, request.name):
+    if not keystore.has_enclave(request.name):
         return False
     return keystore.certificate_of(request.name).public_key() == request.public_key
 
@@ -389,7 +388,7 @@ class _Signer:
         change, root, name = self._change, self._root, request.name
         known, authority = change.known, change.permissions.certificate
         stated = self._stated_rights[name].enclave
-        _check_name(change.keystore, name, renew, has_enclave(root, name))
+        _check_name(change.keystore, name, renew)
         if stated is not None:
             refuse_less_protected(change.keystore, change.governance, stated_protections([stated]))
         present = change.keystore.certificate_of(name) if renew else None
@@ -507,16 +506,15 @@ def _check_free(answer: Path, force: bool) -> None:
         )
 
 
-def _check_name(
-    keystore: OpenedKeystore, name: str, renew: bool, has_enclave_already: bool
-) -> None:
-    if has_enclave_already and not renew:
+def _check_name(keystore: OpenedKeystore, name: str, renew: bool) -> None:
+    exists = keystore.has_enclave(name)
+    if exists and not renew:
         raise KeystoreError(
             f"enclave {name} already exists in keystore '{keystore.root}'",
             "The sender of the request would get the rights of this enclave.",
             "If that is intended, add --renew; otherwise create the request for another name.",
         )
-    if renew and not has_enclave_already:
+    if renew and not exists:
         raise KeystoreError(
             f"enclave {name} does not exist in keystore '{keystore.root}'",
             "Only an existing enclave can be renewed.",

@@ -347,7 +347,7 @@ def generate_artifacts(
 def _expired_enclaves(change: KeystoreChange, names: Iterable[str]) -> Iterator[tuple[str, Note]]:
     """Yield the short-lived enclaves that have expired, with a note: nobody has to renew them."""
     for name in sorted(names):
-        path = enclave_path(change.root, name) / CERTIFICATE_FILE
+        path = change.keystore.folder(name) / CERTIFICATE_FILE
         if change.template.longest_validity(name) is None or not path.exists():
             continue
         end = validity_of(change.keystore.certificate(path)).not_after

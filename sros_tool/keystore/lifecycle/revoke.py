@@ -24,7 +24,6 @@ from sros_tool.keystore.layout import (
     REVOKED,
     ZENOH_FILES,
     enclave_folder,
-    has_enclave,
 )
 from sros_tool.keystore.ledger import RESTORED, Entry, certificate_entry
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
@@ -174,7 +173,7 @@ def restore_revocations(
         lost_revocations = {
             entry.enclave: reasons[serial]
             for serial, entry in sorted(issued.items())
-            if reasons[serial] != SUPERSEDED and has_enclave(root, entry.enclave)
+            if reasons[serial] != SUPERSEDED and change.keystore.has_enclave(entry.enclave)
         }
         replaced_keys = _replaced_keys(issued, unknown, reasons)
         names = {enclave for enclave, _ in replaced_keys}
@@ -278,7 +277,7 @@ def _reasons_of_revoked(change: KeystoreChange, unknown: Mapping[str, Entry]) ->
     return {
         serial: reasons.get(entry.enclave, "unspecified")
         for serial, entry in unknown.items()
-        if entry.enclave in gone and not has_enclave(change.root, entry.enclave)
+        if entry.enclave in gone and not change.keystore.has_enclave(entry.enclave)
     }
 
 
@@ -292,7 +291,7 @@ def _unknown_note(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Note:
     )
     revoked = {entry.serial for entry in change.entries if entry.what == "revocation"}
     valid = sorted({entry.enclave for entry in unknown.values() if entry.serial not in revoked})
-    if missing := [name for name in valid if not has_enclave(change.root, name)]:
+    if missing := [name for name in valid if not change.keystore.has_enclave(name)]:
         text += (
             f". The keystore lacks {first_few(missing, _SHOWN)}, whose certificates stay valid: "
             "create these enclaves again and revoke them, or replace the CA with `sros rotate_ca`"
@@ -345,7 +344,7 @@ def _check_names(change: KeystoreChange, names: Sequence[str]) -> None:
     router = change.template.zenoh.router if change.template.zenoh else None
     for name in names:
         check_enclave_name(name)
-        exists = has_enclave(change.root, name)
+        exists = change.keystore.has_enclave(name)
         if name == router and exists:
             raise _router_error(change, name)
         if not exists:

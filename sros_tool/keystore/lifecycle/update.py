@@ -863,7 +863,7 @@ def _check_settings(change: KeystoreChange, *, edited: bool) -> None:
 
 def _check_router(change: KeystoreChange, router: str) -> None:
     """Raise `UsageError` if a policy gave the enclave of the router its permissions."""
-    path = enclave_path(change.root, router) / PERMISSIONS_FILE
+    path = change.keystore.folder(router) / PERMISSIONS_FILE
     if not path.exists():
         return
     digest = hashlib.sha256(change.keystore.read(path, "permissions document")).hexdigest()
