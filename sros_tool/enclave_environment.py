@@ -712,10 +712,12 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
                 "ROS starts no node in it.",
                 f"Write `-r __ns:={quote(check_namespace(ns))}`.",
             )
-    found = {tuple(e.path for e in policy.enclaves_of_node(*node)) for node in nodes.values()}
-    if "" not in nodes or len(found) > 1:
-        raise _unknown_node_error(command, nodes, [*found])
-    (enclaves,) = found
+    enclave_paths = {
+        tuple(e.path for e in policy.enclaves_of_node(*node)) for node in nodes.values()
+    }
+    if "" not in nodes or len(enclave_paths) > 1:
+        raise _unknown_node_error(command, nodes, [*enclave_paths])
+    (enclaves,) = enclave_paths
     if len(enclaves) == 1:
         return enclaves[0]
     ns, name = nodes[""]
@@ -772,7 +774,9 @@ def _unnamed_node_error(policy: Policy, command: Sequence[str]) -> UsageError:
 
 
 def _unknown_node_error(
-    command: Sequence[str], nodes: Mapping[str, tuple[str, str]], found: Sequence[tuple[str, ...]]
+    command: Sequence[str],
+    nodes: Mapping[str, tuple[str, str]],
+    enclave_paths: Sequence[tuple[str, ...]],
 ) -> UsageError:
     """Return the error for a command whose node depends on the name that its program gives it.
 
@@ -781,8 +785,8 @@ def _unknown_node_error(
     """
     cases = [f"{_full_name(*node)} if its own name is {own}" for own, node in nodes.items() if own]
     other = f"else {_full_name(*nodes[''])}" if "" in nodes else "else it keeps its own name"
-    several = len(found) > 1 or len(found[0]) != 1
-    enclave = "ENCLAVE" if several else quote(found[0][0])
+    several = len(enclave_paths) > 1 or len(enclave_paths[0]) != 1
+    enclave = "ENCLAVE" if several else quote(enclave_paths[0][0])
     return UsageError(
         f"sros cannot know which node the command '{command[0]}' starts",
         f"By its remapping rules it is {', '.join(cases)}, {other}.",

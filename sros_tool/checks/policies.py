@@ -1299,14 +1299,14 @@ def _robots_on_one_domain(
 
     The first robot is from ``other_robots`` (None: from ``robots``), the second from ``robots``.
     """
-    seen = {robot.domain: robot for robot in other_robots or ()}
+    robots_by_domain = {robot.domain: robot for robot in other_robots or ()}
     for robot in robots:
-        candidates = (seen.get(robot.domain), seen.get(None))
-        for other_robot in seen.values() if robot.domain is None else candidates:
+        candidates = (robots_by_domain.get(robot.domain), robots_by_domain.get(None))
+        for other_robot in robots_by_domain.values() if robot.domain is None else candidates:
             if other_robot:
                 return other_robot, robot
         if other_robots is None:
-            seen[robot.domain] = robot
+            robots_by_domain[robot.domain] = robot
     return None
 
 
@@ -1335,12 +1335,12 @@ def _duplicates(path: Path) -> Iterator[tuple[str, int]]:
         root = parse(read_bytes(path, "policy file"), str(path))
     except SrosError:
         return
-    seen: set[str] = set()
+    names: set[str] = set()
     for element in root.iter("enclave"):
         name = element.get("path", "")
-        if name in seen:
+        if name in names:
             yield name, element.sourceline or 0
-        seen.add(name)
+        names.add(name)
 
 
 # ── includes ───────────────────────────────────────────────────────────────────────────────
@@ -1355,16 +1355,16 @@ def _include_findings(path: Path) -> Iterator[Finding]:
             for file in {file for _, file in includes}
             for included in graph.included_files(file)
         }
-        seen: set[tuple[Path, str]] = set()
+        steps: set[tuple[Path, str]] = set()
         for element, file in includes:
             href, line = element.get("href", ""), element.sourceline
             step = (file, element.get("xpointer", ""))
             if not file.exists():
                 yield FALLBACK.found(str(path), f"'{href}' does not exist", str(path), line)
-            elif step in seen or file in reached:
+            elif step in steps or file in reached:
                 text = f"'{href}' is already included in the same profile by another include"
                 yield REDUNDANT_INCLUDE.found(str(path), text, str(path), line)
-            seen.add(step)
+            steps.add(step)
 
 
 class _IncludeGraph:

@@ -79,14 +79,14 @@ def _complete_arguments(
     """Complete the keystore, its enclaves, the `_OPERATIONS`, and then the ROS names."""
     from sros_tool.keystore.layout import is_keystore
 
-    given: tuple[str, ...] = ctx.params.get("arguments") or ()
-    named = bool(given) and is_keystore(Path(given[0]))
-    rest = given[1:] if named else given
+    arguments: tuple[str, ...] = ctx.params.get("arguments") or ()
+    named = bool(arguments) and is_keystore(Path(arguments[0]))
+    rest = arguments[1:] if named else arguments
     before = 0 if ctx.params.get("who") else 1  # the enclave
     if len(rest) == before:
         return [word for word in _OPERATIONS if word.startswith(incomplete)]
     if len(rest) == before + 1:
-        root = Path(given[0]) if named else ctx.params.get("keystore")
+        root = Path(arguments[0]) if named else ctx.params.get("keystore")
         names = _names_in_rights(ctx.params.get("policy") or root, _KINDS.get(rest[-1], ""))
         return [name for name in names if name.startswith(incomplete)]
     if rest:
@@ -114,10 +114,10 @@ def _complete_enclave(
     """Complete the enclaves of the keystore in the arguments, or else in the environment."""
     from sros_tool.keystore.layout import is_keystore, search_enclaves
 
-    given = (
+    arguments = (
         ctx.params.get("arguments") or ctx.args
     )  # click fills only args if an option lacks its value
-    named = ctx.params.get("keystore") or (given[0] if given else "")
+    named = ctx.params.get("keystore") or (arguments[0] if arguments else "")
     root = Path(named or os.environ.get(KEYSTORE_VARIABLE, ""))
     names = search_enclaves(root)[0] if is_keystore(root) else ()
     return [name for name in names if name.startswith(incomplete)]

@@ -378,7 +378,7 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
         for node in enclaves.nodes.expected
         if node.enclave != observer or (node.node and not is_expression(node.node))
     )
-    seen: set[EnclaveNode] = set()
+    observed_nodes: set[EnclaveNode] = set()
     denied: list[DeniedRight] = []
     refused: dict[str, str] = {}
     judged: list[ObservedNode] = []
@@ -389,7 +389,7 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
         if not candidates:
             homeless += nodes
             continue
-        seen |= {
+        observed_nodes |= {
             enclave_node
             for enclave_node in expected
             if enclave_node.enclave in candidates
@@ -427,7 +427,7 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
         make_observation(judged),
         tuple(notes),
         expected,
-        tuple(sorted(expected - seen)),
+        tuple(sorted(expected - observed_nodes)),
         tuple(words for _, words in unjudged if words),
     )
 

@@ -691,7 +691,8 @@ class _Examiner:
             return False
         moved = replace(denial, topic=f"{denial.topic[:2]}{ns}{denial.topic[2:]}")
         now, then = (
-            self._answer(enclave, denial.vendor, _question(each)) for each in (denial, moved)
+            self._answer(enclave, denial.vendor, _question(asked_denial))
+            for asked_denial in (denial, moved)
         )
         return then.allowed and not now.allowed
 
@@ -921,10 +922,10 @@ def _renaming_advice(nodes: Sequence[str], wrong: str) -> str:
         # rcl looks for the rule of the namespace under the new name.
         rules = f"`--ros-args -r {quote(wrong.rpartition('/')[2])}:__node:={quote(name)} "
         rules += f"-r {quote(name)}:__ns:={quote(ns or '/')}`"
-        one = meant[0] if len(meant) == 1 else f"one of these names, such as {meant[0]}"
+        new_name = meant[0] if len(meant) == 1 else f"one of these names, such as {meant[0]}"
         start = (
-            f"The enclave is for several nodes. Rename this node alone to {one}: in its code or "
-            f"launch file, or with {rules}; `-r __node:=` would rename all nodes of the process"
+            f"The enclave is for several nodes. Rename only this node, to {new_name}, in its code "
+            f"or launch file, or with {rules}; `-r __node:=` would rename all nodes of the process"
         )
     return (
         f"{start}; or, if {wrong} is right, give it a profile with common/node.xml: in the policy "

@@ -132,14 +132,14 @@ def minimize(
     Every DENY stays.  ``common`` are the rights that every node needs.  They stay, observed or not,
     if the policy allows them to a node with a profile.
     """
-    seen = folded(right for right in observed if right.qualifier is ALLOW)
+    used = folded(right for right in observed if right.qualifier is ALLOW)
     by_enclave: dict[str, set[Right]] = defaultdict(set)
-    for right in seen:
+    for right in used:
         by_enclave[right.enclave].add(right)
     needed = (
         right for enclave in policy.enclaves for right in _common_rights_of_nodes(enclave, common)
     )
-    names = _KnownNames((policy_rights(policy), seen, needed))
+    names = _KnownNames((policy_rights(policy), used, needed))
     enclaves, uses = [], []
     for enclave in policy.enclaves:
         enclave, use = _Narrowing(
@@ -226,9 +226,9 @@ class _Narrowing:
         self._denied = [right for right in stated if right.qualifier is DENY]
         self._rules = Rules(stated)
         self._observed = sorted(observed, key=order)
-        seen = unfolded(observed)
-        self._in_use = frozenset(part for part in seen if self._is_usable(part))
-        self._refused = folded(seen - self._in_use)
+        observed_parts = unfolded(observed)
+        self._in_use = frozenset(part for part in observed_parts if self._is_usable(part))
+        self._refused = folded(observed_parts - self._in_use)
         self._use = Rules(self._in_use)
         self._common = {
             right
@@ -258,18 +258,20 @@ class _Narrowing:
         return _narrowed_enclave(self._enclave, kept, replacements), self._use_of(kept, wide)
 
     def _use_of(self, kept_rights: set[Right], wide: Sequence[WideRule]) -> EnclaveUse:
-        seen = bool(self._observed)
+        is_observed = bool(self._observed)
         unused = [right for right in self._stated if not self._is_observed(right)]
         rewritten = {wildcard.rule for wildcard in wide}
         remaining = [*kept_rights, *(right for wildcard in wide for right in wildcard.replacement)]
         in_use = self._pairs(self._in_use)
         return EnclaveUse(
             enclave=self._enclave.path,
-            observed_at_all=seen,
+            observed_at_all=is_observed,
             never_observed=tuple(
-                r for r in unused if not seen or (r not in kept_rights and r not in rewritten)
+                r
+                for r in unused
+                if not is_observed or (r not in kept_rights and r not in rewritten)
             ),
-            kept_for_every_node=tuple(r for r in unused if seen and r in kept_rights),
+            kept_for_every_node=tuple(r for r in unused if is_observed and r in kept_rights),
             wildcards=tuple(wide),
             not_allowed=tuple(sorted(self._refused, key=order)),
             allowed=len(self._pairs(self._stated) | in_use),
@@ -286,10 +288,10 @@ class _Narrowing:
         if not is_expression(rule.name):
             return self._is_observed(rule)
         return any(
-            is_expression(seen.name)
-            and (seen.name == part.name or not covers(part.name, seen.name))
+            is_expression(used.name)
+            and (used.name == part.name or not covers(part.name, used.name))
             for part in parts(rule)
-            for seen in self._use.overlapping(part)
+            for used in self._use.overlapping(part)
         )
 
     def _narrowed(self, kept_rights: set[Right]) -> tuple[WideRule, ...]:
@@ -499,14 +501,14 @@ def propose_wildcards(
     )
     chosen: list[WildcardProposal] = []
     replaced: set[Right] = set()
-    for each in best:
+    for proposal in best:
         if needed <= 0:
             break
-        names = tuple(right for right in each.replaces if right not in replaced)
-        saves = sum(map(size, names)) - size(each.rule)
+        names = tuple(right for right in proposal.replaces if right not in replaced)
+        saves = sum(map(size, names)) - size(proposal.rule)
         if len(names) < _FEWEST or saves <= 0:
             continue
-        chosen.append(WildcardProposal(each.rule, names, each.adds, saves))
+        chosen.append(WildcardProposal(proposal.rule, names, proposal.adds, saves))
         replaced.update(names)
         needed -= saves
     return tuple(chosen)

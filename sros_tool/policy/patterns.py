@@ -323,8 +323,8 @@ class Names:
             return -len(gram), count[gram], gram
 
         numbers_by_letters: dict[str, list[int]] = {}
-        for number, each in enumerate(grams):
-            key = min(each, key=rarity) if each else ""
+        for number, expression_grams in enumerate(grams):
+            key = min(expression_grams, key=rarity) if expression_grams else ""
             numbers_by_letters.setdefault(key, []).append(number)
         return numbers_by_letters
 

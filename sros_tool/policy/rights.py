@@ -266,11 +266,11 @@ class RightsDifference:
 
     def without(self, enclaves: Collection[str]) -> RightsDifference:
         """Return the difference in the rights of all other enclaves."""
-        one, other = (
+        only_first, only_second = (
             tuple(right for right in side if right.enclave not in enclaves)
             for side in (self.only_first, self.only_second)
         )
-        return RightsDifference(one, other, self.covered)
+        return RightsDifference(only_first, only_second, self.covered)
 
 
 def renamed_enclaves(
@@ -313,12 +313,12 @@ def compare(
     if wildcards that both state cover it: large permissions leave such names out.  A part of an
     action is one if the other side has it only with the whole action, which is a difference.
     """
-    one, other = (
+    first, second = (
         folded(right for right in side if scope is None or right.enclave in scope)
         for side in (first_rights, second_rights)
     )
-    common = Rules(unfolded(one) & unfolded(other) if one != other else ())
-    first_only, second_only = one - other, other - one
+    common = Rules(unfolded(first) & unfolded(second) if first != second else ())
+    first_only, second_only = first - second, second - first
     gone, new = (
         {right for right in side if not common.cover(right)} for side in (first_only, second_only)
     )
@@ -327,7 +327,7 @@ def compare(
         for rights in (gone | first_only & unfolded(new), new | second_only & unfolded(gone))
     )
     covered: dict[Right, tuple[Right, ...]] = {}
-    for rights, side in ((only_first, other), (only_second, one)):
+    for rights, side in ((only_first, second), (only_second, first)):
         rules = Rules(side if rights else ())
         stated = {part: right for right in side for part in parts(right)} if rights else {}
         for right in rights:

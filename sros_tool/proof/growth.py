@@ -638,19 +638,19 @@ def _gains(
     gains: dict[tuple[object, ...], tuple[Gain, set[str], set[int]]] = {}
     for gain in _each_gain(old, new, worlds, scope, limit):
         key = gain.enclaves[0], gain.action, gain.right, gain.name or gain.topic
-        _, seen, domains = gains.setdefault(key, (gain, set(), set()))
-        seen.update(gain.worlds)
+        _, worlds_of_gain, domains = gains.setdefault(key, (gain, set(), set()))
+        worlds_of_gain.update(gain.worlds)
         domains.update(gain.domains)
     order = [world.title for world in worlds]
     together: dict[Gain, list[str]] = {}
-    for gain, seen, domains in gains.values():
-        one = replace(
+    for gain, worlds_of_gain, domains in gains.values():
+        joined_gain = replace(
             gain,
-            worlds=tuple(world for world in order if world in seen),
+            worlds=tuple(world for world in order if world in worlds_of_gain),
             domains=tuple(sorted(domains)),
         )
         # What the governance gives, it gives to many.
-        same = one if one.right else replace(one, enclaves=())
+        same = joined_gain if joined_gain.right else replace(joined_gain, enclaves=())
         together.setdefault(same, []).extend(gain.enclaves)
     for gain, enclaves in together.items():
         yield replace(gain, enclaves=tuple(dict.fromkeys(enclaves)))
@@ -1153,8 +1153,10 @@ def _completed(side: AccessSource, other: AccessSource) -> AccessSource:
     permissions = _certified_as(side, other)
     if domains:
         permissions = {
-            name: _permissions_for_domain(given, domains[name]) if name in domains else given
-            for name, given in permissions.items()
+            name: _permissions_for_domain(certified, domains[name])
+            if name in domains
+            else certified
+            for name, certified in permissions.items()
         }
     if side.governance:
         return replace(side, permissions=permissions)

@@ -355,11 +355,17 @@ def added_crossing(
         return
     kept = {*before.router_names()} & {*after.router_names()}
     for router in sorted(kept):
-        one, other = _expressions(before, router), _expressions(after, router)
-        if one != other and (name := _newly_passing_name(one, other, limit)):
+        old_crossing, new_crossing = _expressions(before, router), _expressions(after, router)
+        if old_crossing != new_crossing and (
+            name := _newly_passing_name(old_crossing, new_crossing, limit)
+        ):
             meaning = f"{name} may pass between this router and others"
             yield SettingChange(
-                Effect.LOOSER, f"crossing of router {router}", _text(one), _text(other), meaning
+                Effect.LOOSER,
+                f"crossing of router {router}",
+                _text(old_crossing),
+                _text(new_crossing),
+                meaning,
             )
     yield from _moved_enclaves(before, after, {*new.permissions, *new.certified, *kept}, limit)
 
@@ -371,20 +377,22 @@ def _moved_enclaves(
     places: dict[tuple[str, str], str] = {}
     for enclave in sorted(enclaves):
         places.setdefault((_router(before, enclave), _router(after, enclave)), enclave)
-    for (one, other), enclave in places.items():
-        if one == other:
+    for (old_router, new_router), enclave in places.items():
+        if old_router == new_router:
             continue
         for old_place, later in places:
-            if old_place == one:
+            if old_place == old_router:
                 continue
-            has = () if later == other else _crossing_of_both(after, other, later)
-            if name := _newly_passing_name(_crossing_of_both(before, one, old_place), has, limit):
-                crossing = _text(_crossing_of_both(before, one, old_place))
+            has = () if later == new_router else _crossing_of_both(after, new_router, later)
+            if name := _newly_passing_name(
+                _crossing_of_both(before, old_router, old_place), has, limit
+            ):
+                crossing = _text(_crossing_of_both(before, old_router, old_place))
                 yield SettingChange(
                     Effect.LOOSER,
                     f"router of {enclave}",
-                    f"{one}, which passes on {crossing}",
-                    other,
+                    f"{old_router}, which passes on {crossing}",
+                    new_router,
                     f"{name} may pass between this enclave and enclaves that were at {old_place}",
                 )
                 break
@@ -442,7 +450,9 @@ def _names(crossing: _Crossing) -> NameSet:
 
 
 def _expressions(network: ZenohNetwork, router: str) -> _Crossing:
-    own_expressions = next((each.crossing for each in network.routers if each.name == router), ())
+    own_expressions = next(
+        (known.crossing for known in network.routers if known.name == router), ()
+    )
     return tuple(dict.fromkeys(filter(None, (network.crossing, own_expressions))))
 
 

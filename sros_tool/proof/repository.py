@@ -173,7 +173,7 @@ class Repository:
         if _ABBREVIATED.match(name) or (_ABBREVIATED.match(described) and not candidates):
             digits = name if _ABBREVIATED.match(name) else described
             ids = self._ask("rev-parse", f"--disambiguate={digits.lower()}").split()
-            kinds = {each: kind for each, (kind, _) in self._types_and_sizes(ids).items()}
+            kinds = {object_id: kind for object_id, (kind, _) in self._types_and_sizes(ids).items()}
             candidates |= {
                 object_id: object_id
                 for object_id in ids
@@ -286,7 +286,7 @@ class Repository:
         """
         wanted = list(dict.fromkeys(ids))
         trees = _contents_of_kind("tree", wanted, self._objects(wanted))
-        return {each: _entries(data, len(each) // 2) for each, data in trees.items()}
+        return {object_id: _entries(data, len(object_id) // 2) for object_id, data in trees.items()}
 
     def contents(self, ids: Iterable[str]) -> dict[str, bytes]:
         """Return the contents of files, by id.
@@ -299,7 +299,7 @@ class Repository:
 
     def sizes(self, ids: Iterable[str]) -> dict[str, int]:
         """Return the sizes of objects in bytes, by id; missing objects are left out."""
-        return {each: size for each, (_, size) in self._types_and_sizes(ids).items()}
+        return {object_id: size for object_id, (_, size) in self._types_and_sizes(ids).items()}
 
     def _types_and_sizes(self, ids: Iterable[str]) -> dict[str, tuple[str, int]]:
         """Return the type and the size in bytes of objects, by id, as git reports them."""
@@ -340,11 +340,11 @@ class Repository:
             raise DocumentError(f"the files of the commit have more than {maximum} bytes")
         part: list[str] = []
         room = _AT_ONCE
-        for each, size in sizes.items():
+        for object_id, size in sizes.items():
             if part and size > room:
                 yield _contents_of_kind("blob", part, self._read(part, sizes))
                 part, room = [], _AT_ONCE
-            part.append(each)
+            part.append(object_id)
             room -= size
         yield _contents_of_kind("blob", part, self._read(part, sizes))
 
@@ -365,7 +365,7 @@ class Repository:
             DocumentError: an object is damaged, or larger than `_MOST_BYTES`.
         """
         known = {object_id: _known.get((self.folder, object_id)) for object_id in ids}
-        objects = {each: value for each, value in known.items() if value}
+        objects = {object_id: value for object_id, value in known.items() if value}
         unknown = [object_id for object_id in ids if object_id not in objects]
         if unknown:
             objects |= self._read(unknown, self.sizes(unknown))
@@ -373,9 +373,9 @@ class Repository:
 
     def _read(self, ids: Sequence[str], sizes: Mapping[str, int]) -> dict[str, tuple[str, bytes]]:
         """Return type and content of objects as git reads them; see `_objects`."""
-        for each in ids:
-            if sizes.get(each, 0) > _MOST_BYTES:
-                raise DocumentError(f"the object {each} is larger than {_MOST_BYTES} bytes")
+        for object_id in ids:
+            if sizes.get(object_id, 0) > _MOST_BYTES:
+                raise DocumentError(f"the object {object_id} is larger than {_MOST_BYTES} bytes")
         asked = "".join(f"{object_id}\n" for object_id in ids).encode()
         data = self._git(["cat-file", "--batch"], stdin=asked)
         objects: dict[str, tuple[str, bytes]] = {}

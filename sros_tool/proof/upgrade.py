@@ -409,8 +409,8 @@ def changes(files: DecidedFiles, before: Shipped, after: Shipped) -> Iterator[De
                 )
                 for shipped in (before, after)
             ]
-            if found := list(_changes_of_enclave(files, name, sides, number, where, by_vendors)):
-                yield from found
+            if changes := list(_changes_of_enclave(files, name, sides, number, where, by_vendors)):
+                yield from changes
                 break
 
 

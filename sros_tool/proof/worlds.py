@@ -123,7 +123,7 @@ class TopicUser:
 
 def shortest(names: Iterable[str]) -> str | None:
     """Return the shortest of some names, or None if there are none."""
-    return min(names, key=lambda each: (len(each), each), default=None)
+    return min(names, key=lambda name: (len(name), name), default=None)
 
 
 class Side:
