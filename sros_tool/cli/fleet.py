@@ -342,23 +342,26 @@ def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
         line += _outcome_numbers(asked, REQUEST_OUTCOMES, would)
     yield line
     by_outcome = sorted(collected.robots, key=lambda robot: MESSAGE_OUTCOMES.index(robot.outcome))
-    similar_texts: dict[str, dict[str, str]] = {}
+    similar_texts: dict[tuple[str, ...], dict[str, str]] = {}
     for robot in by_outcome:
         why = (f"{robot.outcome}: {robot.why}",) if robot.why else ()
         for text in (*why, *robot.remarks):
             unnamed = _without_robot_name(text, robot.robot)
-            similar_texts.setdefault(_DURATION.sub("", unnamed), {})[robot.robot] = unnamed
+            parts = tuple(_DURATION.split(unnamed))
+            similar_texts.setdefault(parts, {})[robot.robot] = unnamed
     names = [robot.robot for robot in collected.robots]
     for texts in similar_texts.values():
         yield f"{_robot_names(texts, names)}: {_joined_durations(texts)}"
-    for name, request in sorted(
-        requests, key=lambda request: REQUEST_OUTCOMES.index(request[1].outcome)
-    ):
+    requests.sort(key=lambda request: REQUEST_OUTCOMES.index(request[1].outcome))
+    renewed = sum(request.outcome == "renewed" for _, request in requests)
+    for name, request in requests[: renewed + _MOST_LINES]:
         if request.outcome == "renewed":
             yield f"{would}renewed {request.enclave} for the key {request.key_sha256}"
         else:
             enclave = request.enclave or f"a request of {name}"
             yield f"{enclave}: {request.outcome.replace('_', ' ')}: {request.why}"
+    if (more := len(requests) - renewed - _MOST_LINES) > 0:
+        yield f"and {counted(more, 'more request')}, see --json"
 
 
 def _outcome_numbers(numbers: Mapping[str, int], outcomes: Sequence[str], verb_form: str) -> str:
@@ -876,7 +879,7 @@ def _groups(compared_fleet: ComparedFleet, robots: Sequence[str]) -> list[_Group
             clauses = (*_expiry_clauses(robot, compared_fleet.at), *_summary(robot, status.stage))
             what = _CLOCK.sub("", _without_robot_name("; ".join(clauses), robot.robot))
             whats[robot.robot] = what
-            row = (robot.state.value, robot.to_do, _DURATION.sub("", what))
+            row = (robot.state.value, robot.to_do, *_DURATION.split(what))
             robots_by_texts.setdefault((*row, robot.robot if robots else ""), []).append(robot)
         else:
             current.append(robot)
@@ -1089,7 +1092,9 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
     if robot.enclaves and robot.stage not in ("", "unknown", stage):
         yield f"CA files of the stage {robot.stage}"
     yield from robot.notes
-    yield from (robot.problems or ())[:_MOST_GROUPS]
+    for number, problem in enumerate((robot.problems or ())[:_MOST_GROUPS]):
+        # Whoever controls the robot chose the words.
+        yield f"it reports: {problem}" if number < robot.reported else problem
 
 
 def _kind_in_plural(number: int, kind: str) -> str:

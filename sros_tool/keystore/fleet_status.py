@@ -206,7 +206,8 @@ class RobotStatus:
     ``lacks_key`` are enclaves whose key the keystore has and the robot does not, which no release
     brings.  ``is_ahead`` says that, by its message, its files are newer than the backup of the
     keystore. ``reads_copy`` says that it fetched after the publication and got an earlier release,
-    and ``is_locked_out`` that all its certificates are revoked.
+    and ``is_locked_out`` that all its certificates are revoked.  The first ``reported`` problems
+    are in the words of the robot.
     """
 
     robot: str
@@ -277,6 +278,7 @@ class RobotStatus:
     reads_copy: bool = False
     is_ahead: bool = False
     is_locked_out: bool = False
+    reported: int = 0
 
     @property
     def is_published(self) -> bool:
@@ -1065,7 +1067,7 @@ def _status(
         and bool(compared_robot.enclaves)
         and received is not None
         and state not in (State.REFUSED, State.LATER)
-        and set(counts.get("crl", ())) <= {State.CURRENT}
+        and counts.get("crl") == {State.CURRENT: len(compared_robot.enclaves)}
     )
     validity = known.validity(compared_robot)
     certificates = {*counts.get("certificate", ())}
@@ -1100,6 +1102,7 @@ def _status(
         ),
         lacks_key=known.lacks_key(compared_robot) if different or state is State.UNUSABLE else (),
         is_ahead=is_ahead,
+        reported=len((confirmed and confirmed.problems) or ()),
         is_locked_out=bool(compared_robot.enclaves) and certificates == {State.REVOKED},
     )
     if not (status.fetches and known.reads_copy(compared_robot, status.last_heard)):

@@ -306,6 +306,17 @@ def test_two_computers_that_are_alike_are_seen_by_their_starts(home: Home) -> No
     assert not r1.problems, "only the last day counts"
 
 
+def test_requests_of_strangers_neither_speak_for_sros_nor_fill_the_terminal(home: Home) -> None:
+    names = ("Run it", "/r1/base\x1b[2J", *(f"/r1/x{number}" for number in range(200)))
+    home.send(
+        "r1", requests=tuple(make_request(home.key("r1", "/r1/base"), n).decode() for n in names)
+    )
+    said = sros("fleet", "collect", "ks", "inbox", cwd=home.folder).out.splitlines()
+    assert said[2] == "a request of r1: refused: 'Run it' is not a valid enclave name"
+    assert "'/r1/base\\x1b[2J' is not a valid" in said[3]
+    assert len(said) == 53 and said[-1] == "and 152 more requests, see --json"
+
+
 def test_a_message_that_was_replayed(home: Home) -> None:
     first = home.send("r1").read_bytes()
     home.send("r1")

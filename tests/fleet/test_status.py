@@ -254,6 +254,16 @@ def test_a_robot_whose_server_has_an_old_copy(problem: str, field: Field) -> Non
     assert "was restored" in field.run("fleet", "publish", "ks", "pub", "--restored", status=2).err
 
 
+def test_what_a_robot_says_is_neither_an_error_nor_a_word_of_sros(field: Field) -> None:
+    """Its text differs from that of another robot by a duration that is not there."""
+    field.send("r1", problems=["a 5 s b"])
+    field.send("r2", problems=["a  b"])
+    said = field.run("fleet", "status", "ks", status=1).out
+    assert "it reports: a 5 s b\n" in said and "it reports: a  b\n" in said
+    field.send("r1", problems=["Publish with --restored."])
+    assert "it reports: Publish with --rest" in field.run("fleet", "status", "ks", status=1).out
+
+
 def test_a_clock_that_is_behind_the_confirmations(field: Field) -> None:
     """No robot would ever be offline, and nobody knows whether a list is in force."""
     field.run("revoke", "ks", "--robot", "r3")
@@ -593,6 +603,14 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     assert "\nthe revocation list is in force on all 3 robots; robots need it until " in said
     said = field.run("fleet", "status", "ks", "--robot", "r3").out
     assert "\nthe revocation list is in force on 1 robot; robots need it until " in said
+
+
+def test_a_list_that_the_keystore_does_not_export_is_not_in_force(field: Field) -> None:
+    field.run("revoke", "ks", "/dispatcher")
+    (field.root / ENCLAVES / "r1/base/crl.pem").unlink()
+    field.deliver("r1", "r2", restart=[])
+    robots = field.status()["robots"]
+    assert [robots[name]["crl_in_force"] for name in ("r1", "r2")] == [False, True]
 
 
 def test_a_list_that_revokes_nobody_is_not_said_to_be_in_force(field: Field) -> None:

@@ -62,6 +62,7 @@ from sros_tool.keystore.lifecycle.revoke import (
 )
 from sros_tool.keystore.outcomes import changes_below
 from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     SigningRequest,
@@ -643,6 +644,7 @@ class _Renewals:
             result = CollectedRequest("", "", "refused", "")
             try:
                 request = load_request(text.encode(), f"of {robot.name}")
+                check_enclave_name(request.name)
                 result = CollectedRequest(
                     request.name, key_digest(request.public_key), "refused", ""
                 )
