@@ -1106,10 +1106,10 @@ def _dropped_denials(before: AccessSource, after: AccessSource) -> Iterator[Drop
     owed = defaultdict(set, {"": {denial for denial in denials if denial.enclave in left}})
     old_enclaves, new_enclaves = map(_enclaves_of_nodes, (before, after))
     for node, profiles in old_enclaves.items():
-        for path in new_enclaves.get(node, {}).keys() - profiles:
-            for old_path, profile in profiles.items():
-                rights = unfolded(profile_rights(path, profile))
-                owed[old_path].update(right for right in rights if right.qualifier is DENY)
+        now = new_enclaves.get(node, {}).keys()
+        for path, old_path in product(now - profiles, profiles.keys() - now):
+            rights = unfolded(profile_rights(path, profiles[old_path]))
+            owed[old_path].update(right for right in rights if right.qualifier is DENY)
     for old_path, denied in owed.items():
         names = {part: undenied_name(part, stated) for part in denied}
         for right in sorted(folded(part for part, name in names.items() if name)):
