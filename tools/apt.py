@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import functools
+import os
 import re
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from tools.steps import output_of, root_prefix, say, succeeds
+from tools import steps
+from tools.steps import APT_LOG, output_of, root_prefix, say
 
 _PATIENT = ["-o", "Acquire::Retries=2", "-o", "DPkg::Lock::Timeout=300"]
+
+succeeds = functools.partial(steps.succeeds, log_name=APT_LOG)
 
 
 def available() -> bool:
@@ -22,7 +27,7 @@ def install(pattern: str, lock: int | None = None) -> bool:
     """Install, as root, the package whose whole name matches ``pattern``; return the success.
 
     Updates the package lists first.  Fails without root, without such a package, or if apt fails;
-    the log has the output of apt.
+    `APT_LOG` has the output of apt.
     """
     return install_all([pattern], lock) == []
 
@@ -55,6 +60,18 @@ def _library(name: str) -> Callable[[], bool]:
     return lambda: any(Path("/usr/lib").glob(f"*/{name}"))
 
 
+CYCLONE_DDS = r"libddsc0\w*"
+"""Cyclone DDS 0.10 with its security plugins: libddsc0debian, libddsc0t64, or similar."""
+
+CHOSEN_DDS = "SROS_CYCLONEDDS_DIR"
+"""The variable with which a user names the folder of the DDS to use."""
+
+
+def has_chosen_dds() -> bool:
+    """Return whether the user names the DDS to use, so that none is installed."""
+    return bool(os.environ.get(CHOSEN_DDS))
+
+
 FOR_TESTS: tuple[tuple[str, str, Callable[[], bool]], ...] = (
     ("openssl", "OpenSSL", _command("openssl")),
     ("softhsm2", "a PKCS#11 token in software", _command("softhsm2-util")),
@@ -78,6 +95,11 @@ FOR_TESTS: tuple[tuple[str, str, Callable[[], bool]], ...] = (
     ("fish", "another shell that does", _command("fish")),
     ("systemd", "systemd, which verifies its units", _command("systemd-analyze")),
     ("chromium", "a browser for the pages", _command("chromium")),
+    (
+        CYCLONE_DDS,
+        "Cyclone DDS, which enforces security",
+        lambda: has_chosen_dds() or _library("libddsc.so.*")(),
+    ),
 )
 """Programs and libraries for the tests: package pattern, description, test of existence."""
 
@@ -89,6 +111,8 @@ def provide_for_tests(lock: int | None = None) -> None:
         say("not installing openssh-server, which would open a port of this machine from now on:"
             " without it the tests of robots that Ansible reaches are skipped")  # fmt: skip
         del missing["openssh-server"]
+    if root_prefix() is None:
+        missing.pop(CYCLONE_DDS, None)  # which is unpacked later, without root
     if not missing:
         return
     for what in missing.values():

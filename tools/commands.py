@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import NoReturn
 
@@ -86,15 +87,20 @@ def set_up(needs: Needs, *, again: bool = False) -> None:
         groups = list(needs.groups)
         if again:
             record = replace(record, groups=[], dds=None, rmw=None)
-        if not holds(record, current(), groups):
-            record = prepare(groups, record, lock)
+        provide = partial(apt.provide_for_tests if needs.for_tests else _nothing, lock)
+        if holds(record, current(), groups):
+            provide()
+        else:
+            record = prepare(groups, record, lock, meanwhile=provide)
             write_record(record)
-        if needs.for_tests:
-            apt.provide_for_tests(lock)
-        if needs.dds and not dds.chosen_by_user():
+        if needs.dds and not apt.has_chosen_dds():
             with_dds = _with_dds(needs, record, lock)
             if with_dds != record:
                 write_record(with_dds)
+
+
+def _nothing(_lock: int) -> None:
+    """Provide nothing, for commands that need no programs of the system."""
 
 
 def _with_dds(needs: Needs, record: Record, lock: int) -> Record:

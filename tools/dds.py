@@ -9,15 +9,10 @@ import tempfile
 from pathlib import Path
 
 from tools import apt
-from tools.steps import CHECKOUT, LOG, VENV, output_of, root_prefix, say
+from tools.steps import APT_LOG, CHECKOUT, VENV, output_of, root_prefix, say
 
 UNPACKED = CHECKOUT / ".dds"
 """The folder where sros looks for a DDS before it asks the system."""
-
-PACKAGE = r"libddsc0\w*"
-"""Cyclone DDS 0.10 with its security plugins: libddsc0debian, libddsc0t64, or similar."""
-
-_VARIABLE = "SROS_CYCLONEDDS_DIR"
 
 _ASK = """
 from sros_tool.errors import UnavailableError
@@ -53,7 +48,7 @@ def provide(python: Path, lock: int | None) -> str | None:
     tried = []
     if root_prefix() is not None:
         say(f"{missing}: installing Cyclone DDS with apt")
-        apt.install(PACKAGE, lock)
+        apt.install(apt.CYCLONE_DDS, lock)
         plugins = plugins_found_by(python)
         tried.append("apt-get install")
     if not plugins:
@@ -61,7 +56,8 @@ def provide(python: Path, lock: int | None) -> str | None:
         plugins = _unpack(python, lock)
         tried.append("apt-get download")
     if not plugins:
-        say(f"{' and '.join(tried)} brought no DDS that enforces security (see {LOG}); continuing")
+        without = f"{' and '.join(tried)} brought no DDS that enforces security"
+        say(f"{without} (see {VENV / APT_LOG}); continuing")
     return plugins or None
 
 
@@ -75,11 +71,6 @@ def enforced_by_ros(python: Path) -> str | None:
         return None
 
 
-def chosen_by_user() -> bool:
-    """Return whether SROS_CYCLONEDDS_DIR names the DDS to use, so that none is installed."""
-    return bool(os.environ.get(_VARIABLE))
-
-
 def plugins_found_by(python: Path, folder: Path | None = None) -> str | None:
     """Return the folder of the security plugins, "" without, or None if sros does not start.
 
@@ -87,7 +78,7 @@ def plugins_found_by(python: Path, folder: Path | None = None) -> str | None:
     """
     env = dict(os.environ)
     if folder is not None:
-        env[_VARIABLE] = str(folder)
+        env[apt.CHOSEN_DDS] = str(folder)
     answer = output_of([python, "-c", _ASK], env)
     return None if answer is None else answer.strip()
 
@@ -96,7 +87,7 @@ def _unpack(python: Path, lock: int | None) -> str | None:
     with tempfile.TemporaryDirectory(prefix="dds-", dir=VENV) as staging:
         whole = Path(staging, "whole")
         whole.mkdir()
-        if not apt.unpack(PACKAGE, whole, lock) or not plugins_found_by(python, whole):
+        if not apt.unpack(apt.CYCLONE_DDS, whole, lock) or not plugins_found_by(python, whole):
             return None
         whole.rename(UNPACKED)
     return plugins_found_by(python)

@@ -13,7 +13,8 @@ import os
 import platform
 import shutil
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 from tools import apt
@@ -29,6 +30,7 @@ from tools.record import (
     whole,
 )
 from tools.steps import (
+    APT_LOG,
     CHECKOUT,
     LOG,
     VENV,
@@ -86,8 +88,12 @@ _TITLES = {
 }
 
 
-def prepare(groups: list[str], record: Record, lock: int) -> Record:
+def prepare(
+    groups: list[str], record: Record, lock: int, *, meanwhile: Callable[[], None]
+) -> Record:
     """Create the environment if needed, and install ``groups`` of `GROUPS`; return the record.
+
+    ``meanwhile`` runs in a thread while the groups are installed, and has ended at the return.
 
     Raises:
         SetupError: something cannot be installed; its text has the end of the log.
@@ -100,8 +106,9 @@ def prepare(groups: list[str], record: Record, lock: int) -> Record:
     if not _usable(record, now):
         _make(now, lock)
         record = Record()
-    elif LOG.exists():
-        LOG.unlink()
+    else:
+        LOG.unlink(missing_ok=True)
+        LOG.with_name(APT_LOG).unlink(missing_ok=True)
     is_current = (
         record.requirements == now.requirements
         and record.surroundings == now.surroundings
@@ -110,10 +117,12 @@ def prepare(groups: list[str], record: Record, lock: int) -> Record:
     if not is_current:
         record = Record()
     done = list(record.groups)
-    with _unfinished():
+    with _unfinished(), ThreadPoolExecutor(1) as threads:
+        others = threads.submit(meanwhile)
         for group in groups:
             if group not in done and _install(group, now, lock):
                 done.append(group)
+        others.result()
     return replace(
         now,
         groups=done,

@@ -16,6 +16,9 @@ CHECKOUT = Path(__file__).resolve().parent.parent
 VENV = CHECKOUT / ".venv"
 LOG = VENV / "setup.log"
 
+APT_LOG = "apt.log"
+"""The log of apt, next to `LOG`: apt works while packages for Python are installed."""
+
 _PATIENCE = 1800
 """Seconds after which an installer is stopped."""
 
@@ -38,14 +41,17 @@ def succeeds(
     cwd: Path | None = None,
     env: Mapping[str, str] | None = None,
     keep_open: int | None = None,
+    log_name: str | None = None,
 ) -> bool:
-    """Run an installer with its output in the log; return whether its exit status was 0.
+    """Run an installer with its output in a log; return whether its exit status was 0.
+
+    The log is `LOG`, or the file ``log_name`` next to it.
 
     The installer inherits ``keep_open``, the file descriptor of the lock.  So the next setup waits
     for an installer that still runs after its setup was killed.
     """
     LOG.parent.mkdir(parents=True, exist_ok=True)
-    with LOG.open("ab") as log:
+    with LOG.with_name(log_name or LOG.name).open("ab") as log:
         log.write(f"\n$ {' '.join(map(str, command))}\n".encode())
         log.flush()
         try:
