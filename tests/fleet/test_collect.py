@@ -317,6 +317,23 @@ def test_requests_of_strangers_neither_speak_for_sros_nor_fill_the_terminal(home
     assert len(said) == 53 and said[-1] == "and 152 more requests, see --json"
 
 
+def test_an_expired_certificate_counts_only_with_the_key_of_now(home: Home) -> None:
+    """A computer that was replaced long ago, and its key, say nothing of the robot any more."""
+    early, late = NOW + timedelta(days=9), LATE
+    shutil.copytree(home.folder / "r1", home.folder / "r1_old")
+    home.run("renew", "ks", "/r1/base", "/r1/arm", "--new-key")
+    said = home.said("r1", early, sequence=10)
+    home.put("r1", signed_message(home.folder / "r1_old", "/r1/base", said), early)
+    assert home.of("r1", early).outcome == "kept", "it was not revoked"
+    said = home.said("r1", late, sequence=11)
+    home.put("r1", signed_message(home.folder / "r1_old", "/r1/base", said), late)
+    refused = home.of("r1", late)
+    assert refused.outcome == "refused"
+    assert refused.why.endswith(" ago, and /r1/base has another key now")
+    home.send("r2", late)
+    assert home.of("r2", late).outcome == "kept", "it has the same key as ever"
+
+
 def test_a_message_that_was_replayed(home: Home) -> None:
     first = home.send("r1").read_bytes()
     home.send("r1")

@@ -571,7 +571,22 @@ class _Verifier:
         if owner != robot:
             whose = f"an enclave of {owner.name}" if owner else "which belongs to no robot"
             raise _RefusedError(f"it is signed by {issued.enclave}, {whose}")
+        if self._now > validity.not_after and not self._has_key_of(issued.enclave, signer):
+            late = elapsed(self._now - validity.not_after)
+            raise _RefusedError(
+                f"its certificate expired {late} ago, and {issued.enclave} has another key now"
+            )
         return issued.enclave
+
+    def _has_key_of(self, enclave: str, signer: x509.Certificate) -> bool:
+        """Return whether a certificate is for the key that an enclave has now.
+
+        An earlier key may be on a computer that nobody watches any more.
+        """
+        with suppress(SrosError):  # no such enclave, or a file of it is broken
+            present = self._keystore.certificate_of(enclave)
+            return present.public_key() == signer.public_key()
+        return False
 
     def _issued(self, sha256: str) -> Entry | None:
         """Return the ledger's entry of a certificate (SHA-256 of its DER), or None."""
