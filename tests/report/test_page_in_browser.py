@@ -554,6 +554,8 @@ def test_overlays_can_be_filtered_and_listed(browser: Browser, tmp_path: Path) -
     path = tmp_path / "use.html"
     sros("view", tmp_path / "robot.xml", "--observed", tmp_path / "seen.xml", "-o", path).ok()
     with opened(browser, path) as page:
+        said = "2 differences: 1 allowed, never observed; 1 observed, not allowed"
+        assert page.inner_text("#headlines") == said
         assert page.locator("#map path.link.first").count() == 1
         assert page.locator("#map path.link.second").count() == 1
         page.select_option("#filter-mark", "first")

@@ -13,13 +13,13 @@ export const MOST_BUNDLES = 160;
 const MOST_NAMES = 8;
 const SHOWN_NAMES = 4;
 
-// As the drawing on paper cuts names: after a slash or an underscore, where one is near.
+// Cuts names as the drawing on paper does: before a slash or after an underscore, where one is near.
 function wrapped(text, letters) {
   const lines = [];
   while (text.length > letters) {
     const head = text.slice(0, letters);
-    let cut = Math.max(head.lastIndexOf("/"), head.slice(0, -1).lastIndexOf("_"));
-    if (cut < letters / 2) cut = letters - 1;
+    let cut = Math.max(head.lastIndexOf("/"), head.lastIndexOf("_"));
+    if (cut < letters / 3) cut = letters - 1;
     else if (text[cut] === "_") cut += 1;
     lines.push(text.slice(0, cut));
     text = `  ${text.slice(cut)}`;
@@ -110,15 +110,15 @@ export function columns(bundles) {
 
 // What the columns are, above them; only where every card is in one of the three.
 function heads(cards) {
-  const found = [];
+  const headings = [];
   const add = (column, anchor, at, text) => {
     const card = cards.find(column);
-    if (card) found.push({ x: card.x + card.width * at, anchor, text });
+    if (card) headings.push({ x: card.x + card.width * at, anchor, text });
   };
   add((card) => card.role !== "names" && card.id[0] === "s", "start", 0, "may send");
   add((card) => card.role === "names", "middle", 0.5, "topics, services, actions");
   add((card) => card.role !== "names" && card.id[0] === "l", "end", 1, "may receive");
-  return found;
+  return headings;
 }
 
 // What flows to a name, or from it, so many hops far.  Names by which information goes between
@@ -241,15 +241,15 @@ export function fitted(scene, room) {
 
 // Cards from left to right in columns, and in each column from the top.
 function byColumn(cards) {
-  const found = [];
+  const columnList = [];
   const middle = (card) => card.x + card.width / 2;
   for (const card of [...cards].sort((a, b) => middle(a) - middle(b))) {
-    const last = found.at(-1);
+    const last = columnList.at(-1);
     if (last && middle(card) - middle(last[0]) < 8) last.push(card);
-    else found.push([card]);
+    else columnList.push([card]);
   }
-  for (const column of found) column.sort((a, b) => a.y - b.y);
-  return found;
+  for (const column of columnList) column.sort((a, b) => a.y - b.y);
+  return columnList;
 }
 
 function fittingWidths(columnsOf, room) {
@@ -355,6 +355,6 @@ function fittedHeads(scene, before, box) {
     if (!below) return head;
     const now = box.get(below.id);
     const x = now.x + ((head.x - below.x) / below.width) * now.width;
-    return { ...head, x, lines: inWords(head.text, Math.floor((now.width + 20) / 8)) };
+    return { ...head, x, lines: inWords(head.text, Math.floor((now.width + (head.anchor === "middle" ? 20 : 8)) / 8)) };
   });
 }

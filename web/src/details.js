@@ -20,15 +20,15 @@ function chip(kind, text) {
 }
 
 export function chips(model, tie) {
-  const found = [];
-  if (tie.deny) found.push(chip("deny", "DENY"));
+  const shown = [];
+  if (tie.deny) shown.push(chip("deny", "DENY"));
   const marked = markText(model.overlay, tie.mark);
-  if (marked) found.push(chip(tie.mark, marked));
-  if (tie.by?.length) found.push(chip("", `by ${tie.by.join(", ")}`));
-  if (tie.parts?.length) found.push(chip("", `only ${tie.parts.join(", ")}`));
-  if (tie.violates) found.push(chip("error", "breaks a requirement"));
-  if (tie.common) found.push(chip("", "as every node"));
-  return found;
+  if (marked) shown.push(chip(tie.mark, marked));
+  if (tie.by?.length) shown.push(chip("", `by ${tie.by.join(", ")}`));
+  if (tie.parts?.length) shown.push(chip("", `only ${tie.parts.join(", ")}`));
+  if (tie.violates) shown.push(chip("error", "breaks a requirement"));
+  if (tie.common) shown.push(chip("", "as every node"));
+  return shown;
 }
 
 function link(text, onclick) {
@@ -55,6 +55,9 @@ function longList(items) {
   return el("div", {}, el("ul", { class: "plain" }, items.slice(0, MOST)), more);
 }
 
+// Backticks mark commands.
+const marked = (text) => text.split("`").map((part, at) => (at % 2 ? el("code", { text: part }) : part));
+
 // A finding; `enclaves` are all that have this very finding, each with a link.
 export function findingItem(finding, enclaves = [], onEnclave = null) {
   const links = enclaves.map((path) => el("li", {}, link(path, () => onEnclave(path))));
@@ -66,8 +69,8 @@ export function findingItem(finding, enclaves = [], onEnclave = null) {
     " ",
     el("code", { text: finding.id }),
     many ? el("details", {}, el("summary", { text: `${links.length} enclaves` }), el("ul", { class: "plain" }, links)) : null,
-    el("p", {}, links.length === 1 ? [link(enclaves[0], () => onEnclave(enclaves[0])), ": "] : [], finding.text),
-    finding.remedy ? el("p", { class: "soft", text: finding.remedy }) : null,
+    el("p", {}, links.length === 1 ? [link(enclaves[0], () => onEnclave(enclaves[0])), ": "] : [], marked(finding.text)),
+    finding.remedy ? el("p", { class: "soft" }, marked(finding.remedy)) : null,
   );
 }
 
@@ -75,7 +78,7 @@ export function enclaveDetails(model, path, act) {
   const enclave = model.enclave.get(path);
   const ties = model.tiesOf.get(path).filter(({ tie }) => !tie.common);
   const common = model.tiesOf.get(path).length - ties.length;
-  const found = model.findingsOf(path);
+  const findings = model.findingsOf(path);
   const parts = [
     el("p", { class: "kind", text: "Enclave" }),
     el("h2", { text: path, tabindex: "-1" }),
@@ -95,8 +98,8 @@ export function enclaveDetails(model, path, act) {
     const items = enclave.problems.map((text) => el("li", { class: "finding error", text }));
     parts.push(section("It cannot be used", el("ul", { class: "plain" }, items)));
   }
-  if (found.length) {
-    parts.push(section("Findings", el("ul", { class: "plain" }, found.map((finding) => findingItem(finding)))));
+  if (findings.length) {
+    parts.push(section("Findings", el("ul", { class: "plain" }, findings.map((finding) => findingItem(finding)))));
   }
   for (const [right, group] of byRight(ties)) {
     const names = group.flatMap(({ tie, bundle }) =>
@@ -113,25 +116,25 @@ export function enclaveDetails(model, path, act) {
   if (common) parts.push(el("p", { class: "soft", text: "In addition, all rights that every node needs to start." }));
   const written = enclave.statements;
   if (written.length) {
-    const items = written.map((each) =>
+    const items = written.map((statement) =>
       el(
         "li",
         {},
-        el("code", { text: `${each.deny ? "DENY " : ""}${each.right} ${each.name}` }),
-        ` fits ${counted(each.reaches, "name")} on this page, and every other name of this form`,
+        el("code", { text: `${statement.deny ? "DENY " : ""}${statement.right} ${statement.name}` }),
+        ` fits ${counted(statement.reaches, "name")} on this page, and every other name of this form`,
       ),
     );
     parts.push(section("Wildcards as written", el("ul", { class: "plain" }, items)));
   }
   const validities = model.validitiesOf(path);
   if (validities.length) {
-    const items = validities.map((each) =>
+    const items = validities.map((validity) =>
       el(
         "li",
         {},
-        el("b", { text: each.kind }),
-        ` ${dateText(each.not_before)} to ${dateText(each.not_after)} `,
-        chip(daysLeft(each) < 0 ? "error" : daysLeft(each) < 30 ? "warning" : "", leftText(each)),
+        el("b", { text: validity.kind }),
+        ` ${dateText(validity.not_before)} to ${dateText(validity.not_after)} `,
+        chip(daysLeft(validity) < 0 ? "error" : daysLeft(validity) < 30 ? "warning" : "", leftText(validity)),
       ),
     );
     parts.push(section("Validity", el("ul", { class: "plain" }, items)));
@@ -196,9 +199,9 @@ export function nameDetails(model, kind, name, act) {
   ]);
   const unknown = el("p", { class: "soft", text: "It is not known: a policy does not state it." });
   parts.push(section("Protection", protection.level === "unknown" ? unknown : level));
-  const others = bundle.names.filter((each) => each !== name);
+  const others = bundle.names.filter((other) => other !== name);
   if (others.length) {
-    const items = others.map((each) => el("li", {}, link(each, () => act.name(kind, each))));
+    const items = others.map((other) => el("li", {}, link(other, () => act.name(kind, other))));
     const list = el("details", {}, el("summary", { text: counted(others.length, "name") }), longList(items));
     parts.push(section("With the very same rights", list));
   }

@@ -43,11 +43,11 @@ export function linkText(link, overlay) {
 // What a card is called: what it is, what stands on it, and all that it stands for.
 function cardText(card, problems) {
   const what = card.role === "names" ? KINDS[card.kind] : card.role;
-  const seen = [...card.lines, ...card.notes].map((text) => text.trim());
+  const texts = [...card.lines, ...card.notes].map((text) => text.trim());
   const marks = [...[...card.tags].reverse(), ...(problems ? ["!"] : [])];
   const level = card.role === "names" ? LEVELS[card.level] : problems ? "has problems" : "";
   const more = card.members.length > 3 ? "and more" : "";
-  return [what, ...seen, ...marks, level, ...card.members.slice(0, 3), more].filter(Boolean).join(" ");
+  return [what, ...texts, ...marks, level, ...card.members.slice(0, 3), more].filter(Boolean).join(" ");
 }
 
 // `choose(card)` is called for a card that was clicked, or chosen by Enter or the space bar.
@@ -147,9 +147,9 @@ export function drawScene(node, scene, { overlay, problems, choose }) {
         // An onlooker has no links: its tag stands on the names that it may read.
         for (const onlooker of scene.onlookers) {
           const looking = scene.cards.filter((card) => onlooks(card, onlooker));
-          const seen = scene.cards.filter((card) => card.tags.includes(onlooker.tag));
-          if (looking.some(belongs)) for (const card of seen) near.add(card.id);
-          if (seen.some(belongs)) for (const card of looking) near.add(card.id);
+          const watched = scene.cards.filter((card) => card.tags.includes(onlooker.tag));
+          if (looking.some(belongs)) for (const card of watched) near.add(card.id);
+          if (watched.some(belongs)) for (const card of looking) near.add(card.id);
         }
       }
       drawn.classed("faded", (card) => any && !near.has(card.id));
@@ -226,7 +226,7 @@ function moved(event, card, drawn, links, choose) {
   const way = { ArrowDown: [0, 1], ArrowUp: [0, -1], ArrowRight: [1, 0], ArrowLeft: [-1, 0] }[event.key];
   if (!way) return;
   event.preventDefault();
-  const centre = (each) => [each.x + each.width / 2, each.y + each.height / 2];
+  const centre = (box) => [box.x + box.width / 2, box.y + box.height / 2];
   const [x, y] = centre(card);
   const linked = new Set(links.flatMap(({ source, target }) => (source === card.id ? [target] : target === card.id ? [source] : [])));
   let best = null;
@@ -273,9 +273,9 @@ export function legend(scene, overlay, equal, make) {
   if (scene.cards.some((card) => card.lacks)) box("lacking", "may be used by one side only");
   if (overlay && scene.links.some((link) => link.mark === "first")) line("first", overlay.first);
   if (overlay && scene.links.some((link) => link.mark === "second")) line("second", overlay.second);
-  for (const each of equal) {
-    if (!scene.cards.some((card) => [...card.lines, card.group ?? ""].some((text) => text.includes(each.label)))) continue;
-    const text = `${each.label}: each of ${each.members.length} ${each.what}s, which are equal but for their names`;
+  for (const units of equal) {
+    if (!scene.cards.some((card) => [...card.lines, card.group ?? ""].some((text) => text.includes(units.label)))) continue;
+    const text = `${units.label}: each of ${units.members.length} ${units.what}s, which are equal but for their names`;
     items.push(make.el("li", {}, make.el("span", { class: "label", text })));
   }
   if (scene.cards.some((card) => card.lines.some((text) => /{\d+ others? of /.test(text)))) {
@@ -284,9 +284,9 @@ export function legend(scene, overlay, equal, make) {
   if (scene.cards.some((card) => card.notes.some((text) => text.startsWith("own:")))) {
     items.push(make.el("li", {}, make.el("span", { text: "own: names that no other enclave may use" })));
   }
-  for (const each of scene.onlookers) {
-    const tag = make.el("b", { class: "tag", text: each.tag });
-    add(tag, `${ONLOOKERS[each.right]} ${each.enclave.replace(/^:/, "")}`);
+  for (const onlooker of scene.onlookers) {
+    const tag = make.el("b", { class: "tag", text: onlooker.tag });
+    add(tag, `${ONLOOKERS[onlooker.right]} ${onlooker.enclave.replace(/^:/, "")}`);
   }
   return items;
 }

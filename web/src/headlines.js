@@ -11,12 +11,14 @@ function button(text, onclick) {
   return el("button", { type: "button", class: "link-button", text, onclick });
 }
 
-// `opens(kind, name)` returns what shows a name; `act.enclave` shows an enclave, and `showTable` the
-// names that are left out.
-export function headlines(model, opens, act, showTable) {
+// `opens(kind, name)` returns what shows a name; `act.enclave` shows an enclave, and `showTab` the
+// names or differences that are only counted.
+export function headlines(model, opens, act, showTab) {
   const parts = model.headlines.map((text) => el("p", { text: `${text}.` }));
+  const showTable = () => showTab("names");
   // A focus has its own answer, and in a comparison there are two.
-  if (!model.overlay && model.scenes[0].id !== "focus") {
+  if (model.overlay) parts.push(differencesLine(model, () => showTab("differences")));
+  else if (model.scenes[0].id !== "focus") {
     const said = drivers(model.rows, opens, showTable);
     const widest = said.length ? [] : [widestLine(model, act)];
     parts.push(el("div", { class: "drivers" }, said, widest.filter(Boolean), openLine(model, showTable)));
@@ -27,6 +29,13 @@ export function headlines(model, opens, act, showTable) {
     parts.push(el("details", { class: "notes" }, el("summary", { text: summary }), rest.map((text) => el("p", { text: `${text}.` }))));
   } else if (first) parts.push(el("p", { class: "notes", text: `${first}.` }));
   return parts;
+}
+
+function differencesLine({ overlay, differences }, showDifferences) {
+  const number = (mark) => differences.filter((difference) => difference.mark === mark).length;
+  const sides = ["first", "second"].filter(number).map((mark) => `${number(mark)} ${overlay[mark]}`);
+  if (!sides.length) return el("p", { text: "There is no difference." });
+  return el("p", { class: "drivers" }, button(counted(differences.length, "difference"), showDifferences), `: ${sides.join("; ")}`);
 }
 
 // Who may drive the robot; where nothing is known to move it, who may use its names if they are few.

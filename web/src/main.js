@@ -16,9 +16,9 @@ const FILTERS = ["enclave", "namespace", "direction", "protection", "mark"];
 const MOST_FOUND = 12;
 const MOST_FINDINGS = 100;
 const problemsOf = new Map(
-  model.enclaves.map((each) => [
-    each.path,
-    each.problems.length + model.findingsOf(each.path).filter((f) => f.severity === "error").length,
+  model.enclaves.map((enclave) => [
+    enclave.path,
+    enclave.problems.length + model.findingsOf(enclave.path).filter((f) => f.severity === "error").length,
   ]),
 );
 const isSmall = () => window.innerWidth <= 720;
@@ -59,7 +59,7 @@ function alone() {
   if (!type || card?.role === "group" || (card && card.role !== "names")) return null;
   const names = card?.members ?? [name];
   const bundles = path
-    ? model.filtered({ enclave: path, common: state.scene > 0 }).map((each) => ({ ...each, ties: each.ties.filter((tie) => tie.enclave === path) }))
+    ? model.filtered({ enclave: path, common: state.scene > 0 }).map((bundle) => ({ ...bundle, ties: bundle.ties.filter((tie) => tie.enclave === path) }))
     : [{ ...model.bundle(kind ?? card.kind, names[0]), names }];
   return { ...columns(bundles), title: path ? `What ${path} may use` : `Who may use ${names[0]}` };
 }
@@ -141,9 +141,9 @@ function light() {
     card: (card) => (card.role === "names") === (chosen.card.role === "names") && card.kind === chosen.card.kind && card.members[0] === chosen.card.members[0],
   }[chosen.type];
   // In a flow everything belongs to what was asked for.
-  const found = state.drawing.highlight(state.flow ? null : belongs);
-  if (!found && !state.flow) return;
-  const card = state.drawing.card(belongs ?? ((each) => each.chosen));
+  const isLit = state.drawing.highlight(state.flow ? null : belongs);
+  if (!isLit && !state.flow) return;
+  const card = state.drawing.card(belongs ?? ((card) => card.chosen));
   // On a small screen, the details lie over the lower half.
   card?.scrollIntoView({ block: isSmall() ? "center" : "nearest", inline: "nearest" });
 }
@@ -249,8 +249,8 @@ function search() {
   const item = (kind, label, onclick) =>
     el("li", {}, el("button", { type: "button", onclick }, el("span", { class: "kind", text: kind }), el("span", { class: "mono", text: label })));
   const items = [
-    ...enclaves.map((each) => item("enclave", each.path, () => found(() => act.enclave(each.path)))),
-    ...names.map((each) => item(KINDS[each.kind], each.name, () => found(() => act.name(each.kind, each.name)))),
+    ...enclaves.map((enclave) => item("enclave", enclave.path, () => pick(() => act.enclave(enclave.path)))),
+    ...names.map((name) => item(KINDS[name.kind], name.name, () => pick(() => act.name(name.kind, name.name)))),
   ];
   if (more) items.push(el("li", { class: "soft", text: `and ${more} more: type on` }));
   if (text.trim() && !items.length) items.push(el("li", { class: "soft", text: "No name matches." }));
@@ -259,7 +259,7 @@ function search() {
   byId("search-status").textContent = text.trim() ? `${enclaves.length + names.length + more} found` : "";
 }
 
-function found(then) {
+function pick(then) {
   byId("results").hidden = true;
   then();
 }
@@ -309,27 +309,27 @@ function fillLists() {
   byId("findings").replaceChildren(sorted.length ? list : none);
   byId("tab-findings").textContent = sorted.length ? `Findings (${sorted.length})` : "Findings";
   const opens = (kind, name) => model.bundle(kind, name) && (() => act.name(kind, name));
-  byId("headlines").replaceChildren(...headlines(model, opens, act, () => showTab("names")));
+  byId("headlines").replaceChildren(...headlines(model, opens, act, showTab));
   byId("headlines").hidden = !byId("headlines").children.length;
-  const lacking = model.bundles.filter((each) => each.lacks && !each.ties.every((tie) => tie.common));
+  const lacking = model.bundles.filter((bundle) => bundle.lacks && !bundle.ties.every((tie) => tie.common));
   byId("names").replaceChildren(
     ...namesTable(
       model.rows,
-      lacking.reduce((sum, each) => sum + each.names.length, 0),
+      lacking.reduce((sum, bundle) => sum + bundle.names.length, 0),
       opens,
     ),
   );
   byId("timeline").replaceChildren(...timeline(model.validities, act.enclave));
   byId("tab-differences").hidden = !model.overlay;
   if (!model.overlay) return;
-  const differences = model.differences.map((each) =>
+  const differences = model.differences.map((difference) =>
     el(
       "li",
       {},
-      el("span", { class: `chip ${each.mark}`, text: markText(model.overlay, each.mark) }),
+      el("span", { class: `chip ${difference.mark}`, text: markText(model.overlay, difference.mark) }),
       " ",
-      el("code", { text: each.text }),
-      each.notes.length ? el("span", { class: "soft", text: ` (${each.notes.join("; ")})` }) : null,
+      el("code", { text: difference.text }),
+      difference.notes.length ? el("span", { class: "soft", text: ` (${difference.notes.join("; ")})` }) : null,
     ),
   );
   const equal = el("p", { class: "soft", text: "There is no difference." });

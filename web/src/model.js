@@ -24,9 +24,9 @@ export class Model {
       scene.cards = rowsOf(scene.cards);
       scene.links = rowsOf(scene.links);
     }
-    this.enclave = new Map(data.enclaves.map((each) => [each.path, each]));
+    this.enclave = new Map(data.enclaves.map((enclave) => [enclave.path, enclave]));
     this.bundleOf = new Map();
-    this.tiesOf = new Map(data.enclaves.map((each) => [each.path, []]));
+    this.tiesOf = new Map(data.enclaves.map((enclave) => [enclave.path, []]));
     for (const bundle of data.bundles) {
       for (const name of bundle.names) this.bundleOf.set(`${bundle.kind} ${name}`, bundle);
       for (const tie of bundle.ties) this.tiesOf.get(tie.enclave).push({ tie, bundle });
@@ -51,29 +51,29 @@ export class Model {
   search(text, most) {
     const wanted = text.trim().toLowerCase();
     if (!wanted) return { enclaves: [], names: [], more: 0 };
-    const found = (list, nameOf) =>
+    const nearest = (list, nameOf) =>
       list
-        .map((each) => [nearness(nameOf(each).toLowerCase(), wanted) + (each.common ? 9 : 0), each])
+        .map((item) => [nearness(nameOf(item).toLowerCase(), wanted) + (item.common ? 9 : 0), item])
         .filter(([rank]) => rank < 99)
         .sort((a, b) => a[0] - b[0])
-        .map(([, each]) => each);
-    const enclaves = found(this.enclaves, (each) => each.path);
-    const names = found(this.names, (each) => each.name);
+        .map(([, item]) => item);
+    const enclaves = nearest(this.enclaves, (item) => item.path);
+    const names = nearest(this.names, (item) => item.name);
     const more = Math.max(0, enclaves.length - most) + Math.max(0, names.length - most);
     return { enclaves: enclaves.slice(0, most), names: names.slice(0, most), more };
   }
 
   validitiesOf(path) {
-    return this.validities.filter((each) => each.enclave === path);
+    return this.validities.filter((validity) => validity.enclave === path);
   }
 
   findingsOf(path) {
-    return this.findings.filter((each) => each.enclave === path);
+    return this.findings.filter((finding) => finding.enclave === path);
   }
 
   // The bundles that fit the filters, with the ties of them that do.
   filtered({ enclave, namespace, direction, protection, mark, common }) {
-    const found = [];
+    const fitting = [];
     for (const bundle of this.bundles) {
       if (protection && bundle.protection.level !== protection) continue;
       let names = bundle.names;
@@ -89,9 +89,9 @@ export class Model {
         if (!enclave) ties = fits;
         else ties = ties.filter((tie) => tie.enclave !== enclave || fits.includes(tie));
       } else if (!own.length) continue;
-      if (ties.length) found.push({ ...bundle, names, ties });
+      if (ties.length) fitting.push({ ...bundle, names, ties });
     }
-    return found;
+    return fitting;
   }
 
   // Who writes (or reads) a bundle in the sense of information that flows: whom permissions allow
@@ -164,7 +164,7 @@ export class Model {
         const others = far.of.get(bundle).get(part) ?? [];
         for (const tie of near.of.get(bundle).get(part) ?? []) {
           // What only the enclave itself sends, or receives, is no flow to it.
-          if (hop === 1 && others.length && others.every((each) => each.enclave === tie.enclave)) continue;
+          if (hop === 1 && others.length && others.every((other) => other.enclave === tie.enclave)) continue;
           if (!hops.has(tie.enclave)) {
             hops.set(tie.enclave, hop);
             reached.add(tie.enclave);
@@ -225,20 +225,20 @@ function nearness(name, wanted) {
 
 function prefixes(name) {
   const parts = name.split("/").slice(0, -1);
-  const found = ["/"];
+  const namespaces = ["/"];
   for (let length = 2; length <= parts.length; length += 1) {
-    found.push(parts.slice(0, length).join("/"));
+    namespaces.push(parts.slice(0, length).join("/"));
   }
-  return found;
+  return namespaces;
 }
 
 // Ties with their bundles by what they allow or deny, such as "publish" and "DENY subscribe".
 export function byRight(ties) {
   const groups = new Map();
-  for (const each of ties) {
-    const key = `${each.tie.deny ? "DENY " : ""}${each.tie.right}`;
+  for (const entry of ties) {
+    const key = `${entry.tie.deny ? "DENY " : ""}${entry.tie.right}`;
     if (!groups.has(key)) groups.set(key, []);
-    groups.get(key).push(each);
+    groups.get(key).push(entry);
   }
   return groups;
 }

@@ -9,41 +9,41 @@ const DAY = 86400000;
 const WIDTH = 520;
 const MOST_ROWS = 80;
 
-export const daysLeft = (each) => Math.floor((Date.parse(each.not_after) - Date.now()) / DAY);
+export const daysLeft = (validity) => Math.floor((Date.parse(validity.not_after) - Date.now()) / DAY);
 export const dateText = (moment) => moment.slice(0, 10);
 
-export function leftText(each) {
-  const days = daysLeft(each);
-  if (Date.parse(each.not_before) > Date.now()) return "not valid yet";
+export function leftText(validity) {
+  const days = daysLeft(validity);
+  if (Date.parse(validity.not_before) > Date.now()) return "not valid yet";
   if (days < 0) return `expired ${counted(-days, "day")} ago`;
   return days === 0 ? "expires today" : `${counted(days, "day")} left`;
 }
 
-function state(each) {
-  const days = daysLeft(each);
-  if (days < 0 || Date.parse(each.not_before) > Date.now()) return "error";
+function state(validity) {
+  const days = daysLeft(validity);
+  if (days < 0 || Date.parse(validity.not_before) > Date.now()) return "error";
   return days < 30 ? "warning" : "good";
 }
 
 // What is valid for the very same time is one row: with a hundred enclaves there are a hundred.
 function rows(validities) {
-  const found = new Map();
-  for (const each of validities) {
-    const alone = validities.length <= MOST_ROWS || !each.enclave;
-    const key = [each.kind, each.not_before, each.not_after, alone ? each.title : ""].join(" ");
-    if (!found.has(key)) found.set(key, { ...each, members: [] });
-    found.get(key).members.push(each.title);
+  const groups = new Map();
+  for (const validity of validities) {
+    const alone = validities.length <= MOST_ROWS || !validity.enclave;
+    const key = [validity.kind, validity.not_before, validity.not_after, alone ? validity.title : ""].join(" ");
+    if (!groups.has(key)) groups.set(key, { ...validity, members: [] });
+    groups.get(key).members.push(validity.title);
   }
-  return [...found.values()];
+  return [...groups.values()];
 }
 
 export function timeline(validities, onEnclave) {
   if (!validities.length) {
     return [el("p", { class: "soft", text: "No expiry is known: the picture shows policies, not a keystore." })];
   }
-  const times = validities.flatMap((each) => [Date.parse(each.not_before), Date.parse(each.not_after)]);
+  const times = validities.flatMap((validity) => [Date.parse(validity.not_before), Date.parse(validity.not_after)]);
   // CAs expire years later than the rest; the scale must still separate what expires first.
-  const leaves = validities.filter((each) => each.enclave).map((each) => Date.parse(each.not_after));
+  const leaves = validities.filter((validity) => validity.enclave).map((validity) => Date.parse(validity.not_after));
   const last = Math.max(Date.now(), ...(leaves.length ? leaves : times));
   const first = Math.min(Date.now(), ...times);
   const scale = scaleUtc([first, last + (last - first) * 0.08], [6, WIDTH - 6]).clamp(true);
@@ -51,35 +51,35 @@ export function timeline(validities, onEnclave) {
   select(axis).append("g").attr("transform", "translate(0 21)").call(axisTop(scale).ticks(6).tickSizeOuter(0));
   const head = ["What", "Expires", "Left"].map((text) => el("th", { scope: "col", text }));
   head.push(el("th", { scope: "col", class: "bars" }, el("span", { class: "hidden", text: "Time" }), axis));
-  const body = rows(validities).map((each) => row(each, scale, onEnclave));
+  const body = rows(validities).map((validity) => row(validity, scale, onEnclave));
   return [
     el("p", { class: "soft" }, "The first to expire comes first. ", el("span", { class: "bars" }, "The line is today; a bar with an arrow continues beyond the chart.")),
     el("table", { class: "timeline" }, el("thead", {}, el("tr", {}, head)), el("tbody", {}, body)),
   ];
 }
 
-function row(each, scale, onEnclave) {
-  const [from, to, today] = [each.not_before, each.not_after, Date.now()].map((moment) => scale(new Date(moment)));
-  const beyond = Date.parse(each.not_after) > scale.domain()[1];
+function row(validity, scale, onEnclave) {
+  const [from, to, today] = [validity.not_before, validity.not_after, Date.now()].map((moment) => scale(new Date(moment)));
+  const beyond = Date.parse(validity.not_after) > scale.domain()[1];
   const bar = svg(
     "svg",
     { viewBox: `0 0 ${WIDTH} 20`, preserveAspectRatio: "none", class: "bar", "aria-hidden": "true" },
-    svg("rect", { class: `span ${state(each)}`, x: from, y: 6, width: Math.max(2, to - from), height: 8, rx: 2 }),
-    beyond ? svg("path", { class: `span ${state(each)}`, d: `M${to - 2} 2l8 8l-8 8z` }) : null,
+    svg("rect", { class: `span ${state(validity)}`, x: from, y: 6, width: Math.max(2, to - from), height: 8, rx: 2 }),
+    beyond ? svg("path", { class: `span ${state(validity)}`, d: `M${to - 2} 2l8 8l-8 8z` }) : null,
     svg("line", { class: "today", x1: today, x2: today, y1: 0, y2: 20 }),
   );
-  const many = each.members.length > 1;
+  const many = validity.members.length > 1;
   const label = many
-    ? el("details", {}, el("summary", { text: `${each.kind} of ${each.members.length} enclaves` }), each.members.join(", "))
-    : each.enclave
-      ? [`${each.kind} `, el("button", { type: "button", class: "link-button", text: each.title, onclick: () => onEnclave(each.enclave) })]
-      : each.title;
+    ? el("details", {}, el("summary", { text: `${validity.kind} of ${validity.members.length} enclaves` }), validity.members.join(", "))
+    : validity.enclave
+      ? [`${validity.kind} `, el("button", { type: "button", class: "link-button", text: validity.title, onclick: () => onEnclave(validity.enclave) })]
+      : validity.title;
   return el(
     "tr",
     {},
     el("th", { scope: "row" }, label),
-    el("td", {}, el("time", { datetime: each.not_after, text: dateText(each.not_after) })),
-    el("td", {}, el("span", { class: `chip ${state(each)}`, text: leftText(each) })),
+    el("td", {}, el("time", { datetime: validity.not_after, text: dateText(validity.not_after) })),
+    el("td", {}, el("span", { class: `chip ${state(validity)}`, text: leftText(validity) })),
     el("td", { class: "bars" }, bar),
   );
 }
