@@ -21,7 +21,7 @@ def first_few(
     return separator.join(texts[:maximum]) + (f"{joint}{left_out} more" if left_out > 0 else "")
 
 
-def enumerated(texts: Sequence[str], joint: str = " and ") -> str:
+def enumerated(texts: Sequence[str]) -> str:
     """Return all texts as in a sentence: "a, b and c"."""
     *first, last = texts
-    return f"{', '.join(first)}{joint}{last}" if first else last
+    return f"{', '.join(first)} and {last}" if first else last

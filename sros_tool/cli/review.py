@@ -72,13 +72,13 @@ class _Lines(_PathsType):
         return tuple(checked_path(line) for line in lines if line)
 
 
-def _paths_option(name: str, metavar: str, help_text: str) -> Callable[[Decorated], Decorated]:
+def _paths_option(name: str, help_text: str) -> Callable[[Decorated], Decorated]:
     return click.option(
         f"--{name}",
         name.replace("-", "_"),
         type=_Lines(),
         multiple=True,
-        metavar=metavar,
+        metavar="PATH",
         help=f"{help_text}  Can be repeated, or have several lines.",
     )
 
@@ -99,18 +99,17 @@ def _paths_option(name: str, metavar: str, help_text: str) -> Callable[[Decorate
     metavar="COMMIT",
     help="The commit to review: HEAD, a full id or a full reference.",
 )
-@_paths_option("policy", "PATH", "A policy, or a folder of policies, of the robot or fleet.")
-@_paths_option("requirements", "PATH", "A file of requirements on the policies and keystores.")
+@_paths_option("policy", "A policy, or a folder of policies, of the robot or fleet.")
+@_paths_option("requirements", "A file of requirements on the policies and keystores.")
 @click.option(
     "--fleet",
     default="",
     metavar="PATH",
     help="Fleet file whose robots replace the placeholders of the policies.",
 )
-@_paths_option("keystore", "PATH", "A keystore, or its public part.")
+@_paths_option("keystore", "A keystore, or its public part.")
 @_paths_option(
     "leave-out",
-    "PATH",
     "A file, or a folder, of policies that are not for the robot, such as tests.",
 )
 @click.option(

@@ -425,7 +425,7 @@ def _service_cast(rights: Mapping[str, Grant]) -> dict[str, str]:
     cast: dict[str, str] = {}
     best = -1
     for server, client in permutations(rights, 2):
-        for topic in _application_topics(rights[server], "publish"):
+        for topic in _application_topics(rights[server]):
             service, begin = service_of(topic)
             if begin != "rr" or ACTION_SEPARATOR in service or "parameter" in topic:
                 continue
@@ -442,7 +442,7 @@ def _service_cast(rights: Mapping[str, Grant]) -> dict[str, str]:
 
 def _service(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
     """Return the service that the server of a cast offers and the client calls."""
-    for topic in _application_topics(rights[cast["server"]], "publish"):
+    for topic in _application_topics(rights[cast["server"]]):
         name, begin = service_of(topic)
         requests = dds_names("request", name).publish[0]
         if begin == "rr" and allows(rights[cast["client"]], "publish", requests):
@@ -497,9 +497,7 @@ def _width(grant: Grant, right: str, name: str) -> tuple[bool, bool, int]:
 
 def _first_topic(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
     own_topics = [
-        topic
-        for topic in _application_topics(rights[cast["talker"]], "publish")
-        if topic[:3] == "rt/"
+        topic for topic in _application_topics(rights[cast["talker"]]) if topic[:3] == "rt/"
     ]
     return next((t for t in own_topics if allows(rights[cast["listener"]], "subscribe", t)), "")
 
@@ -510,7 +508,7 @@ def _is_below(short: str, long: str) -> bool:
 
 
 def _topics(rights: Mapping[str, Grant]) -> set[str]:
-    return {topic for grant in rights.values() for topic in _application_topics(grant, "publish")}
+    return {topic for grant in rights.values() for topic in _application_topics(grant)}
 
 
 def _copy_filter(root: Path, folders: set[str]) -> Callable[[str, list[str]], set[str]]:
@@ -596,21 +594,21 @@ def _is_wild(expression: str) -> bool:
     return bool(set(expression) & _WILD)
 
 
-def _application_topics(grant: Grant, verb: str) -> Iterator[str]:
-    """Yield the application's DDS topics that a grant allows by exact name.
+def _application_topics(grant: Grant) -> Iterator[str]:
+    """Yield the DDS topics of the application that a grant allows to publish by exact name.
 
     Topics of every node, hidden topics and topics of actions are left out.
     """
-    for topic in _named_topics(grant, verb):
+    for topic in _topics_to_publish(grant):
         private = topic.startswith("rt/_") or ACTION_SEPARATOR in topic
         if topic not in _TOPICS_OF_EVERY_NODE and not private:
             yield topic
 
 
-def _named_topics(grant: Grant, verb: str) -> Iterator[str]:
-    """Yield the DDS topics that a grant allows by exact name."""
+def _topics_to_publish(grant: Grant) -> Iterator[str]:
+    """Yield the DDS topics that a grant allows to publish by exact name."""
     for rule in grant.rules:
-        for topic in _expressions(rule, verb) if rule.allow else ():
+        for topic in _expressions(rule, "publish") if rule.allow else ():
             if not _is_wild(topic):
                 yield topic
 
@@ -638,7 +636,7 @@ def is_node_allowed(grant: Grant, node: str) -> bool:
 def nodes_named(grant: Grant) -> Iterator[str]:
     """Yield the absolute names of the nodes whose standard services a grant allows by name."""
     kind, service = _NODE_MARK
-    for topic in _named_topics(grant, "publish"):
+    for topic in _topics_to_publish(grant):
         if topic.startswith(kind) and topic.endswith(service):
             node = topic.removeprefix(kind).removesuffix(service)
             if is_node_allowed(grant, node):

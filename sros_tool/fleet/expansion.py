@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from sros_tool.errors import DocumentError, InvalidNameError, PolicyError, SrosError
 from sros_tool.fleet.robots import MAX_ENCLAVES, Fleet, Robot, group_of, path_for
 from sros_tool.names import check_enclave_name, check_namespace, expression_problem, is_expression
-from sros_tool.policy.document import PolicyFiles, read_policy
+from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, Enclave, Group, Policy, Profile, Source, with_profiles
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.placeholders import Parts, fill, has_placeholder, parts_of, placeholders_of
@@ -197,21 +197,15 @@ class FleetPolicy(Mapping[str, Enclave]):
             yield name
 
 
-def read_policy_for(
-    path: Path, fleet: Fleet | None, policy_files: PolicyFiles | None = None
-) -> Policy:
+def read_policy_for(path: Path, fleet: Fleet | None) -> Policy:
     """Return the policy in a file; with a fleet, its placeholders are filled in.
-
-    ``policy_files`` returns the content of files that are not in the file system.
 
     Raises:
         PolicyError: (or another `DocumentError`) as `read_policy` and `FleetPolicy` raise it.
     """
     if fleet is None:
-        return read_policy(path, policy_files=policy_files)
-    return FleetPolicy(
-        read_policy(path, placeholders=True, policy_files=policy_files), fleet
-    ).policy()
+        return read_policy(path)
+    return FleetPolicy(read_policy(path, placeholders=True), fleet).policy()
 
 
 def fleet_with_enclaves(fleet: Fleet, files: Iterable[Path]) -> Fleet:

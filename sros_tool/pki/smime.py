@@ -26,7 +26,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, padding, rsa
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from sros_tool.errors import PkiError
+from sros_tool.errors import PkiError, SrosError
 from sros_tool.pki import der, tolerant
 from sros_tool.pki.certificates import digest as fingerprint
 from sros_tool.pki.certificates import is_for_pss, load_der_certificate
@@ -291,6 +291,17 @@ class SignedDocument(NamedTuple):
                 )
             if isinstance(signature.digest, hashes.MD5):  # noqa: S303 - it is refused
                 raise PkiError("it is signed with MD5", "Such a signature can be forged.")
+
+    def problem_for(self, authorities: Iterable[x509.Certificate]) -> str:
+        """Return why no permissions CA in ``authorities`` signed this document; "" if one did."""
+        problem = "no permissions CA is trusted"
+        for authority in authorities:
+            try:
+                self.verify(authority)
+                return ""
+            except SrosError as error:
+                problem = str(error)
+        return problem
 
     def weakness(self) -> str:
         """Return the weak hash of a signature as a clause, or ""."""

@@ -494,15 +494,15 @@ def _mapped_dds(maps: bytes) -> tuple[MappedLibrary, ...]:
     )
 
 
-def installed_dds(top: Path = Path("/")) -> tuple[MappedLibrary, ...]:
-    """Return the DDS libraries in the folders of ROS and of packages below ``top``.
+def installed_dds() -> tuple[MappedLibrary, ...]:
+    """Return the DDS libraries in the folders of ROS and of packages.
 
     Environment variables are not used: in a login by ssh they do not name the folder of ROS.
     """
     libraries = (
         (folder / name, _PRODUCTS[match[1].encode()])
         for pattern in _LIBRARY_FOLDERS
-        for folder in top.glob(pattern)
+        for folder in Path("/").glob(pattern)
         for name in _names_in(folder)
         if (match := _LIBRARY_FILE.match(name))
     )

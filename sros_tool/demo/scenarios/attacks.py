@@ -119,16 +119,14 @@ def _tampered_files_row(
     )
 
 
-def _successful_injection_row(
-    name: str, attacker: Identity, defence_removed: str, victims: KeystoreChoice | None = None
-) -> Row:
+def _successful_injection_row(name: str, attacker: Identity, defence_removed: str) -> Row:
     """Return a row in which the listener hears the attacker, because a defence is removed.
 
     The files of the attacker are valid.
     """
     mechanism = "an attacker with valid files is heard"
     return _injection_row(
-        name, attacker, RowStatus.HEARD, mechanism, defence_removed=defence_removed, victims=victims
+        name, attacker, RowStatus.HEARD, mechanism, defence_removed=defence_removed
     )
 
 

@@ -66,8 +66,8 @@ def _edit_all(copy: KeystoreCopy, change: _Change, *, router: bool = True) -> No
             _edit(path, change)
 
 
-def _edit_part(copy: KeystoreCopy, part: str, change: _Change) -> None:
-    _edit(copy.folder(part) / SESSION_FILE, change)
+def _edit_talker(copy: KeystoreCopy, change: _Change) -> None:
+    _edit(copy.folder("talker") / SESSION_FILE, change)
 
 
 def _without_rules(document: _Document) -> None:
@@ -339,7 +339,7 @@ def without_certificate(copy: KeystoreCopy) -> None:
         gossip = document["scouting"]["gossip"]
         gossip["autoconnect_strategy"]["peer"]["to_peer"] = "always"
 
-    _edit_part(copy, "talker", change)
+    _edit_talker(copy, change)
 
 
 def certificates_not_asked_for(copy: KeystoreCopy) -> None:
@@ -355,7 +355,7 @@ def certificates_not_asked_for(copy: KeystoreCopy) -> None:
 
 def plain_tcp(copy: KeystoreCopy) -> None:
     """Let the talker speak TCP to the port of the router."""
-    _edit_part(copy, "talker", _set_plain_endpoint(f"tcp/{copy.endpoint}"))
+    _edit_talker(copy, _set_plain_endpoint(f"tcp/{copy.endpoint}"))
 
 
 def _set_plain_endpoint(endpoint: str) -> _Change:
@@ -380,7 +380,7 @@ def tcp_next_to_tls(copy: KeystoreCopy) -> None:
 
     through_the_router(copy)
     _edit(enclave_path(copy.root, copy.router) / ROUTER_FILE, change)
-    _edit_part(copy, "talker", _set_plain_endpoint(endpoint))
+    _edit_talker(copy, _set_plain_endpoint(endpoint))
 
 
 def links_in_the_clear(copy: KeystoreCopy) -> None:

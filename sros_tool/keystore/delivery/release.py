@@ -152,14 +152,7 @@ def seal_problem(release: Release, authorities: Iterable[x509.Certificate]) -> s
         return str(error)
     if signed.text != _text(release.robot, release.number, release.files):
         return "robot, number or files differ from the signed list"
-    problem = "no permissions CA is trusted"
-    for authority in authorities:
-        try:
-            signed.verify(authority)
-            return ""
-        except SrosError as error:
-            problem = str(error)
-    return problem
+    return signed.problem_for(authorities)
 
 
 def _text(robot: str, number: int, files: Mapping[str, bytes]) -> bytes:

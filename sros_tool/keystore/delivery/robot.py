@@ -411,14 +411,7 @@ def _broken_seal(answer: RequestAnswer, authorities: Iterable[x509.Certificate])
     head = _SEALED.match(document := signed.text)
     if not head or document[head.end() :] != listed_digests(answer.files):
         return "the files differ from the signed list"
-    problem = ""
-    for authority in authorities:
-        try:
-            signed.verify(authority)
-            return ""
-        except SrosError as error:
-            problem = str(error)
-    return problem
+    return signed.problem_for(authorities)
 
 
 def import_answer(
