@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
@@ -27,6 +26,7 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
 from sros_tool.policy.patterns import overlap
 from sros_tool.runtime.rmw import chosen_vendor
+from sros_tool.values import parse_json
 from sros_tool.xml import read_bytes
 
 
@@ -41,7 +41,7 @@ class ObservedNodes:
         """The nodes with the enclaves and names that they had."""
         path = self.robot.observation_file
         try:
-            return observation_from_json(json.loads(read_bytes(path, "observation"))).nodes
+            return observation_from_json(parse_json(read_bytes(path, "observation"))).nodes
         except (ValueError, TypeError, KeyError) as error:
             raise DocumentError(
                 f"'{path}' is not an observation",

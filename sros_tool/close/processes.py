@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import os
 import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,7 +22,8 @@ from sros_tool.runtime.processes import (
 )
 from sros_tool.runtime.rmw import RMW
 from sros_tool.runtime.variables import DOMAIN, ENCLAVE
-from sros_tool.values import Words
+from sros_tool.terminal import visible
+from sros_tool.values import Words, parse_json
 from sros_tool.xml import read_bytes
 
 ROUTER = "/router"
@@ -110,7 +111,7 @@ class ClosedProcess(NamedTuple):
             return "docker compose up -d"
         variables = [f"{DOMAIN}={domain}"] * bool(domain) + [f"{RMW}={self.rmw}"] * bool(self.rmw)
         words = (*(("env", *variables) if variables else ()), *(self.launch or self.command))
-        return f"cd {shlex.quote(self.folder)} && {shlex.join(words)}"
+        return f"cd {_shell_word(self.folder)} && {' '.join(map(_shell_word, words))}"
 
     def secured_command(self, folder: Path, launch_enclave: str = "") -> str:
         """Return the shell command that starts the process, its launch or containers with security.
@@ -132,7 +133,15 @@ class ClosedProcess(NamedTuple):
             words = (*run_words(folder / "export", enclave, self.rmw), *words)
         elif self.rmw:
             words = ("env", f"{RMW}={self.rmw}", *words)
-        return f"cd {shlex.quote(self.folder)} && {shlex.join(words)}"
+        return f"cd {_shell_word(self.folder)} && {' '.join(map(_shell_word, words))}"
+
+
+def _shell_word(word: str) -> str:
+    """Quote a word for a shell; what could control a terminal, or is not UTF-8, by `printf`."""
+    if visible(word) == word:
+        return shlex.quote(word)
+    octal = re.sub(rb"[^A-Za-z0-9_./ ]", lambda byte: b"\\%03o" % ord(byte[0]), os.fsencode(word))
+    return f"\"$(printf '{octal.decode()}')\""
 
 
 def command_without_enclave(command: Sequence[str], enclave: str) -> Sequence[str]:
@@ -269,21 +278,28 @@ def read_processes(path: Path) -> ObservedProcesses:
         DocumentError: The file cannot be read.
     """
     try:
-        value = json.loads(read_bytes(path, "list of processes"))
+        value = parse_json(read_bytes(path, "list of processes"))
         processes = [ClosedProcess(**process) for process in value["processes"]]
-        if not all(isinstance(name, str) for name in value.get("not_here", ())):
-            raise ValueError(f"{value['not_here']} are not all text")
+        observed = ObservedProcesses(**value)._replace(processes=processes)
+        names = (*observed.unknown, *observed.elsewhere, *observed.ended, *observed.not_here)
+        _check_types(names, (observed.domain,))
         for process in processes:
             words = (process.enclave, process.folder, process.container, process.rmw)
             texts = (*words, *process.command, *process.launch, *process.shares)
-            if not all(isinstance(text, str) for text in texts):
-                raise ValueError(f"{texts} are not all text")
+            _check_types((*texts, process.known_by), (process.pid, process.user))
             if process.unit and not re.fullmatch(SERVICE_NAME, process.unit, re.A):
                 raise ValueError(f"{process.unit!r} is not a service")
-        return ObservedProcesses(**value)._replace(processes=processes)
+        return observed
     except (ValueError, TypeError, KeyError) as error:
         raise DocumentError(
             f"'{path}' is not a list of processes",
             f"{error}",
             "Remove it, to watch the robot again.",
         ) from error
+
+
+def _check_types(texts: Sequence[object], numbers: Sequence[object]) -> None:
+    if not all(isinstance(text, str) for text in texts):
+        raise ValueError(f"{texts} are not all text")
+    if not all(isinstance(number, int) for number in numbers):
+        raise ValueError(f"{numbers} are not all numbers")

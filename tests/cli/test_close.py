@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
@@ -55,6 +56,7 @@ from sros_tool.runtime.processes import (
     process_origin,
     with_files,
 )
+from sros_tool.terminal import visible
 from sros_tool.values import as_plain
 from tests.cli.test_json import Seen
 from tests.graph.fake_graph import Beside, graph
@@ -1042,7 +1044,10 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
     file = robot.folder / "robot/processes.json"
     text = file.read_text()
     other_unit = text.replace('"unit": ""', '"unit": "../x.service"')
-    for wrong in (other_unit, text.replace('"enclave": "/talker"', '"enclave": 5'), "{}"):
+    other_user = re.sub(r'"user": \d+', '"user": "a"', text, count=1)
+    other_name = text.replace('"ended": []', '"ended": [{}]')
+    number = text.replace('"enclave": "/talker"', '"enclave": 5')
+    for wrong in (other_unit, other_user, other_name, number, "{}", "[" * 100_000):
         file.write_text(wrong)
         assert "is not a list of processes" in robot.close(status=2).err
 
@@ -1158,6 +1163,18 @@ def test_the_enclave_of_a_process(
     observed = assign(nodes, processes, 0)
     assert {each.enclave: each.known_by for each in observed.processes} == known
     assert set(observed.elsewhere) == {each.enclaves[0] for each in nodes} - known.keys()
+
+
+def test_a_command_is_written_so_that_it_controls_no_terminal() -> None:
+    """Any user may start a process with such arguments, also with bytes that are not UTF-8."""
+    words = ("/opt/talk", "\x1b[2J'%\\", "\udc9b1", "a b\n")
+    talker = ClosedProcess("/talker", 7, words, "/opt", 0, "", "program")
+    for command in (talker.secured_command(Path()), talker.open_command(0)):
+        assert visible(command) == command
+        arguments = command.removeprefix("cd /opt && sros run export /talker -- ")
+        printed = f"printf '%s|' {arguments.removeprefix('cd /opt && ')}"
+        done = subprocess.run(["sh", "-c", printed], capture_output=True, check=True)
+        assert done.stdout == b"|".join(map(os.fsencode, words)) + b"|"
 
 
 def test_a_process_to_stop_is_named_by_the_id_that_it_has_now() -> None:
