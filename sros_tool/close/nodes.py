@@ -33,15 +33,18 @@ from sros_tool.xml import read_bytes
 class ObservedNodes:
     """The nodes of the open robot, in the enclaves and with the names that the policy has now."""
 
-    def __init__(self, robot: LocalRobot) -> None:
-        self.robot = robot
+    def __init__(self, robot: LocalRobot, nodes: Sequence[ObservedNode] | None = None) -> None:
+        self.robot, self._nodes = robot, nodes
 
     @cached_property
     def as_observed(self) -> Sequence[ObservedNode]:
-        """The nodes with the enclaves and names that they had."""
+        """The nodes with the enclaves and names that they had, as they were given or written."""
         path = self.robot.observation_file
         try:
-            return observation_from_json(parse_json(read_bytes(path, "observation"))).nodes
+            return (
+                self._nodes
+                or observation_from_json(parse_json(read_bytes(path, "observation"))).nodes
+            )
         except (ValueError, TypeError, KeyError) as error:
             raise DocumentError(
                 f"'{path}' is not an observation",

@@ -26,7 +26,7 @@ from sros_tool.explain.explanation import likely_meaning
 from sros_tool.files import policies_dir, remove_file, replace_file
 from sros_tool.folders import make_folders, remove_folders
 from sros_tool.graph.learn import common_parts, is_tool
-from sros_tool.graph.observation import ObservedNode, make_observation
+from sros_tool.graph.observation import ObservedNode, make_observation, observation_from_json
 from sros_tool.names import expand, is_expression
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.merge import plan_merge
@@ -71,7 +71,6 @@ def watch(robot: LocalRobot, step: CommandStep) -> str:
             f"{others}." if others else "",
             f"{'Otherwise start' if others else 'Start'} the robot open, and run this again.",
         )
-    replace_file(robot.observation_file, output.encode())
     return _remember(robot, output, started)
 
 
@@ -132,9 +131,9 @@ def _remember(robot: LocalRobot, document: str, started: _StartedProcesses) -> s
     Return, as a sentence, which of the observed rights an earlier policy lacks.
     """
     replace_file(robot.observer, (policies_dir() / "observer.xml").read_bytes())
-    nodes = [node for node in ObservedNodes(robot).in_their_enclaves() if not is_tool(node)]
-    running = RunningRobot(robot)
-    learned = json.loads(document)
+    running, learned = RunningRobot(robot), json.loads(document)
+    observed_nodes = ObservedNodes(robot, observation_from_json(learned).nodes)
+    nodes = [node for node in observed_nodes.in_their_enclaves() if not is_tool(node)]
     observed = _observed_processes(robot, nodes, learned["ended"], running, started)
     enclaves_here = {process.enclave for process in observed.processes}
     not_here = (robot.not_here - enclaves_here).union(robot.named_elsewhere)
@@ -143,6 +142,7 @@ def _remember(robot: LocalRobot, document: str, started: _StartedProcesses) -> s
     absent = robot.policy_enclaves() - enclaves_here - not_here
     kept = [process for process in robot.processes.processes if process.enclave in absent]
     remembered = observed._replace(processes=[*observed.processes, *kept])
+    replace_file(robot.observation_file, document.encode())
     robot.remember(remembered.belonging_elsewhere(not_here))
     _say_variables(robot, observed, running)
     number = counted(len(observed.processes), "process", "processes")

@@ -714,6 +714,24 @@ def test_what_is_interrupted_at_any_step_goes_on(
     robot.close("--apply")
 
 
+def test_a_watch_that_is_interrupted_keeps_nodes_and_processes_of_one_time(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Or the next run takes the processes of the watch before for those of the new nodes."""
+
+    def interrupted(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    robot.close()
+    files = [robot.folder / "robot" / name for name in ("observed.json", "processes.json")]
+    before = [file.read_bytes() for file in files]
+    robot.nodes = (TALKER, LISTENER, ros_node("third", TALKER[3], "publish rt/third"))
+    with monkeypatch.context() as patched:
+        patched.setattr(watch, "assign", interrupted)
+        robot.close("--for", "1s", status=130)
+    assert [file.read_bytes() for file in files] == before
+
+
 @pytest.mark.parametrize("function", some(["write_units", "restart_units"], 1))
 def test_applying_that_is_interrupted_goes_on_or_back(
     robot: Robot, monkeypatch: pytest.MonkeyPatch, function: str
