@@ -7,7 +7,7 @@ import os
 import shlex
 import sys
 from collections.abc import Sequence
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import nullcontext, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -161,9 +161,10 @@ def close(
     elif prove:
         closed = prove_closed(robot)
     else:
-        closed = prepare(robot, duration, partial=partial, dry_run=dry_run)
-        if apply and not closed.problems:
-            closed = apply_security(robot, closed, dry_run=dry_run)
+        with nullcontext() if dry_run else robot.locked():
+            closed = prepare(robot, duration, partial=partial, dry_run=dry_run)
+            if apply and not closed.problems:
+                closed = apply_security(robot, closed, dry_run=dry_run)
     holds = closed.is_proved(partial=partial)
     if as_json:
         print_json(closed)

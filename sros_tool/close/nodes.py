@@ -39,12 +39,11 @@ class ObservedNodes:
     @cached_property
     def as_observed(self) -> Sequence[ObservedNode]:
         """The nodes with the enclaves and names that they had, as they were given or written."""
+        if self._nodes is not None:
+            return self._nodes
         path = self.robot.observation_file
         try:
-            return (
-                self._nodes
-                or observation_from_json(parse_json(read_bytes(path, "observation"))).nodes
-            )
+            return observation_from_json(parse_json(read_bytes(path, "observation"))).nodes
         except (ValueError, TypeError, KeyError) as error:
             raise DocumentError(
                 f"'{path}' is not an observation",

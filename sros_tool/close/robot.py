@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shlex
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import datetime, tzinfo
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,8 +15,9 @@ from typing import Any, NamedTuple
 from sros_tool.checks.environment import secured_by
 from sros_tool.close.processes import ObservedProcesses, read_processes
 from sros_tool.enclave_environment import loadable_environment
-from sros_tool.errors import SrosError, UsageError
+from sros_tool.errors import SrosError, UnavailableError, UsageError
 from sros_tool.files import replace_file
+from sros_tool.folders import make_folders, remove_folders
 from sros_tool.keystore.layout import (
     CLOSED_OBSERVER,
     CLOSED_POLICY,
@@ -121,7 +124,8 @@ class LocalRobot:
         """
         sudo = self.shell.environment.get("SUDO_UID", "") if os.geteuid() == 0 else ""
         trusted = frozenset({0, os.geteuid(), *([int(sudo)] if sudo.isdecimal() else [])})
-        files = (self.policy, self.observation_file, self.processes_file)
+        policies = (self.policy, self.observer, self.requirements)
+        files = (*policies, self.observation_file, self.processes_file)
         for path in (self.folder, self.start, self.start / "units", *files):
             ways = [*replaceable_on_the_way(path, trusted)]
             if path.exists() and (why := other_writers(path.stat(), trusted)):
@@ -132,6 +136,33 @@ class LocalRobot:
                     f"'{step}': {why}.",
                     "Close the robot into a folder that only you and root can change.",
                 )
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Let only one run at a time write into the folder, which is made if it is missing.
+
+        A folder that is made and stays empty is removed again.
+
+        Raises:
+            UnavailableError: another run writes into it.
+        """
+        made = make_folders(self.folder)
+        handle = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UnavailableError(
+                    f"another `{self.close_command}` is at work",
+                    "It would lose what this one writes.",
+                    "Wait for it, or end it. --proof, --undo and --dry-run work meanwhile.",
+                ) from None
+            except OSError:  # a file system without locks
+                pass
+            yield
+        finally:
+            os.close(handle)
+            remove_folders(made)
 
     @property
     def processes(self) -> ObservedProcesses:

@@ -24,7 +24,6 @@ from sros_tool.close.steps import CommandStep
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.explain.explanation import likely_meaning
 from sros_tool.files import policies_dir, remove_file, replace_file
-from sros_tool.folders import make_folders, remove_folders
 from sros_tool.graph.learn import common_parts, is_tool
 from sros_tool.graph.observation import ObservedNode, make_observation, observation_from_json
 from sros_tool.names import expand, is_expression
@@ -58,13 +57,11 @@ def watch(robot: LocalRobot, step: CommandStep) -> str:
         SrosError: the robot cannot be watched.
     """
     _check_open(robot)
-    made = make_folders(robot.folder)
     robot.shell.say(f"+ {step.command}")
     started: _StartedProcesses = {}
     with _looking(robot, started):
         status, output, _ = robot.shell.run(step.words, True)
     if status:
-        remove_folders(made)
         others = RunningRobot(robot).in_other_domains()
         raise UnavailableError(
             f"there is no robot to close: no node was observed in domain {robot.domain}",

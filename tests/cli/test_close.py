@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import re
@@ -341,7 +342,7 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
 
 def refuse_undo_of_others(robot: Robot) -> None:
     """A folder that others can change, and a drop-in of another folder, undo nothing."""
-    for name in ("", "start/units", "processes.json"):
+    for name in ("", "start/units", "processes.json", "observer.xml"):
         path = robot.folder / "robot" / name
         mode = path.stat().st_mode
         path.chmod(0o777)
@@ -1087,6 +1088,21 @@ def test_a_secured_shell_proves_nothing(robot: Robot) -> None:
     ):
         ended = robot.close("--proof", status=2, **{variable: value})
         assert variable in ended.err and "does not see an open robot" in ended.err
+
+
+def test_one_run_at_a_time_writes_into_the_folder(robot: Robot) -> None:
+    """Or an hour of watching forgets the enclaves that were given to another machine meanwhile."""
+    robot.close()
+    folder = os.open(robot.folder / "robot", os.O_RDONLY)
+    fcntl.flock(folder, fcntl.LOCK_EX)
+    before = snapshot(robot.folder)
+    said = robot.close("--elsewhere", "/listener", status=2).err
+    assert "another `sros close robot` is at work" in said and snapshot(robot.folder) == before
+    robot.close("--dry-run")
+    robot.close("--proof", status=1)
+    robot.close("--undo")
+    os.close(folder)
+    robot.close()
 
 
 def test_a_dry_run_changes_nothing(robot: Robot) -> None:
