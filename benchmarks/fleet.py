@@ -27,6 +27,7 @@ from sros_tool.keystore.confirmation import (
     keep_confirmation,
     make_confirmation,
 )
+from sros_tool.keystore.reader import OpenedKeystore
 
 PER_ROBOT = 100
 _MADE = 1.5
@@ -101,6 +102,7 @@ def fleet(folder: Path, enclaves: int, rules: int) -> Iterator[Figure]:
 def _confirm(root: Path, robots: int) -> None:
     """Have all robots but the last one confirm that they have the current files."""
     now = datetime.now(UTC)
+    keystore = OpenedKeystore(root)
     whole = make_confirmation(root, "r1", now=now)
     files: dict[str, dict[str, str]] = {}
     for path, digest in whole.files.items():
@@ -110,7 +112,8 @@ def _confirm(root: Path, robots: int) -> None:
         certificates = {
             path: whole.certificates[path] for path in own if path in whole.certificates
         }
-        keep_confirmation(root, Received(Confirmation(f"r{number}", now, own, certificates), now))
+        confirmation = Confirmation(f"r{number}", now, own, certificates)
+        keep_confirmation(keystore, Received(confirmation, now))
 
 
 def _words(sizes: Sequence[tuple[str, int | str]]) -> list[str]:

@@ -190,16 +190,17 @@ def _confirm(arguments: tuple[str, ...], robot: str, dry_run: bool, as_json: boo
     from sros_tool.keystore.reader import OpenedKeystore
 
     root, file = root_and_file(arguments, "fleet confirm takes a keystore and one file")
-    recorded_fleet(OpenedKeystore(root)).robot(robot)
+    keystore = OpenedKeystore(root)
+    recorded_fleet(keystore).robot(robot)
     shown_file = "standard input" if str(file) == "-" else f"'{file}'"
     data = read_named(file, "confirmation", max_bytes=MAX_BYTES)
     received = receive(data, robot, shown_file, now=now())
     path = confirmation_file(robot)
     changes = file_change(root / path, existed=(root / path).exists())
     with nullcontext() if dry_run else locked_confirmations(root):
-        refuse_older(root, received)
+        refuse_older(keystore, received)
         if not dry_run:
-            keep_confirmation(root, received)
+            keep_confirmation(keystore, received)
     confirmation = received.confirmation
     enclaves = confirmation.enclaves()
     notes = [Note("fleet.clock", f"{robot}: {text}")] if (text := received.clock_note()) else []

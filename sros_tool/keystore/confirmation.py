@@ -41,6 +41,7 @@ from sros_tool.keystore.layout import (
     list_enclaves,
     search_enclaves,
 )
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.transaction import KeystoreLock
 from sros_tool.names import check_enclave_name
 from sros_tool.validity import elapsed, iso, parse_iso
@@ -234,8 +235,8 @@ def lacks_key(problem: str) -> bool:
 
 def is_of_copy(problem: str) -> bool:
     """Return whether a problem of an agent shows that its source may have an old copy."""
-    shown = (OLDER_THAN_SEEN, OLDER_THAN_INSTALLED, OF_OTHER_CA)
-    return any(text in problem for text in shown)
+    phrases = (OLDER_THAN_SEEN, OLDER_THAN_INSTALLED, OF_OTHER_CA)
+    return any(phrase in problem for phrase in phrases)
 
 
 def is_unusable(problem: str) -> bool:
@@ -303,9 +304,9 @@ def shortened_problems(problems: Iterable[str]) -> tuple[str, ...]:
     for problem in dict.fromkeys(problems):
         text = "".join(character if character.isprintable() else "?" for character in problem)
         texts.append(text if len(text) <= LONGEST_PROBLEM else f"{text[: LONGEST_PROBLEM - 3]}...")
-    more = len(texts) - MOST_PROBLEMS
-    if more > 0:
-        texts = [*texts[: MOST_PROBLEMS - 1], f"There are {more + 1} more problems."]
+    surplus = len(texts) - MOST_PROBLEMS
+    if surplus > 0:
+        texts = [*texts[: MOST_PROBLEMS - 1], f"There are {surplus + 1} more problems."]
     return tuple(texts)
 
 
@@ -404,7 +405,9 @@ class LastMessage(NamedTuple):
         """
         if boot is None or boot in self.boots[:1]:
             return self.boots, self.alternated
-        boots = (boot, *(other for other in self.boots if other != boot))[:_MOST_BOOTS]
+        boots = (boot, *(known_boot for known_boot in self.boots if known_boot != boot))[
+            :_MOST_BOOTS
+        ]
         return boots, now if boot in self.boots else self.alternated
 
 
@@ -422,12 +425,12 @@ class Received:
 
     def two_computers(self) -> str:
         """Return a sentence if messages came from two computers within the last day, or ""."""
-        seen = self.message.alternated if self.message else None
-        if seen is None or self.time - seen > timedelta(days=1):
+        alternated = self.message.alternated if self.message else None
+        if alternated is None or self.time - alternated > timedelta(days=1):
             return ""
         return (
             f"Its messages come in turn from two computers that have its keys, such as by a copied "
-            f"disk, last at {iso(seen)}: what the other one has is not known."
+            f"disk, last at {iso(alternated)}: what the other one has is not known."
         )
 
     def clock_note(self) -> str:
@@ -437,8 +440,8 @@ class Received:
             return ""
         if ahead > timedelta():
             return f"its clock is {elapsed(ahead)} ahead"
-        late = "or its confirmation was on its way that long"
-        return f"its clock is {elapsed(-ahead)} behind, {late}"
+        delay_clause = "or its confirmation was on its way that long"
+        return f"its clock is {elapsed(-ahead)} behind, {delay_clause}"
 
 
 class KeptConfirmation(NamedTuple):
@@ -483,19 +486,19 @@ def receive(data: bytes, robot: str, label: str, *, now: datetime) -> Received:
     return Received(confirmation, now.replace(microsecond=0))
 
 
-def refuse_older(root: Path, received: Received) -> None:
+def refuse_older(keystore: OpenedKeystore, received: Received) -> None:
     """Raise `DocumentError` if a report was made before the last confirmation of its robot.
 
     If the last confirmation came before its own time, the clock of the robot was ahead then.
     """
-    before = None
+    previous = None
     with suppress(DocumentError):  # a damaged file
-        before = last_confirmation(root, received.confirmation.robot)
-    if before and received.confirmation.time < min(before.confirmation.time, before.time):
+        previous = last_confirmation(keystore, received.confirmation.robot)
+    if previous and received.confirmation.time < min(previous.confirmation.time, previous.time):
         robot, time = received.confirmation.robot, iso(received.confirmation.time)
         raise DocumentError(
             f"the report of {robot}, made at {time}, is older than its last confirmation, made at "
-            f"{iso(before.confirmation.time)}",
+            f"{iso(previous.confirmation.time)}",
             "It does not show what the robot has now.",
             f"Make it again: `sros fleet report FOLDER --robot {robot}`. If the clock of the robot "
             "is behind, set it first.",
@@ -521,7 +524,7 @@ def locked_confirmations(root: Path) -> Iterator[None]:
             lock.release()
 
 
-def keep_confirmation(root: Path, received: Received) -> str:
+def keep_confirmation(keystore: OpenedKeystore, received: Received) -> str:
     """Write a robot's confirmation to the keystore, replacing the previous one.
 
     What is known of the last message of its agent stays.  The caller holds `locked_confirmations`.
@@ -530,14 +533,14 @@ def keep_confirmation(root: Path, received: Received) -> str:
     robot = received.confirmation.robot
     path, message = confirmation_file(robot), received.message
     with suppress(DocumentError):  # a damaged file
-        if message is None and (before := last_confirmation(root, robot)):
-            message = before.message
+        if message is None and (previous := last_confirmation(keystore, robot)):
+            message = previous.message
     value = {
         "received": iso(received.time),
         **({"message": as_plain(message)} if message else {}),
         "confirmation": _value_of(received.confirmation),
     }
-    with staged_file(root / path, _json(value), mode=0o644) as put_in_place:
+    with staged_file(keystore.root / path, _json(value), mode=0o644) as put_in_place:
         put_in_place()
     return path
 
@@ -550,34 +553,38 @@ class RefusedMessage(NamedTuple):
 
 
 def keep_refusals(
-    root: Path, before: Mapping[str, RefusedMessage], refused: Mapping[str, str], *, now: datetime
+    keystore: OpenedKeystore,
+    previous: Mapping[str, RefusedMessage],
+    refused: Mapping[str, str],
+    *,
+    now: datetime,
 ) -> None:
-    """Write the reasons for refused messages, by robot, if they differ from ``before``.
+    """Write the reasons for refused messages, by robot, if they differ from ``previous``.
 
     The caller holds `locked_confirmations`.
     """
     reasons = {robot: why[:_LONGEST_REASON] for robot, why in refused.items()}
-    if {robot: refusal.why for robot, refusal in before.items()} == reasons:
+    if {robot: refusal.why for robot, refusal in previous.items()} == reasons:
         return
     value = {
         robot: {
-            "time": iso(before[robot].time if before.get(robot, ("", ""))[1] == why else now),
+            "time": iso(previous[robot].time if previous.get(robot, ("", ""))[1] == why else now),
             "why": why,
         }
         for robot, why in sorted(reasons.items())
     }
-    with staged_file(root / REFUSED, _json(value), mode=0o644) as put_in_place:
+    with staged_file(keystore.root / REFUSED, _json(value), mode=0o644) as put_in_place:
         put_in_place()
 
 
-def refusals(root: Path) -> dict[str, RefusedMessage]:
+def refusals(keystore: OpenedKeystore) -> dict[str, RefusedMessage]:
     """Return why the last messages of robots were refused, by robot.
 
     Raises:
         DocumentError: the file cannot be read, or is damaged: then it is unknown which robots are
             current.
     """
-    path = root / REFUSED
+    path = keystore.root / REFUSED
     if not os.path.lexists(path):
         return {}
     data = read_bytes(path, "refused messages", max_bytes=_MOST_REFUSALS)
@@ -595,13 +602,13 @@ def refusals(root: Path) -> dict[str, RefusedMessage]:
         ) from error
 
 
-def last_confirmation(root: Path, robot: str) -> Received | None:
+def last_confirmation(keystore: OpenedKeystore, robot: str) -> Received | None:
     """Return the last confirmation of ``robot``; None if the keystore has none.
 
     Raises:
         DocumentError: the file of the confirmation is damaged or cannot be read.
     """
-    path = root / confirmation_file(robot)
+    path = keystore.root / confirmation_file(robot)
     if not os.path.lexists(path):
         return None
     shown_path = f"'{path}'"
@@ -685,8 +692,8 @@ def _confirmation_from(value: Any, label: str) -> Confirmation:
             raise _invalid_confirmation_error(
                 label, f"it lists certificates of {path}, which is not a certificate file"
             )
-        listed = isinstance(digests, list) and len(digests) <= _MOST_CERTIFICATES
-        if not listed or not all(_is_digest(digest) for digest in digests):
+        is_short_list = isinstance(digests, list) and len(digests) <= _MOST_CERTIFICATES
+        if not is_short_list or not all(_is_digest(digest) for digest in digests):
             raise _invalid_confirmation_error(
                 label, f"the certificates of {path} are not a list of SHA-256 digests"
             )
@@ -834,15 +841,15 @@ def _dds_from(value: Any, label: str) -> RobotDds:
         raise _invalid_confirmation_error(
             label, 'the keys of its dds are not "libraries" and "unseen"'
         )
-    listed, unseen = value["libraries"], value["unseen"]
+    listed_libraries, unseen = value["libraries"], value["unseen"]
     if type(unseen) is not int or not 0 <= unseen <= _MOST_UNSEEN:
         raise _invalid_confirmation_error(label, "its number of unseen processes is not a number")
-    if not isinstance(listed, list) or len(listed) > _MOST_LIBRARIES:
+    if not isinstance(listed_libraries, list) or len(listed_libraries) > _MOST_LIBRARIES:
         raise _invalid_confirmation_error(
             label, f"its DDS libraries are not a list of at most {_MOST_LIBRARIES}"
         )
     libraries = []
-    for library in listed:
+    for library in listed_libraries:
         if not isinstance(library, dict) or library.keys() != set(RobotLibrary._fields):
             raise _invalid_confirmation_error(
                 label, ('the keys of a library of its DDS are not "product", "version", ...')
@@ -877,15 +884,15 @@ def _entries(value: Mapping[str, Any], key: str, label: str) -> Iterator[tuple[s
     entries = value[key]
     if not isinstance(entries, dict):
         raise _invalid_confirmation_error(label, f"{key} is not an object")
-    known: set[str] = set()
+    checked_folders: set[str] = set()
     for path, entry in entries.items():
         folder, _, file = path.rpartition("/")
-        if folder not in known:
+        if folder not in checked_folders:
             if not _is_enclave_folder(folder):
                 raise _invalid_confirmation_error(
                     label, f"{_shortened(path)} is not the path of a file of an enclave"
                 )
-            known.add(folder)
+            checked_folders.add(folder)
         if file not in CONFIRMED_FILES:
             raise _invalid_confirmation_error(
                 label, f"{_shortened(path)} is not a file that a confirmation lists"

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from enum import StrEnum
 from functools import cached_property
-from pathlib import Path
 from typing import Annotated, NamedTuple
 
 from sros_tool.dds.advisories import Advisory, known_vulnerabilities
@@ -330,8 +329,8 @@ class RobotStatus:
 
     def without_list(self) -> RobotStatus:
         """Return the status if it is not known whether the last revocation list is in force."""
-        known = None if self.crl_in_force is None else False
-        return replace(self, crl_in_force=known, has_list=False)
+        crl_in_force = None if self.crl_in_force is None else False
+        return replace(self, crl_in_force=crl_in_force, has_list=False)
 
     def with_to_do(self, now: datetime, *, is_accepted: bool) -> RobotStatus:
         """Return the status with what is to be done at ``now``.
@@ -367,8 +366,10 @@ class RobotStatus:
             return "deliver" if is_silent else "wait, else deliver"
         if is_silent:
             return "check whether it is on"
-        mended = (is_unusable(text) or EXPIRED_METADATA in text for text in self.problems or ())
-        return "wait: it fetches" if all(mended) else "look into it"
+        passes = (
+            is_unusable(problem) or EXPIRED_METADATA in problem for problem in self.problems or ()
+        )
+        return "wait: it fetches" if all(passes) else "look into it"
 
 
 @shows("folder", "expires", "root_expires", "accepted", null_if_empty=("folder",))
@@ -491,16 +492,17 @@ class FleetStatus:
         robots that fetch and sent nothing for more than a day.  Messages of robots that fetch are
         also as old as they say themselves: whoever has the inbox could hold them back.
         """
-        late = frozenset(
+        overdue = frozenset(
             robot.robot
             for robot in self.robots
             if robot.enclaves
-            and (heard := robot.last_heard)
+            and (last_heard := robot.last_heard)
             and (max_age or robot.fetches)
-            and now - heard > (max_age or _LONGEST_SILENCE)
+            and now - last_heard > (max_age or _LONGEST_SILENCE)
         )
         robots = (
-            robot.offline() if robot.robot in late else robot.expired(now) for robot in self.robots
+            robot.offline() if robot.robot in overdue else robot.expired(now)
+            for robot in self.robots
         )
         publication = self.publication and self.publication.at(now)
         is_accepted = publication is None or bool(publication.accepted)
@@ -510,7 +512,7 @@ class FleetStatus:
         clock = clock or behind_clause(now, received, "the last confirmation")
         if clock:  # nobody knows how old the confirmations are
             to_do = tuple(robot.without_list() for robot in to_do)
-        return replace(self, robots=to_do, overdue=late, clock=clock, publication=publication)
+        return replace(self, robots=to_do, overdue=overdue, clock=clock, publication=publication)
 
 
 def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetStatus:
@@ -520,29 +522,29 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
         KeystoreError: it is not a keystore, has no fleet, or some of its enclaves may be missing.
         DocumentError: the fleet has no such robot.
     """
-    root, fleet = keystore.root, recorded_fleet(keystore)
+    fleet = recorded_fleet(keystore)
     robots = [fleet.robot(name) for name in names] or list(fleet.robots.values())
-    compared = _compare_robots(root, fleet, robots)
+    compared = _compare_robots(keystore, fleet, robots)
     stages = _Stages(keystore)
-    known = _Known(keystore, fleet, compared)
+    records = _KeystoreRecords(keystore, fleet, compared)
     existing = keystore.names
     unassigned = 0 if names else len(existing) - sum(len(robot.enclaves) for robot in compared)
     unrecorded = unrecorded_enclaves(fleet, existing, {robot.name for robot in robots})
     statuses = tuple(
-        _status(robot, known, stages, unrecorded[robot.robot.name]) for robot in compared
+        _status(robot, records, stages, unrecorded[robot.robot.name]) for robot in compared
     )
-    if older := known.age_clause:  # there may be a later list, which it does not have
+    if older := records.age_clause:  # there may be a later list, which it does not have
         statuses = tuple(status.without_list() for status in statuses)
     return FleetStatus(
-        root,
+        keystore.root,
         stages.of_keystore,
         statuses,
         unassigned,
         older=older,
         edited=edited_fleet(keystore, keystore.ledger_with("what", "fleet")),
-        revoked_until=known.revoked_until(),
-        publication=known.publication,
-        is_any_revoked=known.is_any_revoked(),
+        revoked_until=records.revoked_until(),
+        publication=records.publication,
+        is_any_revoked=records.is_any_revoked(),
         groups=fleet.groups,
         awaited=stages.awaited,
     )
@@ -557,15 +559,15 @@ class _Difference(NamedTuple):
     ``confirmed`` is the SHA-256 of the robot's file, "" if the robot has none; ``certificates`` are
     the SHA-256 of the certificates in the robot's file, ``present`` in the keystore's.
     ``exported`` says whether an export has a
-    file at this path; None: the file in the keystore cannot be read.  ``own`` says whether the path
-    belongs to an enclave of the robot.
+    file at this path; None: the file in the keystore cannot be read.  ``is_own`` says whether the
+    path belongs to an enclave of the robot.
     """
 
     path: str
     confirmed: str
     certificates: tuple[str, ...]
     exported: bool | None
-    own: bool
+    is_own: bool
     present: tuple[str, ...] = ()
 
 
@@ -616,25 +618,27 @@ class _ComparedRobot(NamedTuple):
         return self.restart() if due is None else tuple(sorted({*due} & {*self.enclaves}))
 
 
-def _compare_robots(root: Path, fleet: Fleet, robots: Sequence[Robot]) -> list[_ComparedRobot]:
+def _compare_robots(
+    keystore: OpenedKeystore, fleet: Fleet, robots: Sequence[Robot]
+) -> list[_ComparedRobot]:
     """Compare the robots' confirmations with the keystore, on all cores."""
 
     def work(part: Sequence[Robot]) -> list[_ComparedRobot]:
-        with Folder(root) as folder:
-            files = _KeystoreFiles(root, folder)
-            return [_compare(root, fleet, robot, files) for robot in part]
+        with Folder(keystore.root) as folder:
+            files = _KeystoreFiles(folder)
+            return [_compare(keystore, fleet, robot, files) for robot in part]
 
     return [compared for _, part in map_slices(robots, work) for compared in part]
 
 
 def _compare(
-    root: Path, fleet: Fleet, robot: Robot, keystore_files: _KeystoreFiles
+    keystore: OpenedKeystore, fleet: Fleet, robot: Robot, keystore_files: _KeystoreFiles
 ) -> _ComparedRobot:
-    enclaves = enclaves_of_robot(root, fleet, robot)
+    enclaves = enclaves_of_robot(keystore.root, fleet, robot)
     notes: list[str] = []
     received = None
     try:
-        received = last_confirmation(root, robot.name)
+        received = last_confirmation(keystore, robot.name)
     except SrosError as error:
         notes.append(f"its last confirmation cannot be used: {error}")
     if received is None:
@@ -645,10 +649,10 @@ def _compare(
     different: list[_Difference] = []
     authorities: dict[str, set[tuple[str, ...]]] = {kind: set() for kind in _AUTHORITIES}
     expiring: dict[str, set[str]] = {kind: set() for kind in _EXPIRING}
-    left = set(confirmed.files)
+    unmatched_paths = set(confirmed.files)
     for name in enclaves:
         for path, file in keystore_files.files_of(name).items():
-            left.discard(path)
+            unmatched_paths.discard(path)
             sha256, kind = confirmed.files.get(path, ""), _kind_of(path)
             if file and sha256 == file.sha256:
                 current[kind] += 1
@@ -657,7 +661,9 @@ def _compare(
                 certificates = confirmed.certificates.get(path, ())
                 at_keystore, present = (True, file.certificates) if file else (None, ())
                 different.append(
-                    _Difference(path, sha256, certificates, at_keystore, own=True, present=present)
+                    _Difference(
+                        path, sha256, certificates, at_keystore, is_own=True, present=present
+                    )
                 )
             if kind in authorities:
                 authorities[kind].add(certificates)
@@ -666,10 +672,10 @@ def _compare(
                     certificates[:1] if kind == "certificate" else {sha256} - {""}
                 )
     folders = {enclave_folder(name) for name in enclaves}
-    for path in sorted(left):
+    for path in sorted(unmatched_paths):
         certificates = confirmed.certificates.get(path, ())
-        own = path.rpartition("/")[0] in folders
-        different.append(_Difference(path, confirmed.files[path], certificates, False, own))
+        is_own = path.rpartition("/")[0] in folders
+        different.append(_Difference(path, confirmed.files[path], certificates, False, is_own))
     return _ComparedRobot(
         robot,
         enclaves,
@@ -697,8 +703,7 @@ class _KeystoreFile(NamedTuple):
 class _KeystoreFiles:
     """Reader of the digests of enclave files in a keystore; shared files are read once."""
 
-    def __init__(self, root: Path, folder: Folder) -> None:
-        self._root = root
+    def __init__(self, folder: Folder) -> None:
         self._folder = folder
         self._shared: dict[tuple[str, str], _KeystoreFile | None] = {}
 
@@ -713,7 +718,7 @@ class _KeystoreFiles:
             f"{folder}/{file}" for file in REQUIRED_FILES if file != KEY_FILE
         )
         up = "../" * folder.count("/")
-        with suppress(OSError), os.scandir(f"{self._root}/{folder}") as entries:
+        with suppress(OSError), os.scandir(self._folder.path / folder) as entries:
             for entry in entries:
                 if entry.name in CONFIRMED_FILES:
                     path = f"{folder}/{entry.name}"
@@ -760,7 +765,7 @@ class _Expiring(NamedTuple):
     window: Window
 
 
-class _Known:
+class _KeystoreRecords:
     """Identification, by the ledger, of confirmed files that differ from the keystore."""
 
     def __init__(
@@ -779,7 +784,7 @@ class _Known:
             if published.robots
             else None
         )
-        self.refusals = refusals(keystore.root)
+        self.refusals = refusals(keystore)
         """Why the last messages of robots were refused, by robot."""
         self._fleet = fleet
         self._issued: dict[str, Entry] = {}
@@ -788,9 +793,11 @@ class _Known:
         different = [
             file for robot in compared_robots for file in robot.different if file.confirmed
         ]
-        wanted = {file.confirmed for file in different}
-        wanted.update(certificate for file in different for certificate in file.certificates)
-        wanted.update(
+        wanted_digests = {file.confirmed for file in different}
+        wanted_digests.update(
+            certificate for file in different for certificate in file.certificates
+        )
+        wanted_digests.update(
             certificate
             for robot in compared_robots
             for file in robot.different
@@ -798,11 +805,11 @@ class _Known:
             for certificate in file.present
         )
         for robot in compared_robots:
-            wanted.update(*robot.expiring.values())
-        wanted.discard("")  # of a file that the robot does not have
-        ledger = keystore.ledger if wanted else keystore.ledger_with("what", "revocation")
+            wanted_digests.update(*robot.expiring.values())
+        wanted_digests.discard("")  # of a file that the robot does not have
+        ledger = keystore.ledger if wanted_digests else keystore.ledger_with("what", "revocation")
         for entry in ledger.entries:
-            if entry.sha256 in wanted:
+            if entry.sha256 in wanted_digests:
                 self._issued.setdefault(entry.sha256, entry)
             if entry.what == "certificate":
                 self._revoked.discard(entry.enclave)
@@ -816,15 +823,18 @@ class _Known:
 
     def _add_listed(self) -> None:
         """Add what only a revocation list revokes, such as a list that was copied from a robot."""
-        listed = {
+        reason_by_serial = {
             f"{entry.serial:x}": entry.reason
             for crl in self._keystore.revocation_lists
             for entry in crl.revoked
             if f"{entry.serial:x}" not in self._revoked_serials
         }
-        self._revoked_serials.update(listed)
-        for entry in self._keystore.ledger_file.with_values("serial", listed).entries:
-            if entry.what == "certificate" and listed.get(entry.serial, SUPERSEDED) != SUPERSEDED:
+        self._revoked_serials.update(reason_by_serial)
+        for entry in self._keystore.ledger_file.with_values("serial", reason_by_serial).entries:
+            if (
+                entry.what == "certificate"
+                and reason_by_serial.get(entry.serial, SUPERSEDED) != SUPERSEDED
+            ):
                 self._revoked.add(entry.enclave)
 
     def is_later(self, robot: str, release: int) -> bool:
@@ -869,22 +879,32 @@ class _Known:
         confirmed = compared_robot.confirmed
         if confirmed is None:
             return ()
-        problems = [text for text in confirmed.problems or () if lacks_key(text)]
+        problems = [problem for problem in confirmed.problems or () if lacks_key(problem)]
         enclaves_without_key = {
-            name for name in compared_robot.enclaves if any(f"{name} " in text for text in problems)
+            name
+            for name in compared_robot.enclaves
+            if any(f"{name} " in problem for problem in problems)
         }
         folders = {path.rpartition("/")[0] for path in confirmed.files}
         for file in compared_robot.different:
-            if _kind_of(file.path) == "certificate" and file.own and file.present:
-                before = self._issued.get(file.certificates[0]) if file.certificates else None
-                now = self._issued.get(file.present[0])
-                has_other_key = before and now and before.key and now.key and before.key != now.key
+            if _kind_of(file.path) == "certificate" and file.is_own and file.present:
+                confirmed_entry = (
+                    self._issued.get(file.certificates[0]) if file.certificates else None
+                )
+                present_entry = self._issued.get(file.present[0])
+                has_other_key = (
+                    confirmed_entry
+                    and present_entry
+                    and confirmed_entry.key
+                    and present_entry.key
+                    and confirmed_entry.key != present_entry.key
+                )
                 if has_other_key or file.path.rpartition("/")[0] not in folders:
                     enclaves_without_key.add(enclave_of(file.path))
         keys = {name: enclave_path(self._root, name) / KEY_FILE for name in enclaves_without_key}
         return tuple(sorted(name for name, key in keys.items() if os.path.lexists(key)))
 
-    def reads_copy(self, compared_robot: _ComparedRobot, heard: datetime | None) -> bool:
+    def reads_copy(self, compared_robot: _ComparedRobot, last_heard: datetime | None) -> bool:
         """Return whether a robot fetched long after the publication, and got an earlier release.
 
         Robots that report another problem say themselves why they got no release.
@@ -893,13 +913,13 @@ class _Known:
         if confirmed and any(map(is_of_copy, confirmed.problems or ())):
             return True
         published = self.published.get(compared_robot.robot.name)
-        if not (confirmed and heard and published and compared_robot.different):
+        if not (confirmed and last_heard and published and compared_robot.different):
             return False
         if not all(EXPIRED_METADATA in problem for problem in confirmed.problems or ()):
             return False
         released_at = self._releases.get(published)
         return (confirmed.release or 0) < published and bool(
-            released_at and heard - released_at > _SILENCE
+            released_at and last_heard - released_at > _SILENCE
         )
 
     @property
@@ -924,11 +944,11 @@ class _Known:
         """Return when the last certificate on the revocation list expires; None if unknown."""
         with suppress(SrosError):
             lists = self._keystore.revocation_lists
-            listed = {f"{entry.serial:x}" for crl in lists for entry in crl.revoked}
-            entries = self._keystore.ledger_file.with_values("serial", listed).entries
-            ends = {entry.serial: entry.not_after for entry in entries if entry.not_after}
-            if listed and listed <= ends.keys():
-                return parse_iso(max(ends[serial] for serial in listed))
+            listed_serials = {f"{entry.serial:x}" for crl in lists for entry in crl.revoked}
+            entries = self._keystore.ledger_file.with_values("serial", listed_serials).entries
+            expiries = {entry.serial: entry.not_after for entry in entries if entry.not_after}
+            if listed_serials and listed_serials <= expiries.keys():
+                return parse_iso(max(expiries[serial] for serial in listed_serials))
         return None
 
     def revoked(self, robot: Robot) -> tuple[str, ...]:
@@ -965,7 +985,7 @@ class _Known:
         """Return the state and the origin of a robot's file that differs from the keystore."""
         kind, name = _kind_of(difference.path), enclave_of(difference.path)
         state, issued_at, owner = self._identify(difference, kind, name)
-        if not difference.own and state is not State.REVOKED:
+        if not difference.is_own and state is not State.REVOKED:
             if name in self._revoked and not has_enclave(self._root, name):
                 state = State.REVOKED
             elif has_enclave(self._root, name) or robot_of(self._fleet, name) not in (None, robot):
@@ -1011,10 +1031,13 @@ class _Known:
 
 
 def _status(
-    compared_robot: _ComparedRobot, known: _Known, stages: _Stages, unrecorded: Unrecorded
+    compared_robot: _ComparedRobot,
+    records: _KeystoreRecords,
+    stages: _Stages,
+    unrecorded: Unrecorded,
 ) -> RobotStatus:
-    different = tuple(known.file(compared_robot.robot, file) for file in compared_robot.different)
-    revoked = known.revoked(compared_robot.robot)
+    different = tuple(records.file(compared_robot.robot, file) for file in compared_robot.different)
+    revoked = records.revoked(compared_robot.robot)
     counts: dict[str, Counter[State]] = {}
     for kind, number in compared_robot.current.items():
         counts.setdefault(kind, Counter())[State.CURRENT] = number
@@ -1037,39 +1060,39 @@ def _status(
     is_later = bool(
         compared_robot.enclaves
         and confirmed
-        and known.is_later(compared_robot.robot.name, confirmed.release or 0)
+        and records.is_later(compared_robot.robot.name, confirmed.release or 0)
     )
     if is_later:
         state = max(state, State.LATER, key=_BADNESS.__getitem__)
-    refusal = known.refusals.get(compared_robot.robot.name) if compared_robot.enclaves else None
+    refusal = records.refusals.get(compared_robot.robot.name) if compared_robot.enclaves else None
     if refusal and (received is None or received.time <= refusal.time):
         state = max(state, State.REFUSED, key=_BADNESS.__getitem__)
-        text = f"its last message was refused since {iso(refusal.time)}: {refusal.why}"
-        compared_robot = compared_robot._replace(notes=(*compared_robot.notes, text))
+        refusal_note = f"its last message was refused since {iso(refusal.time)}: {refusal.why}"
+        compared_robot = compared_robot._replace(notes=(*compared_robot.notes, refusal_note))
     is_ahead = bool(
         state is State.UNKNOWN
         and received
         and received.message
-        and known.is_ahead(received.confirmation)
+        and records.is_ahead(received.confirmation)
     )
     if is_ahead and confirmed:
-        text = (
+        ahead_note = (
             f"it says that it has release {confirmed.release}, from after the backup of the "
             "keystore: its files are newer then, and the next release replaces them"
         )
-        compared_robot = compared_robot._replace(notes=(*compared_robot.notes, text))
+        compared_robot = compared_robot._replace(notes=(*compared_robot.notes, ahead_note))
     problems = confirmed.problems if confirmed else None
-    if text := received.two_computers() if received and compared_robot.enclaves else "":
-        problems = (*(problems or ()), text)
+    if two_computers := received.two_computers() if received and compared_robot.enclaves else "":
+        problems = (*(problems or ()), two_computers)
     has_list = (
-        known.has_list
-        and not text
+        records.has_list
+        and not two_computers
         and bool(compared_robot.enclaves)
         and received is not None
         and state not in (State.REFUSED, State.LATER)
         and counts.get("crl") == {State.CURRENT: len(compared_robot.enclaves)}
     )
-    validity = known.validity(compared_robot)
+    validity = records.validity(compared_robot)
     certificates = {*counts.get("certificate", ())}
     status = RobotStatus(
         compared_robot.robot.name,
@@ -1081,39 +1104,39 @@ def _status(
         confirmed.time if confirmed else None,
         bool(received and received.message),
         confirmed.release if confirmed else None,
-        known.published.get(compared_robot.robot.name),
+        records.published.get(compared_robot.robot.name),
         stages.of(compared_robot),
         {kind: counts[kind] for kind in (*_KINDS.values(), _ZENOH) if kind in counts},
         different,
         restart,
         compared_robot.running(),
         has_list and compared_robot.crl_restart() == ()
-        if known.has_list and compared_robot.enclaves
+        if records.has_list and compared_robot.enclaves
         else None,
         {kind: file.window.not_after for kind, file in validity.items()},
         confirmed.dds if confirmed else None,
         problems,
         compared_robot.notes,
-        has_release=bool(different) and known.has_release(compared_robot),
-        short_lived=known.short_lived(validity),
+        has_release=bool(different) and records.has_release(compared_robot),
+        short_lived=records.short_lived(validity),
         has_list=has_list,
         renew_from=min(
             (file.window.expires_soon_from() for file in validity.values()), default=None
         ),
-        lacks_key=known.lacks_key(compared_robot) if different or state is State.UNUSABLE else (),
+        lacks_key=records.lacks_key(compared_robot) if different or state is State.UNUSABLE else (),
         is_ahead=is_ahead,
         reported=len((confirmed and confirmed.problems) or ()),
         is_locked_out=bool(compared_robot.enclaves) and certificates == {State.REVOKED},
     )
-    if not (status.fetches and known.reads_copy(compared_robot, status.last_heard)):
+    if not (status.fetches and records.reads_copy(compared_robot, status.last_heard)):
         return status
     if status.problems:
         return replace(status, reads_copy=True)
-    text = (
+    copy_problem = (
         f"It sent a message long after release {status.published} was published, and has release "
         f"{status.release or 'none'}: its `from` is an old copy."
     )
-    return replace(status, reads_copy=True, problems=(*(status.problems or ()), text))
+    return replace(status, reads_copy=True, problems=(*(status.problems or ()), copy_problem))
 
 
 # ── the stages of a rotation ───────────────────────────────────────────────────────────────
@@ -1186,7 +1209,7 @@ def fleet_metrics(
 
     def per_robot(value: Callable[[RobotStatus], int | None]) -> tuple[Sample, ...]:
         values = ((value(robot), labels) for labels, robot in robots)
-        return tuple(Sample(known, labels) for known, labels in values if known is not None)
+        return tuple(Sample(number, labels) for number, labels in values if number is not None)
 
     return (
         Metric(
@@ -1301,20 +1324,20 @@ def _dds_metrics(
     numbers: list[Sample] = []
     unknown: list[Sample] = []
     for labels, robot in robots:
-        hidden = 0 if robot.dds and robot.dds.libraries else 1
+        unknown_libraries = 0 if robot.dds and robot.dds.libraries else 1
         releases: dict[tuple[str, str, str], int] = {}
         for library in robot.dds.libraries if robot.dds else ():
-            known = known_vulnerabilities(library.product, library.version, advisories)
-            if known is None:
-                hidden += 1
+            vulnerabilities = known_vulnerabilities(library.product, library.version, advisories)
+            if vulnerabilities is None:
+                unknown_libraries += 1
             else:
                 release = library.product, library.version, library.seen.value
-                releases[release] = len(known.known)
+                releases[release] = len(vulnerabilities.known)
         numbers += (
             Sample(number, {**labels, "product": product, "version": version, "seen": seen})
             for (product, version, seen), number in sorted(releases.items())
         )
-        unknown.append(Sample(hidden, labels))
+        unknown.append(Sample(unknown_libraries, labels))
     yield Metric(
         "sros_fleet_dds_known_vulnerabilities",
         "Number of known vulnerabilities of each DDS release of a robot, in a process or only "

@@ -130,7 +130,7 @@ class Home:
 
     def kept(self, robot: str) -> int | None:
         """Return the sequence number of the message that is kept of a robot."""
-        last = last_confirmation(self.root, robot)
+        last = last_confirmation(OpenedKeystore(self.root), robot)
         return last.message.sequence if last and last.message else None
 
     def certificate(self, enclave: str) -> x509.Certificate:
@@ -171,7 +171,7 @@ def test_messages_are_kept_once_each(home: Home) -> None:
     found = home.collect()
     assert [robot.outcome for robot in found.robots] == ["kept", "unchanged", "missing"]
     assert found.complete and found.robots[0].enclave == "/r1/base"
-    last = last_confirmation(home.root, "r1")
+    last = last_confirmation(OpenedKeystore(home.root), "r1")
     assert last and last.confirmation.sequence == 3 and last.time <= NOW
 
 
@@ -183,13 +183,13 @@ def test_two_at_once(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
     kept = keep_confirmation
     refused = []
 
-    def meanwhile(root: Path, received: Received) -> str:
+    def meanwhile(keystore: OpenedKeystore, received: Received) -> str:
         assert home.collect(dry_run=True).complete
         with pytest.raises(KeystoreError, match="is busy"):
             home.collect()
         ended = sros("fleet", "confirm", "ks", "said", "--robot", "r1", cwd=home.folder)
         refused.append((ended.status, "is busy" in ended.err))
-        return kept(root, received)
+        return kept(keystore, received)
 
     with monkeypatch.context() as patched:
         patched.setattr(collecting, "keep_confirmation", meanwhile)
@@ -200,9 +200,9 @@ def test_two_at_once(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_an_inbox_that_is_moved_away_meanwhile(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
-    def meanwhile(root: Path, received: Received) -> str:
+    def meanwhile(keystore: OpenedKeystore, received: Received) -> str:
         home.inbox.rename(home.folder / "elsewhere")
-        return keep_confirmation(root, received)
+        return keep_confirmation(keystore, received)
 
     home.send("r1")
     monkeypatch.setattr(collecting, "keep_confirmation", meanwhile)
@@ -270,14 +270,16 @@ def test_an_older_message_in_a_second_inbox(home: Home) -> None:
     assert older.outcome == "older" and home.kept("r1") == 2 and done.complete
     (note,) = (note for note in done.notes if note.id == "fleet.older-message")
     assert note.text.startswith(f"an older message of r1 lies in '{home.inbox}'")
-    assert not refusals(home.root)
+    assert not refusals(OpenedKeystore(home.root))
     # It has to be authentic; one that is not is refused, however old.
     path.write_bytes(home.message("r2", NOW))
     os.utime(path, (path.stat().st_mtime - 90,) * 2)
-    assert home.of("r1").outcome == "refused" and "r1" in refusals(home.root)
+    assert home.of("r1").outcome == "refused" and "r1" in refusals(OpenedKeystore(home.root))
     path.write_bytes(first)
     os.utime(path, (path.stat().st_mtime - 90,) * 2)
-    assert home.of("r1").outcome == "older" and "r1" in refusals(home.root), "as before"
+    assert home.of("r1").outcome == "older" and "r1" in refusals(OpenedKeystore(home.root)), (
+        "as before"
+    )
 
 
 def test_two_computers_with_the_keys_of_a_robot_are_noted(home: Home) -> None:
@@ -662,7 +664,7 @@ def test_when_a_message_arrived(home: Home) -> None:
         file = home.send("r1", now)
         os.utime(file, (written.timestamp(),) * 2)
         home.collect(now)
-        last = last_confirmation(home.root, "r1")
+        last = last_confirmation(OpenedKeystore(home.root), "r1")
         assert last
         return last.time
 
@@ -677,7 +679,7 @@ def test_a_message_whose_file_has_a_time_of_no_year(home: Home, seconds: int) ->
     os.utime(home.send("r1"), (seconds, seconds))
     home.send("r2")
     assert home.outcomes() == {"r1": "kept", "r2": "kept", "r3": "missing"}
-    last = last_confirmation(home.root, "r1")
+    last = last_confirmation(OpenedKeystore(home.root), "r1")
     assert last and last.time <= NOW
 
 

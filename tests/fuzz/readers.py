@@ -261,8 +261,8 @@ def _confirmation(data: bytes, place: Place) -> None:
     received = receive(data, "r7", "drawn", now=NOW)
     (place.keystore / "fleet.toml").write_text('enclaves = ["/{robot}"]\n[robots.r7]\n')
     with locked_confirmations(place.keystore):
-        keep_confirmation(place.keystore, received)
-    kept = last_confirmation(place.keystore, "r7")
+        keep_confirmation(OpenedKeystore(place.keystore), received)
+    kept = last_confirmation(OpenedKeystore(place.keystore), "r7")
     assert kept and kept.confirmation == received.confirmation
     found = fleet_status(OpenedKeystore(place.keystore)).with_overdue(NOW, timedelta(days=1))
     assert [each.robot for each in found.robots] == ["r7"]

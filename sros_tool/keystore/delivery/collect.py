@@ -203,8 +203,8 @@ def collect(
     """
     recorded_fleet(OpenedKeystore(root))
     with nullcontext() if dry_run else locked_confirmations(root):
-        refused_before = refusals(root)
         keystore = OpenedKeystore(root)
+        refused_before = refusals(keystore)
         fleet = checked_fleet(keystore)
         assert fleet
         for name in restored:
@@ -229,10 +229,10 @@ def collect(
                 changes.append(FileChange(action, str(root / path)))
                 if not dry_run:
                     # If this run is killed now, the next one judges the same requests.
-                    keep_confirmation(root, message.received)
+                    keep_confirmation(keystore, message.received)
             taken.append(message.without_confirmation())
         if not dry_run:
-            keep_refusals(root, refused_before, _refusals(refused_before, taken), now=now)
+            keep_refusals(keystore, refused_before, _refusals(refused_before, taken), now=now)
         not_signed, notes, signed = _revoke_again(
             root, forgotten, robots_with_lists, taken, now=now, keyring=keyring, dry_run=dry_run
         )
@@ -458,7 +458,7 @@ class _Verifier:
         remarks: list[str] = []
         last = None
         try:
-            last = last_confirmation(self._keystore.root, robot.name)
+            last = last_confirmation(self._keystore, robot.name)
         except SrosError as error:
             remarks.append(f"its last confirmation cannot be used: {error.what}")
         before = last.message if last else None

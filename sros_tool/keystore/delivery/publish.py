@@ -628,7 +628,7 @@ class _Run:
             return True
         for robot in recorded_fleet(self.keystore).robots:
             with suppress(SrosError):
-                if received := last_confirmation(self.keystore.root, robot):
+                if received := last_confirmation(self.keystore, robot):
                     sent = received.confirmation
                     problems = sent.problems or ()
                     if (sent.release or 0) > last or any(OF_SAME_NUMBER in e for e in problems):
