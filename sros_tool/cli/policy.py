@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from sros_tool.policy.merge import Merged
     from sros_tool.policy.model import StatedProtection
     from sros_tool.policy.rights import RightsDifference
-    from sros_tool.proof.growth import DroppedDenial, Gain, Growth, NewReach
+    from sros_tool.proof.growth import DroppedDenial, Gain, Growth, NewNode, NewReach
     from sros_tool.proof.sources import AccessSource
 
 
@@ -268,12 +268,13 @@ def diff_policy(
 
     With --no-new-access, A and B can also be folders of policies, and policies at a git revision,
     as git:REVISION:PATH. The exit status is 0 only if B gives no enclave access that A does not
-    give, for any vendor, domain or name, and protects nothing less; it is 2 if that cannot be
-    decided. sros assumes that a policy is signed with a governance that controls all access. If A
-    is a policy, a keystore B that protects less than the template production counts as giving more
-    access; a policy B never lowers the protection. The last line says what is assumed and what is
-    left out, such as dates. "!" marks a DENY that B lacks, of names that B does not allow: it gives
-    no access, so that the exit status is 0, but `sros review` fails for it.
+    give, for any vendor, domain or name, assigns no node to an enclave with more rights, and
+    protects nothing less; it is 2 if that cannot be decided. sros assumes that a policy is signed
+    with a governance that controls all access. If A is a policy, a keystore B that protects less
+    than the template production counts as giving more access; a policy B never lowers the
+    protection. The last line says what is assumed and what is left out, such as dates. "!" marks a
+    DENY that B lacks, of names that B does not allow: it gives no access, so that the exit status
+    is 0, but `sros review` fails for it.
 
     Example:
       $ sros diff_policy robot.xml keystore
@@ -835,9 +836,22 @@ def added_lines(base: AccessSource, head: AccessSource, growth: Growth) -> list[
     return [
         *_renamed_lines(renamed, head.fleet),
         *_folded_gains(head, "+", unrenamed.added, growth),
+        *_new_node_lines(head, growth.new_nodes),
         *(f"+ less protection: {change}" for change in growth.lost),
         *_reach_lines(head, unrenamed.reach),
     ]
+
+
+def _new_node_lines(head: AccessSource, nodes: Iterable[NewNode]) -> Iterator[str]:
+    """Yield a line for each node that gets more rights in another enclave; see `folded`."""
+    from sros_tool.fleet.robots import folded
+
+    lines = []
+    for node, enclave, moved_from, right, place in nodes:
+        where = f"moves from enclave {moved_from} to" if moved_from else "is new in enclave"
+        text = f"+ node {node} {where} {enclave}, and may {right.describe()} there  ({place})"
+        lines.append((enclave, text))
+    return folded(head.fleet, lines)
 
 
 def _renamed_lines(renamed: Mapping[str, str], fleet: Fleet | None) -> Iterator[str]:
@@ -953,6 +967,8 @@ def access_summary(growth: Growth, dropped: Collection[DroppedDenial]) -> str:
     parts = []
     if growth.added:
         parts.append(f"{_count(len(growth.added), 'right')} new")
+    if growth.new_nodes:
+        parts.append(f"{_count(len(growth.new_nodes), 'node')} new in an enclave of BASE")
     if growth.lost:
         parts.append(f"{_count(len(growth.lost), 'protection')} less")
     if growth.reach:

@@ -369,7 +369,7 @@ class NodeName(NamedTuple):
 
 def nodes_of(enclave: Enclave) -> tuple[NodeName, ...]:
     """Return the nodes of an enclave, from the profiles of its policy."""
-    return tuple(dict.fromkeys(map(_node_of, enclave.all_profiles())))
+    return tuple(dict.fromkeys(map(node_of, enclave.all_profiles())))
 
 
 def nodes_not_shown(enclave: Enclave) -> tuple[NodeName, ...]:
@@ -383,13 +383,14 @@ def nodes_not_shown(enclave: Enclave) -> tuple[NodeName, ...]:
     return tuple(
         dict.fromkeys(
             node
-            for profile, node in ((profile, _node_of(profile)) for profile in profiles)
+            for profile, node in ((profile, node_of(profile)) for profile in profiles)
             if not any(map(_offers_node_services, profile.groups)) or any(map(node.is_within, gone))
         )
     )
 
 
-def _node_of(profile: Profile) -> NodeName:
+def node_of(profile: Profile) -> NodeName:
+    """Return namespace and name of the node of a profile."""
     ns = profile.ns.strip("/")
     # A namespace that begins with a wildcard has no "/" before it.
     return NodeName(ns if ns.startswith("*") else f"/{ns}", profile.node)

@@ -55,6 +55,9 @@ from sros_tool.policy.rights import (
     Right,
     Rules,
     folded,
+    node_of,
+    nodes_of,
+    order,
     parts,
     profile_rights,
     renamed_enclaves,
@@ -160,6 +163,25 @@ class GainedProtection(NamedTuple):
     """The protection in HEAD."""
 
 
+class NewNode(NamedTuple):
+    """A node that HEAD assigns to an enclave of BASE, so that its process gets more rights there.
+
+    `sros run --policy` and `ros2 launch --secured` start a node in the enclave that the policy
+    assigns to it.
+    """
+
+    node: str
+    """Full name of the node, perhaps with wildcards."""
+    enclave: str
+    """The enclave that has the node in HEAD, and not in BASE."""
+    moved_from: str
+    """An enclave that had the node in BASE, and no longer has it; or empty."""
+    right: Right
+    """Example of a right of the enclave that the process did not have."""
+    place: Source
+    """File and line of the node in HEAD."""
+
+
 class DroppedDenial(NamedTuple):
     """A DENY of BASE of which HEAD neither denies nor allows all names.
 
@@ -176,7 +198,8 @@ class DroppedDenial(NamedTuple):
 
 @shows(
     *("new_access", "worlds", "domains", "assumed", "left_out", "not_compared", "added", "reach"),
-    *("reach_known", "less_protection", "dropped_denials", "removed", "more_protection"),
+    *("reach_known", "new_nodes", "less_protection", "dropped_denials", "removed"),
+    *("more_protection",),
 )
 @dataclass(frozen=True, slots=True)
 class Growth:
@@ -206,6 +229,8 @@ class Growth:
     """Parts that are not compared on purpose."""
     not_compared: tuple[str, ...]
     """Parts that could not be compared; if nothing is new, this is an error with exit status 2."""
+    new_nodes: tuple[NewNode, ...]
+    """Nodes that HEAD assigns to an enclave of BASE, and that get more rights by it."""
     dropped_denials: tuple[DroppedDenial, ...]
     """Denials that HEAD drops or narrows without allowing their names; they are no new access."""
 
@@ -235,7 +260,7 @@ class Growth:
         return [GainedProtection(change.key, change.after, change.before) for change in self.gained]
 
     def __bool__(self) -> bool:
-        return bool(self.added or self.lost)
+        return bool(self.added or self.lost or self.new_nodes)
 
     def without_renames(self, renamed: Mapping[str, str]) -> Growth:
         """Return this growth without access that only comes from the new names of enclaves.
@@ -328,8 +353,9 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     worlds = _worlds(before, after)
     added = tuple(_gains(before, after, worlds, scope, limit))
     lost = tuple(dict.fromkeys(_lost_protection(base, head, limit, rules=not added)))
+    new_nodes = tuple(_new_nodes(base, head))
     unclear = tuple(_not_compared_clauses(base, head))
-    if unclear and not added and not lost:
+    if unclear and not (added or lost or new_nodes):
         raise DocumentError(
             f"'{head.shown}' cannot be compared: {unclear[0]}",
             "Apart from that, nothing is new.",
@@ -353,6 +379,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
         tuple(_assumptions(base, head)),
         tuple(_left_out_texts(base, head)),
         unclear,
+        new_nodes,
         tuple(_dropped_denials(base, head)),
     )
 
@@ -1091,6 +1118,36 @@ def _reached_with_hops(edges: _Edges, start: str) -> dict[str, Hop]:
                 reached[neighbour] = hop
                 row.append(neighbour)
     return reached
+
+
+# ── nodes ──────────────────────────────────────────────────────────────────────────────────
+
+
+def _new_nodes(before: AccessSource, after: AccessSource) -> Iterator[NewNode]:
+    """Yield the nodes that policies assign to another enclave, which has more rights.
+
+    A node that is alone in its enclave may have another name than before, and a node whose name a
+    wildcard of the enclave matched is not new.
+    """
+    old_enclaves = _enclaves_of_nodes(before)
+    for (ns, node), profiles in sorted(_enclaves_of_nodes(after).items()):
+        earlier = old_enclaves.get((ns, node), {})
+        for path, profile in sorted(profiles.items()):
+            if path in earlier or path not in before.enclaves:
+                continue
+            if any(map(node_of(profile).is_within, nodes_of(before.enclaves[path]))):
+                continue
+            if earlier:
+                had = {right for right in before.rights if right.enclave in earlier}
+            else:
+                had = set(profile_rights(path, profile))
+            known = Rules(right._replace(enclave=path) for right in had)
+            allowed = (r for r in after.rights if r.enclave == path and r.qualifier is ALLOW)
+            if gained := [right for right in allowed if not known.cover(right)]:
+                full = f"/{ns}/{node}".replace("//", "/")
+                moved_from = min(earlier.keys() - profiles, default="")
+                place = after.shown_source(profile.source)
+                yield NewNode(full, path, moved_from, min(gained, key=order), place)
 
 
 # ── denials ────────────────────────────────────────────────────────────────────────────────

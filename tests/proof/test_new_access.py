@@ -82,6 +82,43 @@ def questions(base: Drawn, head: Drawn) -> Iterator[tuple[str, Style, Decide]]:
         yield "Zenoh", Style.FNMATCH, Side.on_zenoh
 
 
+@pytest.mark.parametrize(
+    ("before", "mux", "web", "lines"),
+    [
+        ("mux", "mux web", "other", ["/web moves from enclave /web to /mux"]),
+        ("mux", "web", "mux", ["/web moves from enclave /web to /mux"]),
+        ("mux", "mux web", "web", ["/web is new in enclave /mux"]),
+        ("mux", "mux new", "web", ["/new is new in enclave /mux"]),
+        ("mux", "new", "web", []),  # may be another name of the node
+        ("mux arm_*", "mux arm_* arm_2", "web", []),
+        ("mux", "mux", "web mux", []),  # has less there
+    ],
+)
+def test_a_node_that_gets_the_rights_of_another_enclave(
+    tmp_path: Path, before: str, mux: str, web: str, lines: list[str]
+) -> None:
+    """`sros run --policy` starts a node in the enclave to which the policy assigns it."""
+
+    def write(name: str, mux: str, web: str) -> None:
+        enclaves = ""
+        for path, names, wide in (("/mux", mux, "/*"), ("/web", web, "/status")):
+            first, *others = names.split()
+            profiles = f'<profile ns="/" node="{first}">{publish(wide)}</profile>'
+            for node in others:
+                profiles += f'<profile ns="/" node="{node}">{publish("/status")}</profile>'
+            enclaves += f'<enclave path="{path}"><profiles>{profiles}</profiles></enclave>'
+        text = f'<policy version="0.2.0"><enclaves>{enclaves}</enclaves></policy>'
+        (tmp_path / name).write_text(text)
+
+    write("base.xml", before, "web")
+    write("head.xml", mux, web)
+    ended = sros("diff_policy", "--no-new-access", "base.xml", "head.xml", cwd=tmp_path)
+    added = [line for line in ended.out.splitlines() if line.startswith("+")]
+    assert [line.partition(", and")[0] for line in added] == [f"+ node {each}" for each in lines]
+    assert all("and may publish topic /* there  (head.xml:1)" in line for line in added)
+    assert ended.status == bool(lines) and ("1 node is new in an" in ended.err) == bool(lines)
+
+
 @pytest.mark.parametrize("part", range(8 if LONG else 1))
 def test_random_pairs_against_single_questions(tmp_path: Path, part: int) -> None:
     """Policies, keystores, fleets and Zenoh files: what is new is found, and nothing else."""
