@@ -130,6 +130,36 @@ def test_units_to_restart_are_in_order() -> None:
 
 
 @needs_ansible
+def test_what_is_said_restarted_has_no_files_of_the_same_play(tmp_path: Path) -> None:
+    """They came after the restart; what a unit runs was restarted by the play."""
+    names = ["/r1/before", "/r1/new", "/r1/unit"]
+    found = {"restart": names, "changed_enclaves": ["/r1/new", "/r1/unit"], "routers": []}
+    (tmp_path / "keystore").mkdir(mode=0o700)
+    record = tmp_path / ".keystore.sros-restart"
+    record.write_text(json.dumps(names))
+    record.chmod(0o600)
+    variables = {
+        "sros_enclaves": found,
+        "sros_units": [{"name": "a.service", "enclaves": ["/r1/unit"]}],
+        "sros_systemctl": ["true"],
+        "sros_restarted": True,
+        "sros_dest": str(tmp_path / "keystore"),
+        "sros_prefix": "",
+        "sros_timeout": 60,
+    }
+    role = {"name": "sros.fleet.robot", "tasks_from": "restart.yml"}
+    tasks = [{"ansible.builtin.include_role": role}]
+    play = {"hosts": "localhost", "gather_facts": False, "vars": variables, "tasks": tasks}
+    (tmp_path / "play.yml").write_text(json.dumps([play]))
+    local = {"ansible_connection": "local", "ansible_python_interpreter": sys.executable}
+    hosts = {"localhost": local}
+    (tmp_path / "inventory.json").write_text(json.dumps({"all": {"hosts": hosts}}))
+    said = ansible("ansible-playbook", "-i", "inventory.json", "play.yml", folder=tmp_path)
+    assert "Restart the processes of /r1/new, which no unit" in " ".join(said.split())
+    assert json.loads(record.read_text()) == ["/r1/new"]
+
+
+@needs_ansible
 def test_a_revoked_robot_is_left_out_and_no_failure(tmp_path: Path) -> None:
     """Otherwise a robot that was revoked before would stop every delivery to the others."""
     from ansible_collections.sros.fleet.plugins.action.enclaves import export
