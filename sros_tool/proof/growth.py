@@ -1129,25 +1129,27 @@ def _new_nodes(before: AccessSource, after: AccessSource) -> Iterator[NewNode]:
     A node that is alone in its enclave may have another name than before, and a node whose name a
     wildcard of the enclave matched is not new.
     """
-    old_enclaves = _enclaves_of_nodes(before)
-    for (ns, node), profiles in sorted(_enclaves_of_nodes(after).items()):
-        earlier = old_enclaves.get((ns, node), {})
-        for path, profile in sorted(profiles.items()):
-            if path in earlier or path not in before.enclaves:
-                continue
-            if any(map(node_of(profile).is_within, nodes_of(before.enclaves[path]))):
-                continue
-            if earlier:
-                had = {right for right in before.rights if right.enclave in earlier}
-            else:
-                had = set(profile_rights(path, profile))
-            known = Rules(right._replace(enclave=path) for right in had)
-            allowed = (r for r in after.rights if r.enclave == path and r.qualifier is ALLOW)
-            if gained := [right for right in allowed if not known.cover(right)]:
-                full = f"/{ns}/{node}".replace("//", "/")
-                moved_from = min(earlier.keys() - profiles, default="")
-                place = after.shown_source(profile.source)
-                yield NewNode(full, path, moved_from, min(gained, key=order), place)
+    old_enclaves, new_enclaves = map(_enclaves_of_nodes, (before, after))
+    assigned = [
+        (node, path)
+        for node, profiles in sorted(new_enclaves.items())
+        for path in sorted((profiles.keys() & before.enclaves.keys()) - old_enclaves[node].keys())
+        if not any(map(node_of(profiles[path]).is_within, nodes_of(before.enclaves[path])))
+    ]
+    if not assigned:  # of a large fleet, the rights are many
+        return
+    old_rights, new_rights = map(_rights_by_enclave, (before.rights, after.rights))
+    for node, path in assigned:
+        profile, earlier = new_enclaves[node][path], old_enclaves[node].keys()
+        had = [right for enclave in earlier for right in old_rights.get(enclave, ())]
+        had = had if earlier else [*profile_rights(path, profile)]
+        known = Rules(right._replace(enclave=path) for right in had)
+        allowed = (right for right in new_rights.get(path, ()) if right.qualifier is ALLOW)
+        if gained := [right for right in allowed if not known.cover(right)]:
+            full = f"/{'/'.join(node)}".replace("//", "/")
+            moved_from = min(earlier - new_enclaves[node].keys(), default="")
+            place = after.shown_source(profile.source)
+            yield NewNode(full, path, moved_from, min(gained, key=order), place)
 
 
 # ── denials ────────────────────────────────────────────────────────────────────────────────
@@ -1175,9 +1177,9 @@ def _dropped_denials(before: AccessSource, after: AccessSource) -> Iterator[Drop
             yield DroppedDenial(right, name if stated.overlaps(right) else "", old_path)
 
 
-def _enclaves_of_nodes(side: AccessSource) -> dict[tuple[str, str], dict[str, Profile]]:
+def _enclaves_of_nodes(side: AccessSource) -> defaultdict[tuple[str, str], dict[str, Profile]]:
     """Map namespace and name of each node in policies to its enclaves, with its profiles there."""
-    enclaves: dict[tuple[str, str], dict[str, Profile]] = defaultdict(dict)
+    enclaves: defaultdict[tuple[str, str], dict[str, Profile]] = defaultdict(dict)
     for path, enclave in side.enclaves.items():
         for profile in enclave.all_profiles():
             node = profile.ns.strip("/"), profile.node
