@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from functools import cached_property
 from typing import NamedTuple
 
@@ -67,6 +67,20 @@ class RunningRobot:
             for process in self.processes.processes
             if process.enclave and process.enclave.is_of(export)
         ]
+
+    @cached_property
+    def open_processes(self) -> Mapping[tuple[str, ...], Process]:
+        """The processes in the robot's domain that run without security, by their commands."""
+        return {
+            process.program[1]: process
+            for process in self.in_domain
+            if not process.asks_for_security
+        }
+
+    def is_open(self, process: ClosedProcess) -> bool:
+        """Return whether an observed process runs open, and no process runs in its enclave."""
+        is_secured = any(enclave.name == process.enclave for _, enclave in self.secured_everywhere)
+        return not is_secured and tuple(process.command) in self.open_processes
 
     @cached_property
     def current_enclaves(self) -> Set[str]:

@@ -22,32 +22,32 @@ from sros_tool.values import FileChange
 
 def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     """Remove the drop-ins of this folder, restart their units, and say what to do by hand."""
-    observed = RunningRobot(robot).with_later_processes(robot.processes)
+    running = RunningRobot(robot)
+    observed = running.with_later_processes(robot.processes)
     drop_ins = drop_ins_of(robot, observed)
     for path in drop_ins:
         robot.shell.say(f"{'would remove' if dry_run else 'removed'} {path}")
         if not dry_run:
             remove_file(path)
-    drop_in_units = {path.parent.name.removesuffix(".d") for path in drop_ins}
-    restart_units(robot, observed, {*observed.units.values()} | drop_in_units, dry_run=dry_run)
+    units = {path.parent.name.removesuffix(".d") for path in drop_ins}
+    # Without a drop-in, a unit is not open yet if an earlier --undo was killed before the restart.
+    units |= {process.unit for process in observed.processes if not running.is_open(process)} - {""}
+    restart_units(robot, observed, units, dry_run=dry_run)
     changes = [FileChange("remove", str(path)) for path in drop_ins]
     state = current_state(robot)._replace(dry_run=dry_run, changes=changes)
-    return state._replace(problems=[*_texts_to_open(robot, observed)])
+    return state._replace(problems=[*_texts_to_open(robot, observed, dry_run=dry_run)])
 
 
-def _texts_to_open(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[str]:
+def _texts_to_open(
+    robot: LocalRobot, observed: ObservedProcesses, *, dry_run: bool
+) -> Iterator[str]:
     """Yield how to start each process open that runs in an enclave or does not run.
 
     Processes of enclaves that were taken out of the policy are left out.  Secured processes
     that sros does not know are named, so that none of them is taken for open.
     """
     running = RunningRobot(robot)
-    are_open = {
-        process.program[1]: process
-        for process in running.in_domain
-        if not process.asks_for_security
-    }
-    nodes = ObservedNodes(robot)
+    are_open, nodes = running.open_processes, ObservedNodes(robot)
     observed_commands = {tuple(process.command) for process in observed.processes}
     others = [are_open[command] for command in are_open if command not in observed_commands]
     secured = {
@@ -71,6 +71,13 @@ def _texts_to_open(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[s
             commands.append(process.open_command(robot.domain))
     for command in dict.fromkeys(commands):
         yield f"restart it open: {command}"
+    for process in observed.processes if not dry_run else ():
+        if process.unit and process.enclave in secured:
+            label = secured[process.enclave].label
+            yield (
+                f"{label} still runs in {process.enclave}: stop it if {process.unit} did not start "
+                "it; otherwise take sros out of the unit"
+            )
     for process in by_hand:
         if process.enclave not in secured and tuple(process.command) not in are_open:
             names, old = nodes.names_in(process.enclave)

@@ -386,6 +386,13 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     assert [*robot.folder.glob("systemd/*.d/*")] == []
     assert robot.restarts[2:] == ["daemon-reload", "restart listener.service talker.service"]
     assert undone.err.count("removed ") == 2
+    robot.close("--undo")
+    assert len(robot.restarts) == 4, "they run open already"
+    robot.by_hand = {"/talker"}
+    still = "process 4711 (run) still runs in /talker: stop it if talker.service did not start it"
+    assert still in robot.close("--undo", status=1).out
+    assert robot.restarts[4:] == ["daemon-reload", "restart talker.service"]
+    robot.by_hand = set()
     robot.close("--proof", status=1)
     assert made(robot.folder) == MADE
     opens = "protection.default.write_access_control=false"
