@@ -284,7 +284,9 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
             steps = f"{stop}start them by the first commands in {robot.commands_file}"
         if not closed.pending:
             following = ask
-        elif any(name in observed.units for name in closed.pending):
+        elif any(
+            process.unit for process in observed.processes if process.enclave in closed.pending
+        ):
             following = f"sros close {folder} --apply"
         else:
             following = f"{steps}, and ask {ask}"

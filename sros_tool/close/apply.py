@@ -21,7 +21,7 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
     """
     robot.shell.check_open()
     observed = prepared.observed
-    paths = [f"{unit}.d/{DROP_IN}" for unit in sorted(observed.units.values())]
+    paths = [f"{unit}.d/{DROP_IN}" for unit in sorted(observed.units)]
     files = {path: read_bytes(robot.start / "units" / path, "unit").decode() for path in paths}
     drop_ins_of(robot, observed)
     changes = unit_changes(SYSTEMD, files, force=True)
@@ -30,8 +30,9 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
     if not dry_run:
         write_units(SYSTEMD, files, changes)
     secured = prepared.secured
-    open_units = {unit for enclave, unit in observed.units.items() if not secured.get(enclave)}
-    restart_units(robot, observed, open_units, dry_run=dry_run)
+    unsecured = [process for process in observed.processes if not secured.get(process.enclave)]
+    open_units = observed._replace(processes=unsecured).units
+    restart_units(robot, observed, open_units, changed=bool(changes), dry_run=dry_run)
     done = [FileChange(action, str(SYSTEMD / path)) for path, action in changes.items()]
     by_hand = dry_run or prepared.pending_by_hand
     proofs = () if by_hand else proofs_of(robot, prepared, _RESTART_SECONDS)

@@ -169,7 +169,7 @@ def ended_processes(
     that starts one of them starts it alone.
     """
     origins = {process.pid: origin for process, origin in ran}
-    units_in_use = {*observed.units.values()}
+    units_in_use = observed.units
     ended = assign(nodes, [process for process, _ in ran], observed.domain, {}, origins)
     commands = Counter(process.enclave for process in ended.processes)
     return [

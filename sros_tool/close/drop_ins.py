@@ -28,7 +28,7 @@ def drop_ins_of(robot: LocalRobot, observed: ObservedProcesses) -> list[Path]:
         for path in sorted(SYSTEMD.glob(f"*.d/{DROP_IN}"))
         if read_bytes(path, "unit").startswith(drop_in_heading(robot).encode())
     ]
-    for unit in sorted({*observed.units.values()}):
+    for unit in sorted(observed.units):
         path = SYSTEMD / f"{unit}.d/{DROP_IN}"
         if path not in drop_ins and os.path.lexists(path):
             raise SrosError(
@@ -40,16 +40,21 @@ def drop_ins_of(robot: LocalRobot, observed: ObservedProcesses) -> list[Path]:
 
 
 def restart_units(
-    robot: LocalRobot, observed: ObservedProcesses, units: set[str], *, dry_run: bool
+    robot: LocalRobot,
+    observed: ObservedProcesses,
+    units: set[str],
+    *,
+    changed: bool = False,
+    dry_run: bool,
 ) -> None:
-    """Let systemd read its units again, and restart some.  Raises `SrosError`.
+    """Let systemd read its units again if some are restarted or changed.  Raises `SrosError`.
 
     Units whose processes ended by themselves are restarted only if they run.
     """
     idle = {process.unit for process in observed.processes if not process.pid}
     verbs = {"restart": units - idle, "try-restart": units & idle}
     restarts = [[verb, *sorted(names)] for verb, names in verbs.items() if names]
-    for words in [["daemon-reload"], *restarts] if units else []:
+    for words in [["daemon-reload"], *restarts] if units or changed else []:
         command = ["systemctl", *words]
         robot.shell.say(f"{'would run:' if dry_run else '+'} {shlex.join(command)}")
         try:

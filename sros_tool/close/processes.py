@@ -178,9 +178,9 @@ class ObservedProcesses(NamedTuple):
     """Enclaves that belong to other machines: those of `--elsewhere`."""
 
     @property
-    def units(self) -> dict[str, str]:
-        """The systemd units that start a process alone, by its enclave."""
-        return {process.enclave: process.unit for process in self.processes if process.unit}
+    def units(self) -> set[str]:
+        """The systemd units that start a process alone."""
+        return {process.unit for process in self.processes} - {""}
 
     def with_current_pids(self, running: RunningProcesses) -> ObservedProcesses:
         """Return a copy with the current ids and the current unknown processes."""

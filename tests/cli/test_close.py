@@ -355,7 +355,8 @@ def refuse_undo_of_others(robot: Robot) -> None:
     for words in ("--undo", "--apply"):
         assert "is not the drop-in of this folder" in robot.close(words, status=2).err
     drop_in.write_text(f"{text}Environment=MINE=1\n")
-    assert f"would replace {drop_in}" in robot.close("--apply", "--dry-run").err
+    would = robot.close("--apply", "--dry-run").err
+    assert f"would replace {drop_in}" in would and would.endswith(": systemctl daemon-reload\n")
     drop_in.write_text(text)
     assert len(robot.restarts) == 2
 
@@ -909,6 +910,9 @@ def test_a_process_with_the_name_of_another_is_not_signed(robot: Robot) -> None:
     assert both in said
     assert not (robot.folder / "robot/keystore").exists()
     assert both in robot.close("--apply", status=1).out
+    talker = ClosedProcess("/talker", 7, ("talk",), "/opt", 0, "a.service", "program")
+    accepted = ObservedProcesses(0, [talker, talker._replace(unit="b.service")])  # --partial
+    assert accepted.units == {"a.service", "b.service"}
     robot.nodes, robot.more = robot.nodes[:2], ()
     (robot.folder / "robot/policy.xml").unlink()
     robot.close()
