@@ -788,8 +788,9 @@ def new_access(
         base_fleet: The fleet file for ``base``, if it differs from ``fleet``.
 
     Returns:
-        What is ``added`` and ``removed``, whom enclaves can influence now (``reach``), and the
-        protection that is ``lost`` and ``gained``; false if nothing is added and nothing lost.
+        What is ``added`` and ``removed``, whom enclaves can influence now (``reach``), the nodes
+        that get more rights in another enclave (``new_nodes``), and the protection that is ``lost``
+        and ``gained``; false if nothing is added and nothing lost, and there are no new nodes.
         ``assumed`` and ``left_out`` state the assumptions: a policy counts as signed with access
         control of everything, and a policy as ``base`` also with the default protection.
 
