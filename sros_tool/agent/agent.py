@@ -209,16 +209,16 @@ class _Round:
         restarted: Sequence[str] = ()
         if clock is not RobotClock.BEHIND:  # nodes would not accept their certificates
             restarted = self._restart(names, opened)
-        seen = self._look_after(restarted, names)
-        self._problems += [f"{problem}." for problem in seen.problems]
-        due = enclaves_to_restart(self._state.due, seen.states, complete=seen.complete)
-        unseen = tuple(name for name in due if seen.states[name] is RunningFiles.NOT_SEEN)
+        processes = self._look_after(restarted, names)
+        self._problems += [f"{problem}." for problem in processes.problems]
+        due = enclaves_to_restart(self._state.due, processes.states, complete=processes.complete)
+        unseen = tuple(name for name in due if processes.states[name] is RunningFiles.NOT_SEEN)
         list_due = enclaves_to_restart(
-            self._state.list_due, seen.list_states, complete=seen.complete
+            self._state.list_due, processes.list_states, complete=processes.complete
         )
         self._state = replace(self._state, due=due, unseen=unseen, list_due=list_due)
         asked = self._renewals(names)
-        arrived = self._confirm(names, opened, seen, clock, asked)
+        arrived = self._confirm(names, opened, processes, clock, asked)
         problems = tuple(dict.fromkeys(self._problems))
         self._state = replace(
             self._state, fetched=now if fetched else self._state.fetched, problems=problems
@@ -501,13 +501,13 @@ class _Round:
         if not settings.restart or not self._state.due:
             return ()
         # Only processes that were seen with earlier files, or may have them.
-        seen = self._look(names)
+        processes = self._look(names)
         routers = [
             name for name in names if (enclave_path(self._folder, name) / ROUTER_FILE).exists()
         ]
         done = restart_units(
             settings,
-            enclaves_to_restart(self._state.due, seen.states, complete=seen.complete),
+            enclaves_to_restart(self._state.due, processes.states, complete=processes.complete),
             routers=routers,
             unusable={
                 name: enclave.problem
@@ -517,16 +517,18 @@ class _Round:
             systemd=machine.systemd or Systemd(settings.systemctl),
         )
         self._problems += done.problems
-        return [name for name in done.enclaves if seen.states[name] is not RunningFiles.NOT_SEEN]
+        return [
+            name for name in done.enclaves if processes.states[name] is not RunningFiles.NOT_SEEN
+        ]
 
     def _look_after(self, restarted: Sequence[str], names: Iterable[str]) -> EnclaveProcesses:
         """Examine the processes until those of restarted units have loaded their new files."""
         end = time.monotonic() + self._machine.patience
         while True:
-            seen = self._look(names)
-            starting = (seen.states.get(name) is RunningFiles.NOT_SEEN for name in restarted)
+            processes = self._look(names)
+            starting = (processes.states.get(name) is RunningFiles.NOT_SEEN for name in restarted)
             if not any(starting) or time.monotonic() > end:
-                return seen
+                return processes
             time.sleep(_LOOK_SECONDS)
 
     def _look(self, names: Iterable[str]) -> EnclaveProcesses:

@@ -248,9 +248,11 @@ def _drop_endless(state: Path) -> None:
     """Remove pipes, devices and huge files, which the client of TUF would read without end."""
     for path in (state / _FETCHED, *(state / _METADATA).rglob("*")):
         with suppress(OSError):
-            there = path.stat()
-            is_file = stat.S_ISREG(there.st_mode) and there.st_size <= OF_ONE_ROBOT.packed
-            if not (is_file or stat.S_ISDIR(there.st_mode)):
+            state_of_file = path.stat()
+            is_file = (
+                stat.S_ISREG(state_of_file.st_mode) and state_of_file.st_size <= OF_ONE_ROBOT.packed
+            )
+            if not (is_file or stat.S_ISDIR(state_of_file.st_mode)):
                 remove_file(path)
 
 

@@ -231,13 +231,13 @@ def trusts_any(folder: Path) -> bool:
 
 def _trusted(folder: Path, present: Iterable[str]) -> Iterator[x509.Certificate]:
     """Yield the permissions CAs of the enclaves; a file that cannot be read counts as missing."""
-    seen = set()
+    read_files = set()
     with Folder(folder) as opened:
         for name in present:
             with suppress(SrosError, OSError):
                 data = opened.read_inside(f"{enclave_folder(name)}/{PERMISSIONS_CA_FILE}")
-                if data not in seen:
-                    seen.add(data)
+                if data not in read_files:
+                    read_files.add(data)
                     yield from load_certificates(data, f"of {name}")
 
 

@@ -150,14 +150,14 @@ def _is_outdated(process: Process, enclave: ProcessEnclave) -> bool:
 def _state(
     processes: Iterable[Process], is_outdated: Callable[[Process, ProcessEnclave], bool]
 ) -> RunningFiles:
-    seen = False
+    is_any_current = False
     for process in processes:
         if process.enclave is None or process.enclave.problem:
             continue
         if is_outdated(process, process.enclave):
             return RunningFiles.EARLIER
-        seen = True
-    return RunningFiles.CURRENT if seen else RunningFiles.NOT_SEEN
+        is_any_current = True
+    return RunningFiles.CURRENT if is_any_current else RunningFiles.NOT_SEEN
 
 
 def enclaves_to_restart(
@@ -182,11 +182,15 @@ def robot_dds(running: RunningProcesses) -> RobotDds:
     """Return the DDS libraries that processes of this machine have loaded, or that are
     installed."""
     loaded = [library for process in running.processes for library in process.dds]
-    seen = dict.fromkeys(installed_dds(), Seen.INSTALLED)
-    seen |= dict.fromkeys((library._replace(replaced=False) for library in loaded), Seen.PROCESS)
+    place_by_library = dict.fromkeys(installed_dds(), Seen.INSTALLED)
+    place_by_library |= dict.fromkeys(
+        (library._replace(replaced=False) for library in loaded), Seen.PROCESS
+    )
     libraries = dict.fromkeys(
         RobotLibrary(library.product, library.version, plain(library.path, _LONGEST_PATH), how)
-        for library, how in sorted(seen.items(), key=lambda pair: (pair[1] != "process", pair[0]))
+        for library, how in sorted(
+            place_by_library.items(), key=lambda pair: (pair[1] != "process", pair[0])
+        )
     )
     return RobotDds(tuple(libraries), len(running.unseen) + bool(running.hidden))
 

@@ -823,9 +823,9 @@ def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         (end, robot.robot, kind) for robot in soon for kind, end in robot.expiry.items()
     )
     root = compared_fleet.status.keystore
-    left = end - compared_fleet.at
-    when = f"{end:%Y-%m-%d}" if left > timedelta(days=1) else iso(end)
-    label = "first expiry on a robot" if left > timedelta(0) else "expired on a robot since"
+    time_left = end - compared_fleet.at
+    when = f"{end:%Y-%m-%d}" if time_left > timedelta(days=1) else iso(end)
+    label = "first expiry on a robot" if time_left > timedelta(0) else "expired on a robot since"
     short_lived = [name for robot in soon for name in robot.short_lived]
     named = [*map(quote, short_lived[:_MOST_GROUPS])]
     named += ["..."] * (len(short_lived) > _MOST_GROUPS)
@@ -995,14 +995,14 @@ def _robot_names(
 
     Many neighbors in the fleet, with names that differ in a number, become "r4 to r50".
     """
-    places, left, words = _robot_positions(everybody), set(names), []
-    number = len(left)
+    places, remaining_names, words = _robot_positions(everybody), set(names), []
+    number = len(remaining_names)
     for group, members in sorted(groups.items(), key=lambda item: -len(item[1])):
-        if len(members) > _MOST_GROUPS and left.issuperset(members):
+        if len(members) > _MOST_GROUPS and remaining_names.issuperset(members):
             words.append(f"{group} (all {len(members)})")
-            left.difference_update(members)
+            remaining_names.difference_update(members)
     runs: list[list[str]] = []
-    for name in sorted(left, key=places.__getitem__):
+    for name in sorted(remaining_names, key=places.__getitem__):
         last = runs[-1][-1] if runs else ""
         is_next = runs and places[name] == places[last] + 1
         if is_next and _DIGITS.sub("", name) == _DIGITS.sub("", last):
@@ -1061,8 +1061,8 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
     foreign = Counter(
         file.robot or file.enclave for file in robot.pending if file.state == "another"
     )
-    for whose, number in foreign.items():
-        yield f"{counted(number, 'file')} of {whose}"
+    for owner, number in foreign.items():
+        yield f"{counted(number, 'file')} of {owner}"
     if revoked := sum(file.state == "revoked" for file in robot.pending):
         yield f"{counted(revoked, 'revoked file')}"
     groups: dict[tuple[str, str], Counter[str]] = {}
@@ -1132,8 +1132,8 @@ def _details(robot: RobotStatus) -> Iterator[str]:
         pending = ()
     for file in pending[:_MOST_LINES]:
         issued = f" of {file.since}" if file.since else ""
-        whose = f" of {file.robot or file.enclave}" if file.enclave else ""
-        yield f"  {file.action} {file.path}: {file.state}{issued}{whose}"
+        owner_clause = f" of {file.robot or file.enclave}" if file.enclave else ""
+        yield f"  {file.action} {file.path}: {file.state}{issued}{owner_clause}"
     if (more := len(pending) - _MOST_LINES) > 0:
         yield f"  and {more} more, see --json"
 

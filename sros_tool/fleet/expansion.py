@@ -296,12 +296,12 @@ def unobserved_robots(policy: FleetPolicy, observed: Iterable[Right]) -> dict[st
     Only paths that were observed for another robot are included; robots are in the order of the
     fleet.
     """
-    seen = _rights_by_enclave(observed)
+    observed_rights = _rights_by_enclave(observed)
     missing: dict[str, list[str]] = defaultdict(list)
-    stated_enclaves = {policy.stated(path)[0].path for path in seen if path in policy}
+    stated_enclaves = {policy.stated(path)[0].path for path in observed_rights if path in policy}
     for path in policy:
         enclave, robot = policy.stated(path)
-        if robot and enclave.path in stated_enclaves and path not in seen:
+        if robot and enclave.path in stated_enclaves and path not in observed_rights:
             missing[enclave.path].append(robot.name)
     return missing
 
@@ -313,17 +313,21 @@ def check_narrowed(policy: FleetPolicy, result: MinimizedPolicy, observed: Itera
         PolicyError: a wildcard of the policy means something else for another robot.
     """
     after = FleetPolicy(with_names_as_written(result.policy), policy.fleet)
-    seen = _rights_by_enclave(observed)
+    observed_rights = _rights_by_enclave(observed)
     replaced = {use.enclave for use in result.uses if use.wildcards}
     for path in policy:
-        if path not in seen and policy.stated(path)[0].path not in replaced:
+        if path not in observed_rights and policy.stated(path)[0].path not in replaced:
             continue
         allowed, narrowed = (policy_rights(Policy((side[path],))) for side in (policy, after))
         before, now = Rules(allowed), Rules(narrowed)
         wrong = [
             right for right in narrowed if right.qualifier is ALLOW and not before.cover(right)
         ]
-        used = (e for e in unfolded(seen.get(path, ())) if before.allow(path, e.right, e.name))
+        used = (
+            e
+            for e in unfolded(observed_rights.get(path, ()))
+            if before.allow(path, e.right, e.name)
+        )
         wrong += (right for right in used if not now.cover(right))
         if wrong:
             raise PolicyError(
@@ -363,9 +367,9 @@ def _as_stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Ite
         same = (
             same
             or [
-                each
+                general_right
                 for name in _forms_with_placeholders(right.name, robot)
-                if rules.cover(each := Right(enclave.path, ALLOW, right.right, name))
+                if rules.cover(general_right := Right(enclave.path, ALLOW, right.right, name))
             ][:1]
         )
         # A wildcard for each robot, such as /{robots}/*, stays.

@@ -166,24 +166,24 @@ class _Reader:
         for group in member:
             if problem := name_problem(group):
                 raise self._invalid_value_error(f"{at}.groups", group, problem)
-        given: dict[str, Any] = {}
+        stated_values: dict[str, Any] = {}
         origin: dict[str, str] = {}
         for group in member:
             for key, value in groups.get(group, {}).items():
                 group_key = f"groups.{group}.{key}"
-                if key in given and key not in values and given[key] != value:
+                if key in stated_values and key not in values and stated_values[key] != value:
                     raise self._error(
                         f"the robot {name} gets its {key} from two groups",
                         f"{origin[key]} and {group_key} differ.",
                         f"Write {at}.{key}.",
                     )
-                given[key], origin[key] = value, group_key
+                stated_values[key], origin[key] = value, group_key
         own_values = {key: value for key, value in values.items() if key != "groups"}
-        given = self._read_values(given, origin, name) | self._read_values(
+        stated_values = self._read_values(stated_values, origin, name) | self._read_values(
             own_values, {key: f"{at}.{self._word(key)}" for key in own_values}
         )
         usual = {"namespace": f"/{name}", "address": name, "user": "", "domain": None}
-        robot = Robot(name, groups=member, **(usual | given))
+        robot = Robot(name, groups=member, **(usual | stated_values))
         if robot.crossing and not robot.router:
             text = "Names can pass only through a router, and the robot has none."
             raise self._invalid_value_error(f"{at}.crossing", list(robot.crossing), text)
@@ -383,11 +383,11 @@ def _values_below(top: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str
 
     A leaf is any value that is not a mapping, or an empty mapping.
     """
-    left: list[tuple[tuple[str, ...], Any]] = [((), top)]
-    while left:
-        path, value = left.pop()
+    remaining: list[tuple[tuple[str, ...], Any]] = [((), top)]
+    while remaining:
+        path, value = remaining.pop()
         if isinstance(value, dict) and value:
-            left += [((*path, str(key)), inner) for key, inner in value.items()]
+            remaining += [((*path, str(key)), inner) for key, inner in value.items()]
         else:
             yield path, str(value)
 

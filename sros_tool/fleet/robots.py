@@ -429,14 +429,14 @@ def _patterns(paths: tuple[str, ...]) -> Mapping[str, list[_Pattern]]:
 
 
 def _expression(parts: Parts) -> re.Pattern[str]:
-    text, seen = "", set()
+    text, captured = "", set()
     for part in parts:
         if isinstance(part, str):
             text += re.escape(part)
-        elif part.value in seen:
+        elif part.value in captured:
             text += f"(?P={part.value})"
         else:
-            seen.add(part.value)
+            captured.add(part.value)
             text += f"(?P<{part.value}>{_VALUES[part.value]})"
     return re.compile(text, re.ASCII)
 
@@ -481,7 +481,9 @@ def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[st
     for _, foldings in read:
         for folding, robot in foldings:
             robots.setdefault(folding, set()).add(robot)
-    chosen = [max(foldings[:2], key=lambda each: len(robots[each[0]])) for _, foldings in read]
+    chosen = [
+        max(foldings[:2], key=lambda folding: len(robots[folding[0]])) for _, foldings in read
+    ]
     targets: dict[_Folding, set[_Folding]] = {}
     for (_, foldings), (folding, _) in zip(read, chosen, strict=True):
         for pair, _ in foldings[2:]:

@@ -330,7 +330,7 @@ def left_enclave_notes(root: Path, before: Fleet, after: Fleet) -> Iterator[Note
 
     No two robots of ``after`` have an enclave in common, as `write_fleet` makes sure.
     """
-    left: dict[str, set[str]] = {}
+    left_enclaves: dict[str, set[str]] = {}
     for robot in before.robots.values():
         same_robot = after.robots.get(robot.name)
         kept = set(enclaves_of(after, same_robot) if same_robot else ())
@@ -341,10 +341,12 @@ def left_enclave_notes(root: Path, before: Fleet, after: Fleet) -> Iterator[Note
                 yield _lost_router_note(root, robot.name, router)
         names = (name for name in enclaves_of(before, robot) if name not in kept)
         if left_names := {name for name in names if has_enclave(root, name)}:
-            left[robot.name] = left_names
+            left_enclaves[robot.name] = left_names
     # Also what an earlier change of the fleet left.
-    earlier = unrecorded_enclaves(before, enclave_names(root), left) if left else {}
-    for name, enclaves in left.items():
+    earlier = (
+        unrecorded_enclaves(before, enclave_names(root), left_enclaves) if left_enclaves else {}
+    )
+    for name, enclaves in left_enclaves.items():
         enclaves.update(enclave for enclave in earlier[name].below if not robot_of(after, enclave))
         why = "has other enclave paths now" if name in after.robots else "is no longer in the fleet"
         stay = "stays" if len(enclaves) == 1 else "stay"

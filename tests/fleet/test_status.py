@@ -264,6 +264,23 @@ def test_what_a_robot_says_is_neither_an_error_nor_a_word_of_sros(field: Field) 
     assert "it reports: Publish with --rest" in field.run("fleet", "status", "ks", status=1).out
 
 
+def test_a_web_server_cannot_keep_the_keystore_busy_with_archives(field: Field) -> None:
+    field.run("fleet", "publish", "ks", "pub")
+    path = field.folder / "pub/metadata/timestamp.json"
+    value = json.loads(path.read_text())
+    value["signed"]["version"] += 1  # nobody signed it
+    path.write_text(json.dumps(value))
+    folder = field.folder / "pub/targets/robots"
+    archive = next(folder.iterdir())
+    for number in range(650 - 3):
+        (folder / f"{number:064}.r1.tar.gz").hardlink_to(archive)
+    field.run("renew", "ks", "/r1/base")
+    (folder / f"{'f' * 64}.r1.tar.gz").hardlink_to(archive)
+    refused = field.run("renew", "ks", "/r1/base", status=2).err
+    assert "pub/targets/robots' has more than 650 archives" in refused
+    assert len(refused.splitlines()) == 1
+
+
 def test_a_clock_that_is_behind_the_confirmations(field: Field) -> None:
     """No robot would ever be offline, and nobody knows whether a list is in force."""
     field.run("revoke", "ks", "--robot", "r3")

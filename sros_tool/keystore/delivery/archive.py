@@ -117,16 +117,16 @@ def _unzip(data: bytes, limits: ArchiveLimits) -> bytes:
 
 
 def _members(tar: tarfile.TarFile, maximum: int) -> Iterator[tuple[str, bytes]]:
-    seen: set[str] = set()
+    member_names: set[str] = set()
     for entry in tar:
         name = entry.name
-        if name in seen or len(seen) >= maximum:
+        if name in member_names or len(member_names) >= maximum:
             raise DocumentError(
                 f"it contains {name!r} twice"
-                if name in seen
+                if name in member_names
                 else f"it contains more than {maximum} entries"
             )
-        seen.add(name)
+        member_names.add(name)
         if entry.isdir():
             continue
         if entry.type not in (tarfile.REGTYPE, tarfile.AREGTYPE) or entry.issparse():

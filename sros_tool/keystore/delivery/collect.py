@@ -424,12 +424,12 @@ def _older_message_notes(inbox: Path, messages: Iterable[_ReceivedMessage]) -> I
     """Yield a note on messages that are older than the last ones of their robots."""
     robots = [message.robot.name for message in messages if message.outcome == "older"]
     if robots:
-        what = "an older message" if len(robots) == 1 else "older messages"
+        messages_text = "an older message" if len(robots) == 1 else "older messages"
         lies = "lies" if len(robots) == 1 else "lie"
         yield Note(
             "fleet.older-message",
-            f"{what} of {first_few(robots, _SHOWN)} {lies} in '{inbox}', from before the last one "
-            "came, and changes nothing: delete it there.",
+            f"{messages_text} of {first_few(robots, _SHOWN)} {lies} in '{inbox}', from before the "
+            "last one came, and changes nothing: delete it there.",
         )
 
 
@@ -569,12 +569,12 @@ class _Verifier:
             )
         owner = robot_of(self._fleet, issued.enclave)
         if owner != robot:
-            whose = f"an enclave of {owner.name}" if owner else "which belongs to no robot"
-            raise _RefusedError(f"it is signed by {issued.enclave}, {whose}")
+            owner_clause = f"an enclave of {owner.name}" if owner else "which belongs to no robot"
+            raise _RefusedError(f"it is signed by {issued.enclave}, {owner_clause}")
         if self._now > validity.not_after and not self._has_key_of(issued.enclave, signer):
-            late = elapsed(self._now - validity.not_after)
+            age = elapsed(self._now - validity.not_after)
             raise _RefusedError(
-                f"its certificate expired {late} ago, and {issued.enclave} has another key now"
+                f"its certificate expired {age} ago, and {issued.enclave} has another key now"
             )
         return issued.enclave
 
@@ -613,8 +613,8 @@ class _Verifier:
     def _expiry_clauses(self, certificate: x509.Certificate) -> Iterator[str]:
         validity = validity_of(certificate)
         if self._now > validity.not_after:
-            late = elapsed(self._now - validity.not_after)
-            yield f"its certificate expired {late} ago, at {iso(validity.not_after)}"
+            age = elapsed(self._now - validity.not_after)
+            yield f"its certificate expired {age} ago, at {iso(validity.not_after)}"
         elif self._now < validity.not_before:
             yield f"its certificate is valid only from {iso(validity.not_before)}"
 
@@ -689,8 +689,8 @@ class _Renewals:
         name, keystore = request.name, self._keystore
         owner = robot_of(self._fleet, name)
         if owner != robot:
-            whose = f"an enclave of {owner.name}" if owner else "not an enclave of a robot"
-            raise _RefusedError(f"{name} is {whose}")
+            owner_clause = f"an enclave of {owner.name}" if owner else "not an enclave of a robot"
+            raise _RefusedError(f"{name} is {owner_clause}")
         if not keystore.has_enclave(name):
             raise _RefusedError("the keystore does not have this enclave, or it was revoked")
         present = keystore.certificate_of(name)
@@ -747,13 +747,13 @@ class _Renewals:
 
     def _check_grace(self, robot: Robot, validity: Window) -> None:
         """Raise `_Refused` if a certificate expired longer ago than the fleet file accepts."""
-        late = self._now - validity.not_after
-        if late.total_seconds() <= 0:
+        overdue = self._now - validity.not_after
+        if overdue.total_seconds() <= 0:
             return
-        if not robot.renewal_grace or late > parse_duration(robot.renewal_grace):
+        if not robot.renewal_grace or overdue > parse_duration(robot.renewal_grace):
             grace = robot.renewal_grace or "none"
             raise _RefusedError(
-                f"its certificate expired {elapsed(late)} ago (renewal_grace of {robot.name}: "
+                f"its certificate expired {elapsed(overdue)} ago (renewal_grace of {robot.name}: "
                 f"{grace})"
             )
 

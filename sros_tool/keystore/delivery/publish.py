@@ -1000,13 +1000,13 @@ class _Run:
         assert self._composed
         with Folder(self._folder) as folder:
             roots = [file for file in self.roots.files() if not folder.state(file[0])]
-            late = [] if self._present.follows(self.roots.last) else roots
+            roots_after_timestamp = [] if self._present.follows(self.roots.last) else roots
             *files, timestamp = self._composed.files
-            for path, data in (*([] if late else roots), *files):
+            for path, data in (*([] if roots_after_timestamp else roots), *files):
                 _put_file(folder, path, data)
             folder.flush_file_system()
             _put_file(folder, *timestamp)
-            for path, data in late:
+            for path, data in roots_after_timestamp:
                 _put_file(folder, path, data)
             folder.flush_file_system()
             for path, superseded_at in self.list.superseded.items():

@@ -12,10 +12,11 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sros_tool.errors import DocumentError, SrosError
+from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT
 from sros_tool.keystore.delivery.release import read_release, release_target
 from sros_tool.keystore.layout import CRL_FILE, IDENTITY, PUBLISHED
@@ -28,6 +29,9 @@ from sros_tool.xml import read_bytes
 _FORMAT = 1
 _MOST_BYTES = 128 * 1024 * 1024
 _SMALL = 64 * 1024
+_ARCHIVES_OF_FLEET, _ARCHIVES_OF_ROBOT = 500, 50
+"""How many archives a publishing folder can have for all robots, and further ones for each robot
+that the keystore knows: it keeps replaced ones for two days."""
 MOST_NUMBER = 10**12 - 1
 """Highest number of a release, as a seal can state it, and highest version of metadata."""
 BEGIN_AGAIN = "Start again as after a theft of all keys: docs/fetching.md says how."
@@ -141,8 +145,8 @@ def read_published(keystore: OpenedKeystore) -> Published:
     if not keystore.has(PUBLISHED):
         return Published()
     try:
-        path, what = keystore.root / PUBLISHED, "list of what is published"
-        value = parse_json(read_bytes(path, what, max_bytes=_MOST_BYTES))
+        path = keystore.root / PUBLISHED
+        value = parse_json(read_bytes(path, "list of what is published", max_bytes=_MOST_BYTES))
         return Published(
             {name: _robot(robot_value) for name, robot_value in value["robots"].items()},
             {name: check_count(version) for name, version in value["versions"].items()},
@@ -175,17 +179,32 @@ def may_have_later_releases(keystore: OpenedKeystore) -> bool:
 
 
 def later_revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
-    """Return the serials that the keystore's lists in a folder with later releases revoke."""
+    """Return the serials that the keystore's lists in a folder with later releases revoke.
+
+    Raises:
+        KeystoreError: the folder has more archives than the fleet can need: whoever has the web
+            server could else keep the keystore busy for ever.
+    """
     serials: set[int] = set()
-    seen: set[bytes] = set()
+    read_lists: set[bytes] = set()
     if may_have_later_releases(keystore):
-        authorities = keystore.authority(IDENTITY)
-        for path in Path(read_published(keystore).folder).glob("targets/robots/*.tar.gz"):
+        authorities, published = keystore.authority(IDENTITY), read_published(keystore)
+        most = _ARCHIVES_OF_FLEET + _ARCHIVES_OF_ROBOT * len(published.robots)
+        folder = Path(published.folder) / "targets/robots"
+        archives = [*islice(folder.glob("*.tar.gz"), most + 1)]
+        if len(archives) > most:
+            raise KeystoreError(
+                f"'{folder}' has more than {most} archives",
+                "The keystore did not publish so many. It has to read them, because the metadata "
+                "there is later than what it published last.",
+                "Find out who else can write there, and remove what is not from a keystore.",
+            )
+        for path in archives:
             with suppress(SrosError, OSError):
                 release = read_release(read_bytes(path, "archive", max_bytes=OF_ONE_ROBOT.packed))
                 lists = {data for file, data in release.files.items() if file.endswith(CRL_FILE)}
-                for data in lists - seen:
-                    seen.add(data)
+                for data in lists - read_lists:
+                    read_lists.add(data)
                     crl = load_crl(data, f"'{path}'")
                     if any(signed_by(crl.list, authority) for authority in authorities):
                         serials.update(entry.serial for entry in crl.revoked)
