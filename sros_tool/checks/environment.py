@@ -25,13 +25,11 @@ from sros_tool.keystore.layout import (
     IDENTITY,
     PERMISSIONS,
     ca_key,
-    enclave_path,
     is_keystore,
     refuse_earlier,
     search_enclaves,
 )
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.pki import smime
 from sros_tool.runtime.environment import (
     NO_CONFIGURATION,
     OVERRIDE,
@@ -239,7 +237,7 @@ def variable_findings(
             missing, remedy = f"is not read. {error.why}".rstrip("."), error.remedy
         yield KEYSTORE_NOT_FOUND.found(KEYSTORE, f"'{root}' {missing}", remedy=remedy)
         return
-    yield from _enclave_findings(environment, root, domain, now=now, zone=zone)
+    yield from _enclave_findings(environment, OpenedKeystore(root), domain, now=now, zone=zone)
 
 
 def set_without_enable(environment: Mapping[str, str]) -> list[str]:
@@ -271,14 +269,15 @@ def _spelling_findings(environment: Mapping[str, str]) -> Iterator[Finding]:
 
 def _enclave_findings(
     environment: Mapping[str, str],
-    root: Path,
+    keystore: OpenedKeystore,
     domain: int | None,
     *,
     now: datetime,
     zone: tzinfo,
 ) -> Iterator[Finding]:
+    root = keystore.root
     names, wanted = set(search_enclaves(root)[0]), environment.get(ENCLAVE, "")
-    governed = _governed_domains(root)
+    governed = _governed_domains(keystore)
     if governed and domain is not None and domain not in governed:
         text = f"the governance of '{root}' is for domain {governed}, not for {domain}"
         yield DOMAIN_NOT_GOVERNED.found(DOMAIN, text)
@@ -293,14 +292,13 @@ def _enclave_findings(
         yield kind.found(ENCLAVE, f"'{root}' has no enclave /")
         return
     name = wanted or "/"
-    if name not in names and not enclave_path(root, name).is_dir():
+    if name not in names and not keystore.folder(name).is_dir():
         close = difflib.get_close_matches(name, names, n=1)
         hint = f"; it has {close[0]}" if close else ""
         enforced = environment.get(STRATEGY) == "Enforce"
         effect = "" if enforced else f"; nodes RUN UNSECURED, as {STRATEGY} is not 'Enforce'"
         yield ENCLAVE_NOT_FOUND.found(ENCLAVE, f"'{root}' has no enclave {name}{hint}{effect}")
         return
-    keystore = OpenedKeystore(root)
     sourced = environment.get(ROS_DISTRO, "")
     stated: tuple[str, ...] = ()
     with suppress(SrosError):  # what cannot be read is a finding of the keystore
@@ -316,10 +314,11 @@ def _enclave_findings(
             yield finding
 
 
-def _governed_domains(root: Path) -> DomainSet | None:
+def _governed_domains(keystore: OpenedKeystore) -> DomainSet | None:
     """Return the ROS domains of a keystore's governance, or None if it cannot be read."""
     try:
-        signed = smime.parse(read_bytes(root / GOVERNANCE_P7S, "governance document"))
+        message = keystore.read(GOVERNANCE_P7S, "governance document")
+        signed = keystore.files.signed(message)
         return parse_governance(signed.document).domains().closed()
     except SrosError:  # reported for the enclave, which has its own copy in an export
         return None

@@ -431,7 +431,7 @@ class LedgerFile:
 
         if index := self._opened().ledger_index:
             return IndexUpdate(self.root, index)
-        with _open(self.root, self._follow_link) or io.BytesIO() as file:
+        with self._open() or io.BytesIO() as file:
             made, is_sound = self._new_index(file, self._opened().head)
             return made if is_sound else None
 
@@ -443,7 +443,7 @@ class LedgerFile:
         """
         files = self._opened()
         if files.later:
-            raise _later_part_error(self.root, files.later)
+            raise self._later_part_error(files.later)
         return files.part, files.state.st_size if files.state else 0
 
     def clock_behind(self, now: datetime) -> str:
@@ -466,7 +466,7 @@ class LedgerFile:
         if self._files and self._files.lines is not None:
             yield self._files.lines
             return
-        with _open(self.root, self._follow_link) or io.BytesIO() as file:
+        with self._open() or io.BytesIO() as file:
             yield from iter(lambda: file.read(_BLOCK), b"")
 
     def _reading(self, needed_text: bytes, terms: _Terms | None = None) -> _Reading:
@@ -520,16 +520,16 @@ class LedgerFile:
     def _read_once(self) -> _Files:
         head = self._read_head(self._read_first)
         self._read_first = read_bytes
-        file = _open(self.root, self._follow_link)
+        file = self._open()
         if file is None:
-            return _Files(head, None, b"", later=_later_than(self.root, 0))
+            return _Files(head, None, b"", later=self._later_than(0))
         with file:
             state = os.fstat(file.fileno())
             before = _sealed_before(file)
             part = before.number + 1 if before else 1
             start = max(0, state.st_size - _END_BYTES)
             last = tuple(os.pread(file.fileno(), _END_BYTES, start).split(b"\n"))[bool(start) :]
-            later = _later_than(self.root, part, state)
+            later = self._later_than(part, state)
             if head and (index := self._index(file, head)):
                 return _Files(head, state, None, index, part, later, last)
             kept = state.st_size <= _MOST_KEPT and not before
@@ -574,7 +574,7 @@ class LedgerFile:
         index, head = files.ledger_index, files.head
         terms = dict.fromkeys([*terms, ("what", "ca"), ("what", GAP)])
         postings = merged_postings(index.postings(*term) for term in terms)
-        with _open(self.root, self._follow_link) or io.BytesIO() as file:
+        with self._open() or io.BytesIO() as file:
             for posting in postings:
                 if posting.digest not in self._entries:
                     self._entries[posting.digest] = _entry_at(posting, index, file)
@@ -616,7 +616,7 @@ class LedgerFile:
                 files.lines, needed_text, stated, _MOST_LINES, _MOST_BYTES
             )
         else:
-            with _open(self.root, self._follow_link) or io.BytesIO() as file:
+            with self._open() or io.BytesIO() as file:
                 lines = self._every_line(file)
                 read = _read_lines(lines, needed_text, stated, _MOST_LINES, _MOST_BYTES)
         if read is None:
@@ -639,7 +639,7 @@ class LedgerFile:
             with self._part(parts[-1]) as file:
                 before = _sealed_before(file)
             if before is None or before.number != parts[-1].number - 1:
-                raise _not_as_sealed_error(self.root, parts[-1])
+                raise self._not_as_sealed_error(parts[-1])
             parts.append(before)
         for part in reversed(parts):
             digest = hashlib.sha256()
@@ -648,14 +648,14 @@ class LedgerFile:
                     digest.update(line)
                     yield line
             if digest.hexdigest() != part.sha256:
-                raise _not_as_sealed_error(self.root, part)
+                raise self._not_as_sealed_error(part)
             after_part(ledger_part(part.number))
         yield from _lines_in(last_part)
 
     def _part(self, sealed: Entry) -> BinaryIO:
         """Return a sealed part, open for reading."""
         name = ledger_part(sealed.number)
-        if file := _open(self.root, self._follow_link, name):
+        if file := self._open(name):
             return file
         raise KeystoreError(
             f"{name}, a sealed part of the ledger of '{self.root}', is missing",
@@ -691,7 +691,7 @@ class LedgerFile:
 
     def _compared_with_head(self, files: _Files, read: _Lines) -> _Reading:
         if not read.lines:
-            return _without_lines(self.root, file_exists=files.state is not None)
+            return self._without_lines(file_exists=files.state is not None)
         entries, numbers, faults = read.entries, read.numbers, [*read.faults]
         if fault := _head_fault(files.head, read.lines, read.signed, is_chained=read.chained):
             faults.append(fault)
@@ -715,6 +715,80 @@ class LedgerFile:
         sound = not (faults or read.unchained)
         return _Reading(ledger, unrecorded, read.previous, read.ended, sound)
 
+    def _open(self, name: str = LEDGER) -> BinaryIO | None:
+        """Return the ledger file, or its part ``name``, open for reading; None if there is none.
+
+        While a transaction is being committed, the file is a link.  The process that has locked the
+        keystore does not follow it: the link could lead to a file outside the keystore.
+        """
+        path = self.root / name
+        try:
+            if self._follow_link:
+                return _checked_file(open_at_once(path))
+            from sros_tool.folders import Folder  # a question does not load what writes
+
+            with Folder(self.root) as folder:
+                target = folder.link_target(name) or ""
+                file = target if SEALED_LEDGER.fullmatch(target) else name
+                return _checked_file(folder.open(file))
+        except FileNotFoundError:
+            return None
+        except (OSError, SrosError) as error:
+            if isinstance(error, OSError) and error.errno == errno.EFBIG:
+                raise _too_large_error(path) from error
+            raise KeystoreError(
+                f"the ledger '{path}' cannot be read",
+                f"{error.strerror}."
+                if isinstance(error, OSError)
+                else error.why or f"{error.what}.",
+                "Restore it from a backup.",
+            ) from error
+
+    def _without_lines(self, *, file_exists: bool) -> _Reading:
+        """Return the reading of a ledger file that is missing or has no line.
+
+        It is a fault unless the keystore never had a ledger, as a keystore of ros2/sros2.
+        """
+        had_ledger = any((self.root / file).exists() for file in (SETTINGS, LEDGER_HEAD))
+        if not file_exists and not had_ledger:
+            return _Reading(Ledger())
+        missing = _Fault(0, f"{LEDGER} is empty" if file_exists else f"there is no {LEDGER}")
+        return _Reading(Ledger(gaps=(missing.text,)), [missing])
+
+    def _later_than(self, part: int, last: os.stat_result | None = None) -> str:
+        """Return the name of a part of the ledger after the part ``last``; "" if there is none.
+
+        ``part`` is the number of the last part, which may have another name, or be a copy of its
+        file.
+        """
+        if not self.root.exists():
+            return ""
+        for name in sorted(filter(SEALED_LEDGER.fullmatch, os.listdir(self.root)), reverse=True):
+            number = int(name.split(".")[1])
+            with suppress(OSError):  # a link of a transaction that is not committed yet
+                state = (self.root / name).stat()
+                is_last = last and os.path.samestat(state, last)
+                is_longer = number == part and last and state.st_size > last.st_size
+                if (number > part and not is_last) or is_longer:
+                    return name
+        return ""
+
+    def _later_part_error(self, name: str) -> KeystoreError:
+        return KeystoreError(
+            f"'{self.root / name}' is a later part of the ledger than {LEDGER}",
+            "An earlier ledger was put back, which lacks what the keystore issued and revoked "
+            "since.",
+            f"Restore {LEDGER}, its parts and {LEDGER_HEAD} from the latest backup; or, if they "
+            "are lost, move the later parts to an archive.",
+        )
+
+    def _not_as_sealed_error(self, sealed: Entry) -> KeystoreError:
+        return KeystoreError(
+            f"{ledger_part(sealed.number)} is not the sealed part of the ledger of '{self.root}'",
+            "It was changed, cut off or exchanged.",
+            "Copy the sealed part back from your archive.",
+        )
+
 
 def _lines_in(file: BinaryIO) -> Iterator[bytes]:
     return iter(lambda: file.readline(_LONGEST_LINE), b"")
@@ -726,41 +800,6 @@ def _sealed_before(file: BinaryIO) -> Entry | None:
     file.seek(0)
     entry = _parse(line.removesuffix(b"\n")) if b'"what":"sealed"' in line else None
     return entry if entry and entry.what == SEALED else None
-
-
-def _not_as_sealed_error(root: Path, sealed: Entry) -> KeystoreError:
-    return KeystoreError(
-        f"{ledger_part(sealed.number)} is not the sealed part of the ledger of '{root}'",
-        "It was changed, cut off or exchanged.",
-        "Copy the sealed part back from your archive.",
-    )
-
-
-def _later_than(root: Path, part: int, last: os.stat_result | None = None) -> str:
-    """Return the name of a part of the ledger after the part ``last``; "" if there is none.
-
-    ``part`` is the number of the last part, which may have another name, or be a copy of its file.
-    """
-    if not root.exists():
-        return ""
-    for name in sorted(filter(SEALED_LEDGER.fullmatch, os.listdir(root)), reverse=True):
-        number = int(name.split(".")[1])
-        with suppress(OSError):  # a link of a transaction that is not committed yet
-            state = (root / name).stat()
-            is_last = last and os.path.samestat(state, last)
-            is_longer = number == part and last and state.st_size > last.st_size
-            if (number > part and not is_last) or is_longer:
-                return name
-    return ""
-
-
-def _later_part_error(root: Path, name: str) -> KeystoreError:
-    return KeystoreError(
-        f"'{root / name}' is a later part of the ledger than {LEDGER}",
-        "An earlier ledger was put back, which lacks what the keystore issued and revoked since.",
-        f"Restore {LEDGER}, its parts and {LEDGER_HEAD} from the latest backup; or, if they are "
-        "lost, move the later parts to an archive.",
-    )
 
 
 def _entry_at(posting: Posting, index: LedgerIndex, last_part: BinaryIO) -> Entry:
@@ -883,49 +922,11 @@ def _read_remembered_lines(
     return _read_lines(_lines_in(io.BytesIO(data)), needed_text, stated, maximum, most_bytes)
 
 
-def _without_lines(root: Path, *, file_exists: bool) -> _Reading:
-    """Return the reading of a ledger file that is missing or has no line.
-
-    It is a fault unless the keystore never had a ledger, as a keystore of ros2/sros2.
-    """
-    if not file_exists and not any((root / file).exists() for file in (SETTINGS, LEDGER_HEAD)):
-        return _Reading(Ledger())
-    missing = _Fault(0, f"{LEDGER} is empty" if file_exists else f"there is no {LEDGER}")
-    return _Reading(Ledger(gaps=(missing.text,)), [missing])
-
-
 def _not_entries_fault(last: int, count: int) -> _Fault:
     """Return the fault of ``count`` lines up to the line ``last``."""
     if count == 1:
         return _Fault(last, f"line {last} is not an entry")
     return _Fault(last, f"lines {last - count + 1} to {last} are not entries")
-
-
-def _open(root: Path, follow_link: bool, name: str = LEDGER) -> BinaryIO | None:
-    """Return the ledger file, or its part ``name``, open for reading; None if there is none.
-
-    While a transaction is being committed, the file is a link.  The process that has locked the
-    keystore does not follow it: the link could lead to a file outside the keystore.
-    """
-    path = root / name
-    try:
-        if follow_link:
-            return _checked_file(open_at_once(path))
-        from sros_tool.folders import Folder  # a question does not load what writes
-
-        with Folder(root) as folder:
-            target = folder.link_target(name) or ""
-            return _checked_file(folder.open(target if SEALED_LEDGER.fullmatch(target) else name))
-    except FileNotFoundError:
-        return None
-    except (OSError, SrosError) as error:
-        if isinstance(error, OSError) and error.errno == errno.EFBIG:
-            raise _too_large_error(path) from error
-        raise KeystoreError(
-            f"the ledger '{path}' cannot be read",
-            f"{error.strerror}." if isinstance(error, OSError) else error.why or f"{error.what}.",
-            "Restore it from a backup.",
-        ) from error
 
 
 def _checked_file(file: BinaryIO) -> BinaryIO:
