@@ -20,6 +20,7 @@ from lxml import etree
 
 from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.folders import Folder
+from sros_tool.names import has_parts
 from sros_tool.policy.document import FALLBACKS, INCLUDES, MissingFileError, is_policy, read_policy
 from sros_tool.policy.model import RIGHTS, Source
 from sros_tool.proof.repository import FILES, FOLDER, LINK, Repository, TreeEntry, walk
@@ -364,27 +365,36 @@ _CONVERTING = ("working-tree-encoding", "ident", "export-subst")
 """Attributes by which git puts other content than that of the commit into a checkout or archive."""
 
 
-def converting_attribute(content: bytes, path: str) -> str:
-    """Return an attribute in a file of git attributes that may convert a file, or "".
+_MOST_PATTERNS = 100
 
-    ``path`` is relative to the folder of the attributes.  Characters that gitattributes(5) reads in
-    a special way stand for any text here, and later lines that unset an attribute do not count.
+
+def converting_patterns(content: bytes) -> dict[str, str]:
+    """Map patterns in a file of git attributes to an attribute that converts matching files.
+
+    Lines that unset an attribute do not count.
     """
+    patterns: dict[str, str] = {}
     for line in content.removeprefix(codecs.BOM_UTF8).split(b"\n"):
         pattern, *attributes = map(os.fsdecode, line.split() or [b""])
         named = {attribute.partition("=")[0] for attribute in attributes}
         converting = next((attribute for attribute in _CONVERTING if attribute in named), "")
-        if converting and _may_match(pattern, path):
-            return converting
-    return ""
+        if converting and not pattern.startswith("#"):
+            patterns[pattern] = converting
+        if len(patterns) > _MOST_PATTERNS:
+            return {"*": converting}
+    return patterns
 
 
-def _may_match(pattern: str, path: str) -> bool:
-    if pattern.startswith(("#", '"')):
-        return pattern.startswith('"')  # can have spaces and any escape
-    parts = re.split(r"[*?]+|[\[\\].*", pattern.removeprefix("/"))
-    wanted = path if "/" in pattern else PurePosixPath(path).name
-    return bool(re.fullmatch(".*".join(map(re.escape, parts)), wanted, re.IGNORECASE | re.DOTALL))
+def may_match(pattern: str, path: str) -> bool:
+    """Return whether a pattern of gitattributes(5) may match a path relative to its file's folder.
+
+    Characters that git reads in a special way stand for any text.
+    """
+    if pattern.startswith('"'):
+        return True  # can have spaces and any escape
+    wanted = (path if "/" in pattern else PurePosixPath(path).name).lower()
+    parts = re.split(r"[*?]+/?|[\[\\].*", pattern.removeprefix("/").lower(), flags=re.DOTALL)
+    return has_parts(wanted, parts) if len(parts) > 1 else wanted == parts[0]
 
 
 # ── policies, and their parts ──────────────────────────────────────────────────────────────

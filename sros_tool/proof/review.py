@@ -47,10 +47,11 @@ from sros_tool.policy.rights import (
 from sros_tool.proof.commit_files import (
     ATTRIBUTES_FILE,
     CommitFiles,
-    converting_attribute,
+    converting_patterns,
     includes_files,
     is_whole_policy,
     may_be_policy,
+    may_match,
     same_root,
     used_whole,
     users_of,
@@ -514,11 +515,14 @@ class _Review:
             entry = self.head.entry(path)
             if entry is None or entry.mode not in FILES:
                 continue
-            content = self.request.repository.content(entry.id)
-            for file in sorted(self.head.files):
-                if Path(file).is_relative_to(folder) and (
-                    attribute := converting_attribute(content, str(Path(file).relative_to(folder)))
-                ):
+            patterns = converting_patterns(self.request.repository.content(entry.id))
+            below = sorted(file for file in self.head.files if Path(file).is_relative_to(folder))
+            for file in below if patterns else ():
+                relative = str(Path(file).relative_to(folder))
+                matching = (
+                    used for pattern, used in patterns.items() if may_match(pattern, relative)
+                )
+                if attribute := next(matching, ""):
                     text = f"can be another file in a checkout or archive, by {attribute} in {path}"
                     lines.append((text, file))
         return (_FOUND, Facts(tuple(lines))) if lines else None

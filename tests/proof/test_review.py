@@ -516,6 +516,7 @@ sub/robot.xml ident
         b"*.xml working-tree-encoding=ASCII//TRANSLIT",
         b"\xef\xbb\xbfrobot.xml\tident",
         b"/r*.XML text=\x85 export-subst",
+        b"**/robot.xml ident",
         b"rob[o]t.xml ident",
         b"ro\\bot.xml ident",
         b'"robot.xml" ident',
