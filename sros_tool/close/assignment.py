@@ -47,63 +47,58 @@ def assign(
     Cyclone DDS to the process ids that they state; ``origins`` has what started each process, and
     None is for processes that run now.
     """
-    unclaimed = {
-        process.pid: process
-        for process in running
+    by_pid = {process.pid: process for process in running}  # the last program that it ran
+    near = [
+        process
+        for process in by_pid.values()
         if is_in_domain(process, domain) and not process.is_daemon
-    }
+    ]
     if origins is None:
-        origins = {pid: process_origin(pid) for pid in unclaimed}
-    programs = {process.program[0]: origins[pid].unit for pid, process in unclaimed.items()}
-    units = Counter(programs.values())
-    assigned: list[ClosedProcess] = []
-
-    def assign_enclave(process: Process, enclave: str, known_by: str) -> None:
-        origin = origins[process.pid]
-        del unclaimed[process.pid]
-        unit = origin.unit if units[origin.unit] == 1 else ""
-        assigned.append(
-            ClosedProcess.from_process(process, enclave, origin._replace(unit=unit), known_by)
-        )
-
-    for router in [process for process in unclaimed.values() if process.is_router]:
-        assign_enclave(router, ROUTER, "program")
+        origins = {process.pid: process_origin(process.pid) for process in near}
     by_enclave: dict[str, list[ObservedNode]] = {}
     for node in nodes:
         by_enclave.setdefault(node.enclaves[0], []).append(node)
+    claims = [(process, ROUTER, "program") for process in near if process.is_router]
     for known_by, shows_node in _KNOWN_BY.items():
-        unassigned = sorted(by_enclave.keys() - {process.enclave for process in assigned})
+        unassigned = sorted(by_enclave.keys() - {enclave for _, enclave, _ in claims})
         if known_by == "elimination" and len(unassigned) > 1:
             continue
         for enclave in unassigned:
-            nodes_of_enclave = by_enclave[enclave]
+            claimed = {process.pid for process, _, _ in claims}
+            enclave_nodes = by_enclave[enclave]
             processes = [
                 process
-                for process in unclaimed.values()
-                if any(shows_node(process, node, process_ids or {}) for node in nodes_of_enclave)
+                for process in near
+                if process.pid not in claimed
+                and any(
+                    shows_node(process, node, process_ids or {}) for node in by_enclave[enclave]
+                )
             ]
-            if len(processes) <= len({node.participant for node in nodes_of_enclave}):
-                for process in processes:
-                    assign_enclave(process, enclave, known_by)
-    enclaves_of_program: dict[int, set[str]] = {}
+            if len(processes) <= len({node.participant for node in by_enclave[enclave]}):
+                claims += [(process, enclave, known_by) for process in processes]
+    units = Counter({process.program[0]: origins[process.pid].unit for process in near}.values())
+    assigned = []
+    for process, enclave, known_by in claims:
+        origin = origins[process.pid]
+        alone = origin if units[origin.unit] == 1 else origin._replace(unit="")
+        assigned.append(ClosedProcess.from_process(process, enclave, alone, known_by))
+    enclaves: dict[int, set[str]] = {}
     for closed in assigned:
-        enclaves_of_program.setdefault(closed.pid, set()).add(closed.enclave)
+        enclaves.setdefault(closed.pid, set()).add(closed.enclave)
+    claimed = {process.pid for process, _, _ in claims}
+    unknown = [process for process in near if process.pid not in {*claimed, *enclaves}]
+    counts = Counter(closed.enclave for closed in assigned)
     return ObservedProcesses(
         domain,
         sorted(
-            closed._replace(shares=sorted(enclaves_of_program[closed.pid] - {closed.enclave}))
+            closed._replace(shares=sorted(enclaves[closed.pid] - {closed.enclave}))
             for closed in assigned
         ),
-        [
-            process_text(process)
-            for process in unclaimed.values()
-            if process.pid not in enclaves_of_program
-        ],
+        [process_text(process) for process in unknown],
         sorted(
             enclave
-            for enclave, nodes_of_enclave in by_enclave.items()
-            if len({_process_prefix(node) for node in nodes_of_enclave})
-            > sum(process.enclave == enclave for process in assigned)
+            for enclave, observed_nodes in by_enclave.items()
+            if len({_process_prefix(node) for node in observed_nodes}) > counts[enclave]
         ),
     )
 

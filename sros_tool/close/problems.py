@@ -8,7 +8,7 @@ import stat
 from collections.abc import Iterator
 
 from sros_tool.close.export import enclaves_without_origin
-from sros_tool.close.processes import ROUTER, ClosedProcess, run_words
+from sros_tool.close.processes import ROUTER, ClosedProcess, ObservedProcesses, run_words
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot
 from sros_tool.close.state import CloseState
 from sros_tool.keystore.layout import enclave_path, list_enclaves
@@ -21,10 +21,23 @@ from sros_tool.wording import counted, enumerated, first_few
 
 def problems_of(robot: LocalRobot, state: CloseState, *, partial: bool) -> Iterator[str]:
     """Yield what keeps the robot from running closed, with what to do."""
-    policy, observed = read_policy(robot.policy), state.observed
-    not_here = robot.not_here
+    yield from _keystore_problems(robot)
+    for name in sorted(robot.not_here & state.secured.keys()):
+        yield f"{name} belongs to another machine, and a process runs in it here: stop it"
+    for name in enclaves_without_origin(robot):
+        remove = f"rm -r {shlex.quote(str(enclave_path(robot.export, name)))}"
+        yield f"the export has {name}, which the keystore neither has nor revoked: {remove}"
+    yield from _user_problems(robot, state.observed)
+    yield from _launch_problems(robot, state.observed)
+    if not partial:
+        yield from _unknown_process_problems(robot, state)
+
+
+def _keystore_problems(robot: LocalRobot) -> Iterator[str]:
+    """Yield the enclaves of the keystore that the policy does not have."""
+    known = {OBSERVER, ROUTER, *robot.not_here, *robot.policy_enclaves()}
     for name in list_enclaves(robot.keystore):
-        if name not in (OBSERVER, ROUTER, *not_here) and not policy.enclave(name):
+        if name not in known:
             revoke = f"sros revoke {shlex.quote(str(robot.keystore))} {name}"
             yield (
                 f"the policy does not have {name}, and the keystore does: if nothing needs it "
@@ -32,14 +45,12 @@ def problems_of(robot: LocalRobot, state: CloseState, *, partial: bool) -> Itera
                 f"{robot.close_command} --elsewhere {name}; if it belongs to this machine, sros "
                 f"merge_policy {shlex.quote(str(robot.policy))} ITS_POLICY --in-place"
             )
-    for name in sorted(not_here & state.secured.keys()):
-        yield f"{name} belongs to another machine, and a process runs in it here: stop it"
-    for name in enclaves_without_origin(robot):
-        remove = f"rm -r {shlex.quote(str(enclave_path(robot.export, name)))}"
-        yield f"the export has {name}, which the keystore neither has nor revoked: {remove}"
+
+
+def _user_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[str]:
+    """Yield the users of processes who cannot read their enclaves."""
     owner, export = robot.export.stat().st_uid, robot.export.absolute()
-    users = sorted({process.user for process in observed.processes})
-    for user in users:
+    for user in sorted({process.user for process in observed.processes}):
         closed = [path for path in export.parents if not _may_enter(user, path.stat())]
         if closed and user:
             yield f"user {user}, who runs processes, cannot enter '{closed[-1]}'"
@@ -48,43 +59,48 @@ def problems_of(robot: LocalRobot, state: CloseState, *, partial: bool) -> Itera
                 f"processes run as user {user}, and only user {owner} can read the enclaves: "
                 f"chown -R {user} {shlex.quote(str(robot.export))}"
             )
+
+
+def _launch_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[str]:
+    """Yield the processes that `ros2 launch` would not start in their enclaves."""
     for process in observed.processes:
         command = process.command
         if process.launch and not (node_argument(command) or launch_verb(command)):
-            words = run_words(export, process.enclave, process.rmw)
+            words = run_words(robot.export.absolute(), process.enclave, process.rmw)
             prefix = f"prefix='{' '.join(words)}'"
             yield (
                 f"the process of {process.enclave} has no name= in its launch file, and would "
                 f"not start: give it one, or {prefix}"
             )
-    if partial:
-        return
+
+
+def _unknown_process_problems(robot: LocalRobot, state: CloseState) -> Iterator[str]:
+    """Yield the processes without known nodes, and the nodes without a known process."""
+    observed, close = state.observed, robot.close_command
     silent = "they would not be heard any more (accept: --partial)"
     if observed.unknown:
         named = first_few(observed.unknown, MOST_NAMES)
-        opened = f"go back by {robot.close_command} --undo, and " if state.secured else ""
+        opened = f"go back by {close} --undo, and " if state.secured else ""
         yield (
             f"sros saw no node of {counted(len(observed.unknown), 'process', 'processes')}: "
-            f"{named}; {opened}watch again while they run: {robot.close_command} --for 1m; "
+            f"{named}; {opened}watch again while they run: {close} --for 1m; "
             f"otherwise {silent}"
         )
-    if observed.elsewhere:
-        here = {process.enclave: process.pid for process in observed.processes}
-        twice = sorted(here.keys() & {*observed.elsewhere})
-        if twice:
-            yield (
-                f"nodes of {twice[0]} are in process {here[twice[0]]} and in another one that "
-                "sros does not see: if another robot is in this ROS domain, switch it off, or "
-                "give it a domain of its own, remove the rights that it added to "
-                f"'{robot.policy}', and watch again: {robot.close_command} --for 1m"
-            )
-        if only_there := [name for name in observed.elsewhere if name not in twice]:
-            named = first_few(only_there, MOST_NAMES)
-            options = " ".join(f"--elsewhere {name}" for name in only_there)
-            yield (
-                f"sros knows no process of this machine for nodes of {named}; if they run on "
-                f"another machine: {robot.close_command} {options}; otherwise {silent}"
-            )
+    here = {process.enclave: process.pid for process in observed.processes}
+    if twice := sorted(here.keys() & {*observed.elsewhere}):
+        yield (
+            f"nodes of {twice[0]} are in process {here[twice[0]]} and in another one that "
+            "sros does not see: if another robot is in this ROS domain, switch it off, or "
+            "give it a domain of its own, remove the rights that it added to "
+            f"'{robot.policy}', and watch again: {close} --for 1m"
+        )
+    if only_there := [name for name in observed.elsewhere if name not in twice]:
+        named = first_few(only_there, MOST_NAMES)
+        options = " ".join(f"--elsewhere {name}" for name in only_there)
+        yield (
+            f"sros knows no process of this machine for nodes of {named}; if they run on "
+            f"another machine: {close} {options}; otherwise {silent}"
+        )
 
 
 def shared_program_problems(robot: LocalRobot) -> Iterator[str]:

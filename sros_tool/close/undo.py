@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from itertools import chain
 
 from sros_tool.close.drop_ins import drop_ins_of, restart_units
@@ -35,65 +35,93 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     restart_units(robot, observed, units, dry_run=dry_run)
     changes = [FileChange("remove", str(path)) for path in drop_ins]
     state = current_state(robot)._replace(dry_run=dry_run, changes=changes)
-    return state._replace(problems=[*_texts_to_open(robot, observed, dry_run=dry_run)])
-
-
-def _texts_to_open(
-    robot: LocalRobot, observed: ObservedProcesses, *, dry_run: bool
-) -> Iterator[str]:
-    """Yield how to start each process open that runs in an enclave or does not run.
-
-    Processes of enclaves that were taken out of the policy are left out.  Secured processes
-    that sros does not know are named, so that none of them is taken for open.
-    """
-    running = RunningRobot(robot)
-    are_open, nodes = running.open_processes, ObservedNodes(robot)
-    observed_commands = {tuple(process.command) for process in observed.processes}
-    others = [are_open[command] for command in are_open if command not in observed_commands]
-    secured = {
-        enclave.name: process
-        for process, enclave in sorted(
-            running.secured_everywhere, key=lambda secured: running.may_use_files(secured.process)
-        )
-    }
+    now = RunningRobot(robot)
     if robot.policy.exists():
         observed = observed.within(read_policy(robot.policy))
-    by_hand = [*chain.from_iterable(observed.commands_by_hand(robot.folder).values())]
+    _say_how_to_start(now, observed)
+    problems = [
+        *_commands_to_open(now, observed),
+        *(() if dry_run else _secured_units(now, observed)),
+        *_secured_guests(now, observed),
+        *_unknown_processes(now),
+    ]
+    return state._replace(problems=problems)
+
+
+def _secured_processes(running: RunningRobot) -> Mapping[str, Process]:
+    """Map enclaves to a process that runs in them, best of a user who can read their files."""
+    by_user = sorted(
+        running.secured_everywhere, key=lambda secured: running.may_use_files(secured.process)
+    )
+    return {enclave.name: process for process, enclave in by_user}
+
+
+def _processes_by_hand(robot: LocalRobot, observed: ObservedProcesses) -> list[ClosedProcess]:
+    return [*chain.from_iterable(observed.commands_by_hand(robot.folder).values())]
+
+
+def _commands_to_open(running: RunningRobot, observed: ObservedProcesses) -> Iterator[str]:
+    """Yield how to restart the processes open that run in enclaves and that no unit starts."""
+    robot, secured = running.robot, _secured_processes(running)
+    by_hand = _processes_by_hand(robot, observed)
     closed = [process for process in by_hand if process.enclave in secured]
-    process_counts = Counter(process.enclave for process in closed)
+    counts = Counter(process.enclave for process in closed)
     commands = []
     for process in closed:
         now = secured[process.enclave]
-        is_alone = process_counts[process.enclave] == 1 and not process.launch
+        is_alone = counts[process.enclave] == 1 and not process.launch
         if is_alone and not process.container and running.may_use_files(now):
             commands.append(secured_process(now, process.enclave).open_command(robot.domain))
         else:
             commands.append(process.open_command(robot.domain))
     for command in dict.fromkeys(commands):
         yield f"restart it open: {command}"
-    for process in observed.processes if not dry_run else ():
+
+
+def _secured_units(running: RunningRobot, observed: ObservedProcesses) -> Iterator[str]:
+    """Yield the processes of units that run in enclaves though their units were restarted."""
+    secured = _secured_processes(running)
+    for process in observed.processes:
         if process.unit and process.enclave in secured:
-            label = secured[process.enclave].label
             yield (
-                f"{label} still runs in {process.enclave}: stop it if {process.unit} did not start "
-                "it; otherwise take sros out of the unit"
+                f"{secured[process.enclave].label} still runs in {process.enclave}: stop it if "
+                f"{process.unit} did not start it; otherwise take sros out of the unit"
             )
-    for process in by_hand:
-        if process.enclave not in secured and tuple(process.command) not in are_open:
-            names, old = nodes.names_in(process.enclave)
-            under = f", under its old name {old}" if old else ""
-            how = f"start it open{under}: {process.open_command(robot.domain)}"
-            like = [other.label for other in others if _is_like(other, process, names)]
-            state = "does not run; "
-            if like:
-                state = f"runs open by another command ({like[0]}); if that is another program, "
-            robot.shell.say(f"{process.enclave} {state}{how}")
+
+
+def _say_how_to_start(running: RunningRobot, observed: ObservedProcesses) -> None:
+    """Show how to start the processes open that do not run, or run by another command."""
+    robot, secured, nodes = running.robot, _secured_processes(running), ObservedNodes(running.robot)
+    known = running.with_later_processes(robot.processes)
+    commands = {tuple(process.command) for process in known.processes}
+    others = [
+        process for command, process in running.open_processes.items() if command not in commands
+    ]
+    for process in _processes_by_hand(robot, observed):
+        if process.enclave in secured or tuple(process.command) in running.open_processes:
+            continue
+        names, old = nodes.names_in(process.enclave)
+        under = f", under its old name {old}" if old else ""
+        state = "does not run; "
+        if like := [other.label for other in others if _is_like(other, process, names)]:
+            state = f"runs open by another command ({like[0]}); if that is another program, "
+        command = process.open_command(robot.domain)
+        robot.shell.say(f"{process.enclave} {state}start it open{under}: {command}")
+
+
+def _secured_guests(running: RunningRobot, observed: ObservedProcesses) -> Iterator[str]:
+    """Yield the processes in enclaves of the export in which no process was observed."""
+    secured = _secured_processes(running)
     for name in sorted(secured.keys() - {process.enclave for process in observed.processes}):
         guest = secured[name]
         how = f"restart it open: {process_text(guest)}"
         if not running.may_use_files(guest):
             how = f"it is {guest.label} of user {guest.user}, who cannot read its files"
         yield f"{name} runs in an enclave, too; {how}"
+
+
+def _unknown_processes(running: RunningRobot) -> Iterator[str]:
+    """Yield secured processes that sros does not know, so that none of them is taken for open."""
     pids = {process.pid for process, _ in running.secured_everywhere}
     for other in running.in_domain:
         if (enclave := other.enclave) and other.pid not in pids and not other.is_daemon:
@@ -106,7 +134,9 @@ def _texts_to_open(
         if unseen.speaks:
             yield f"{unseen.label} speaks ROS 2, and cannot be looked at: {unseen.why}"
     if running.processes.hidden or any(not unseen.speaks for unseen in running.processes.unseen):
-        robot.shell.say("some processes cannot be looked at: to be sure of them, ask as root")
+        running.robot.shell.say(
+            "some processes cannot be looked at: to be sure of them, ask as root"
+        )
 
 
 def _is_like(process: Process, observed: ClosedProcess, nodes: Collection[str]) -> bool:
