@@ -70,11 +70,9 @@ def assign(
                 process
                 for process in near
                 if process.pid not in claimed
-                and any(
-                    shows_node(process, node, process_ids or {}) for node in by_enclave[enclave]
-                )
+                and any(shows_node(process, node, process_ids or {}) for node in enclave_nodes)
             ]
-            if len(processes) <= len({node.participant for node in by_enclave[enclave]}):
+            if len(processes) <= len({node.participant for node in enclave_nodes}):
                 claims += [(process, enclave, known_by) for process in processes]
     units = Counter({process.program[0]: origins[process.pid].unit for process in near}.values())
     assigned = []
