@@ -51,7 +51,8 @@ from sros_tool.xml import read_bytes
 _FORMAT = 1
 MAX_BYTES = 4 * 1024 * 1024
 """Largest size of a confirmation in bytes; enough for a robot with 4,000 enclaves."""
-_LONGEST_REASON = 400
+LONGEST_REASON = 400
+"""Maximum number of characters of the reason for which a message is refused."""
 _MOST_REFUSALS = 64 * 1024 * 1024
 """Largest size of the file of refused messages, in bytes; enough for 100,000 robots, each with the
 longest reason."""
@@ -563,7 +564,7 @@ def keep_refusals(
 
     The caller holds `locked_confirmations`.
     """
-    reasons = {robot: why[:_LONGEST_REASON] for robot, why in refused.items()}
+    reasons = {robot: why[:LONGEST_REASON] for robot, why in refused.items()}
     if {robot: refusal.why for robot, refusal in previous.items()} == reasons:
         return
     value = {

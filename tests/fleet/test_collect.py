@@ -15,7 +15,9 @@ from typing import Any
 
 import pytest
 from cryptography import x509
+from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import rsa
+from cryptography.x509.oid import NameOID
 
 from sros_tool.errors import DocumentError, KeystoreError
 from sros_tool.keystore import transaction
@@ -255,6 +257,24 @@ def test_a_robot_cannot_answer_for_another_one(home: Home) -> None:
     assert home.kept("r1") is None and home.kept("r2") is None
     home.put("r1", smime.sign(named_r1, stolen, home.key("r1", "/r1/base")))
     assert home.of("r1").outcome == "kept"
+
+
+def test_a_stranger_with_a_long_name_is_refused_in_a_short_line(home: Home) -> None:
+    """Whoever can write into the inbox chooses the subject of the certificate."""
+    name = x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, "a\x1b[2J")
+    key = generate_key()
+    stranger = (
+        x509.CertificateBuilder(x509.Name([name] * 1000), x509.Name([name] * 1000))
+        .public_key(key.public_key())
+        .serial_number(5)
+        .not_valid_before(NOW)
+        .not_valid_after(LATE)
+        .sign(key, hashes.SHA256())
+    )
+    home.put("r1", smime.sign(render_confirmation(home.said("r1", NOW)), stranger, key))
+    said = sros("fleet", "collect", "ks", "inbox", cwd=home.folder).out
+    assert "r1: refused: no identity CA of the keystore issued its certificate: " in said
+    assert len(said) < 600 and "\x1b" not in said
 
 
 def test_an_older_message_in_a_second_inbox(home: Home) -> None:

@@ -28,6 +28,7 @@ from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosE
 from sros_tool.fleet.robots import RENEWAL_ALLOWED, Fleet, Robot, enclaves_of, robot_of
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
+    LONGEST_REASON,
     MAX_BYTES,
     MESSAGE_FILE,
     Confirmation,
@@ -334,6 +335,11 @@ class _RefusedError(SrosError):
     """A message that proves nothing, or a request that must not be signed."""
 
 
+def _shortened(reason: str) -> str:
+    """Return a reason that is not too long: it may have names that the robot chose."""
+    return reason if len(reason) <= LONGEST_REASON else f"{reason[: LONGEST_REASON - 3]}..."
+
+
 class _File(NamedTuple):
     """The content of a message, and when its file was written."""
 
@@ -361,9 +367,8 @@ def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_Rec
                     continue
                 taken = _ReceivedMessage(robot, "revoked")
             except _RefusedError as refusal:
-                taken = _ReceivedMessage(
-                    robot, "revoked" if is_revoked else "refused", refusal.what
-                )
+                outcome = "revoked" if is_revoked else "refused"
+                taken = _ReceivedMessage(robot, outcome, _shortened(refusal.what))
             if is_revoked and folder.state(robot.name) is not None:
                 taken.why = "all its enclaves were revoked; its message does not count"
             if file:
@@ -668,7 +673,7 @@ class _Renewals:
                 names.add(request.name)
                 outcome, why = self._decide_request(robot, message, request)
             except SrosError as error:
-                outcome, why = "refused", error.what
+                outcome, why = "refused", _shortened(error.what)
             result = result._replace(outcome=outcome, why=why)
             if outcome == "renewed":
                 present = self._keystore.certificate_of(request.name)
