@@ -168,7 +168,7 @@ def _observed_processes(
     commands = {process.command for process in processes}
     finished = ended_processes(
         [node for node in nodes if node.enclaves[0] in ended],
-        [started[command] for command in started.keys() - commands],
+        [start for command, start in started.items() if command not in commands],
         observed,
     )
     with_units = [with_command_of_unit(process) for process in (*observed.processes, *finished)]

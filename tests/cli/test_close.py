@@ -7,12 +7,10 @@ import json
 import os
 import re
 import shutil
-import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -29,39 +27,32 @@ from sros_tool.close import (
     talk_proof,
     watch,
 )
-from sros_tool.close.access import access_lines
-from sros_tool.close.assignment import assign, with_command_of_unit
-from sros_tool.close.endpoints import left_alone
+from sros_tool.close.assignment import with_command_of_unit
 from sros_tool.close.processes import ClosedProcess, ObservedProcesses
 from sros_tool.close.robot import LocalRobot, Shell
 from sros_tool.close.steps import steps
-from sros_tool.explain.audit import DeniedRight, audit
+from sros_tool.explain.audit import audit
 from sros_tool.graph import observe
-from sros_tool.graph.observation import Endpoint, ObservedNode, make_observation
 from sros_tool.keystore.layout import list_enclaves
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import ALLOW, Policy
-from sros_tool.policy.rights import Right
 from sros_tool.runtime.environment import secured_environment
 from sros_tool.runtime.processes import (
     FileReader,
     Process,
-    ProcessEnclave,
     ProcessOrigin,
     ProcessRoot,
     ProcessTable,
     RunningProcesses,
     UnseenProcess,
-    _forked_by,
     launch_verb,
     process_origin,
     with_files,
 )
-from sros_tool.terminal import visible
 from sros_tool.values import as_plain
 from tests.cli.test_json import Seen
+from tests.close.test_origins import made_up
 from tests.graph.fake_graph import Beside, graph
-from tests.support.harness import Ended, policy_text, publish, snapshot, sros, subscribe
+from tests.support.harness import Ended, snapshot, sros
 from tests.support.long_form import some, sometimes
 
 pytest_plugins = ["tests.graph.beside"]
@@ -690,9 +681,6 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     assert "closed, except for what was not checked" in ended.err
 
 
-# ── interrupted ────────────────────────────────────────────────────────────────────────────
-
-
 @pytest.mark.parametrize("after", some([False, True], 1))
 def test_what_is_interrupted_at_any_step_goes_on(
     robot: Robot, monkeypatch: pytest.MonkeyPatch, after: bool
@@ -778,9 +766,6 @@ def test_a_node_of_another_robot_is_not_proposed_for_another_machine(robot: Robo
     assert "--elsewhere" not in ended.out
 
 
-# ── refused ────────────────────────────────────────────────────────────────────────────────
-
-
 @sometimes("nothing_is_closed_of_what_is_not_understood", 1 / 2)
 def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
     robot.units = UNITS
@@ -850,22 +835,6 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     said = robot.close("--proof").out
     assert "policy has no profile for them any more: /rear_camera (if they have new names, " in said
     assert "watched again: sros close robot --undo, sros close robot --for 1m)\n" in said
-
-
-def test_a_name_that_moved_leaves_nobody_alone() -> None:
-    """Or /base never hears /cmd_vel again, and the proof says that everything talks."""
-    old, new = Endpoint("rt/cmd_vel", "publish"), Endpoint("rt/nav/cmd_vel", "publish")
-    heard = Endpoint("rt/cmd_vel", "subscribe")
-    planner = replace(node("planner", ns="/nav"), endpoints=frozenset({new}))
-    base = replace(node("base"), endpoints=frozenset({heard}))
-    joystick = replace(node("joystick"), endpoints=frozenset({old}))
-    seen, moved = make_observation([planner, base]), {(old, new)}
-    alone = "/base subscribe /cmd_vel, which is /nav/cmd_vel now"
-    assert left_alone(seen, seen, moved, ()) == [alone]
-    assert not left_alone(seen, make_observation([planner, base, joystick]), moved, ())
-    right = Right("/base", ALLOW, "subscribe", "/cmd_vel")
-    denied = DeniedRight(right, ("/base",), "no rule", False, False, (heard,))
-    assert not left_alone(seen, seen, moved, [denied])
 
 
 def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None:
@@ -1145,9 +1114,6 @@ def test_what_is_printed_as_json(robot: Robot) -> None:
     assert seen.unseen("close") == []
 
 
-# ── which process ──────────────────────────────────────────────────────────────────────────
-
-
 def test_no_command_of_another_user_is_proposed(robot: Robot) -> None:
     """Anybody can start a program whose variables name the export."""
     robot.close()
@@ -1161,82 +1127,6 @@ def test_no_command_of_another_user_is_proposed(robot: Robot) -> None:
     words = {**graph(), "secured": graph(*secured(*robot.remaining))}
     ended = robot.beside("close", words, "robot", "--undo")
     assert "evil" not in ended.out and "restart it open: cd /opt && /opt/run talker" in ended.out
-
-
-def process(pid: int, *command: str, **more: Any) -> Process:
-    return Process(pid, command, {}, datetime.now(UTC), frozenset({"libfastrtps"}), **more)
-
-
-def node(name: str, participant: str = "01", ns: str = "/") -> ObservedNode:
-    enclave = f"{ns.rstrip('/')}/{name}"
-    writes = frozenset({Endpoint("rt/x", "publish")})
-    return ObservedNode((enclave,), ns, name, participant, writes)
-
-
-@pytest.mark.parametrize(
-    ("nodes", "processes", "known"),
-    [
-        (
-            [node("a", "010f7f01a530")],
-            [process(0x130A5, "x"), process(2, "a")],
-            {"/a": "process id"},
-        ),
-        ([node("a", "01107f01a530")], [process(0x130A5, "x"), process(2, "y")], {}),
-        (
-            [node("a", "1", "/n"), node("b", "2")],
-            [process(1, "x", "--ros-args", "-r", "__node:=a", "-r", "__ns:=/n"), process(2, "y")],
-            {"/n/a": "node name", "/b": "elimination"},
-        ),
-        (
-            [node("a", "1"), node("b", "2")],
-            [process(1, "python3", "/opt/a.py"), process(2, "/opt/b")],
-            {"/a": "program", "/b": "program"},
-        ),
-        ([node("a", "1")], [process(1, "/opt/a"), process(2, "/usr/a")], {}),
-        (
-            [node("a", "1"), node("a", "2")],
-            [process(1, "/opt/a"), process(2, "/usr/a")],
-            {"/a": "program"},
-        ),
-        ([node("a")], [process(1, "x", network="net:[1]")], {}),
-        ([node("a")], [process(1, "x")], {"/a": "elimination"}),
-    ],
-)
-def test_the_enclave_of_a_process(
-    nodes: list[ObservedNode], processes: list[Process], known: dict[str, str]
-) -> None:
-    observed = assign(nodes, processes, 0)
-    assert {each.enclave: each.known_by for each in observed.processes} == known
-    assert set(observed.elsewhere) == {each.enclaves[0] for each in nodes} - known.keys()
-
-
-def test_a_command_is_written_so_that_it_controls_no_terminal() -> None:
-    """Any user may start a process with such arguments, also with bytes that are not UTF-8."""
-    words = ("/opt/talk", "\x1b[2J'%\\", "\udc9b1", "a b\n")
-    talker = ClosedProcess("/talker", 7, words, "/opt", 0, "", "program")
-    for command in (talker.secured_command(Path()), talker.open_command(0)):
-        assert visible(command) == command
-        arguments = command.removeprefix("cd /opt && sros run export /talker -- ")
-        printed = f"printf '%s|' {arguments.removeprefix('cd /opt && ')}"
-        done = subprocess.run(["sh", "-c", printed], capture_output=True, check=True)
-        assert done.stdout == b"|".join(map(os.fsencode, words)) + b"|"
-
-
-def test_a_process_to_stop_is_named_by_the_id_that_it_has_now() -> None:
-    talker = ClosedProcess("/talker", 7, ("talk", "a"), "/opt", 0, "", "program")
-    again, other = process(8, "talk", "a"), process(7, "talk", "b")
-    unseen = UnseenProcess(7, (), "another user's", speaks=False)
-    for processes, pid in (
-        (RunningProcesses((process(7, "talk", "a"), again)), 7),
-        (RunningProcesses((other, again)), 8),
-        (RunningProcesses((process(9, "talk", "a", "--ros-args", "--enclave", "/talker"),)), 9),
-        (RunningProcesses((process(9, "talk", "a", "--ros-args", "--enclave", "/other"),)), 0),
-        (RunningProcesses((other,)), 0),
-        (RunningProcesses((other,), hidden="those of other users"), 7),
-        (RunningProcesses(unseen=(unseen,)), 7),
-    ):
-        assert talker.with_current_pid(processes).pid == pid
-    assert talker._replace(unit="talker.service").with_current_pid(RunningProcesses()).pid == 7
 
 
 def test_what_is_exported_without_the_enclaves_of_other_machines(tmp_path: Path) -> None:
@@ -1310,25 +1200,6 @@ def test_the_nodes_of_a_process_that_has_several(tmp_path: Path) -> None:
     assert nodes == ", for the nodes /p/detector and /p/tracker"
 
 
-def test_a_process_of_cyclone_dds_is_known_by_what_it_says() -> None:
-    """Not by the two bytes in which Fast DDS has the id."""
-    nodes = [node("a", "01107f01a530"), node("b", "0110")]
-    processes = [process(0x130A5, "x"), process(2, "y")]
-    observed = assign(nodes, processes, 0, {"0110": 0x130A5, "01107f01a530": 2})
-    known = {each.enclave: (each.pid, each.known_by) for each in observed.processes}
-    assert known == {"/a": (2, "process id"), "/b": (0x130A5, "process id")}
-
-
-def test_nodes_of_the_same_name_elsewhere_are_told() -> None:
-    own, same = node("a", "010f7f01a53001"), node("a", "010f7f01a53002")
-    talker = process(0x30A5, "/opt/a")
-    assert assign([own, same], [talker], 0).elsewhere == []
-    for other in (node("a", "010f7f02a530"), node("a", "010f7f01ffff"), node("a", "0110aa")):
-        observed = assign([own, other], [talker], 0)
-        assert [each.pid for each in observed.processes] == [talker.pid]
-        assert observed.elsewhere == ["/a"]
-
-
 def test_containers_are_started_with_the_files_of_their_enclaves(robot: Robot) -> None:
     robot.container = "0123456789ab"
     robot.close()
@@ -1354,108 +1225,6 @@ def test_a_node_on_zenoh_gets_an_argument_from_its_unit(robot: Robot) -> None:
     assert with_command_of_unit(script).unit == ""
     for other in (script._replace(rmw=""), script._replace(enclave="/router")):
         assert with_command_of_unit(other) == other
-
-
-def test_commands_name_the_rmw_and_on_zenoh_the_enclave() -> None:
-    """Without them, a process runs open or on another RMW, or others do not see it."""
-    start = "/talker", 1, ("python3", "talk"), "/opt", 0, "", "program"
-    talker = ClosedProcess(*start, rmw="rmw_zenoh_cpp")
-    run = "sros run export {} --rmw rmw_zenoh_cpp --"
-    assert talker.secured_command(Path()) == (
-        f"cd /opt && {run.format('/talker')} python3 talk --ros-args --enclave /talker"
-    )
-    router = talker._replace(enclave="/router", command=("rmw_zenohd",))
-    assert router.secured_command(Path()) == f"cd /opt && {run.format('/router')} rmw_zenohd"
-    named = {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}
-    on_cyclone = Process(1, ("talk",), named, datetime.now(UTC))
-    origin = ProcessOrigin("", "/opt")
-    cyclone = ClosedProcess.from_process(on_cyclone, "/talker", origin, "program")
-    started = "cd /opt && sros run export /talker --rmw rmw_cyclonedds_cpp -- talk"
-    assert cyclone.secured_command(Path()) == started
-    assert cyclone.open_command(0) == "cd /opt && env RMW_IMPLEMENTATION=rmw_cyclonedds_cpp talk"
-    other = replace(on_cyclone, environment={"RMW_IMPLEMENTATION": "rmw_other"})
-    assert ClosedProcess.from_process(other, "/talker", origin, "program").rmw == ""
-    empty = Policy(())
-    assert ObservedProcesses(0, [talker, router]).enclaves_outside(empty) == ["/talker"]
-    assert ObservedProcesses(0, [router._replace(rmw="")]).enclaves_outside(empty) == ["/router"]
-    in_domain = "cd /opt && env ROS_DOMAIN_ID=7 RMW_IMPLEMENTATION=rmw_zenoh_cpp python3 talk"
-    assert talker.open_command(7) == in_domain
-    observed = ObservedProcesses(7, [talker])
-    assert observed.command_of_new(Path("export"), "/horn") == f"{run.format('/horn')} COMMAND"
-    variables = {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}
-    process = Process(1, ("python3", "talk"), variables, datetime.now(UTC))
-    now: Any = SimpleNamespace(secured=[(process, ProcessEnclave("/export", "/talker"))])
-    unseen = talk_proof.unseen_text(now, "/talker", "/talker")
-    assert "start process 1 (talk) with `--ros-args --enclave /talker` at its end" in unseen
-
-
-def test_variables_that_a_command_does_not_set_are_named() -> None:
-    variables = {"HOME": "/", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp", "GAIN": "2"}
-    talker = Process(1, ("talk",), variables, datetime.now(UTC))
-    closed = ClosedProcess.from_process(talker, "/talker", ProcessOrigin("", "/opt"), "program")
-    shown: list[str] = []
-    shell = SimpleNamespace(environment={"HOME": "/root"}, say=shown.append)
-    robot: Any = SimpleNamespace(shell=shell, commands_file="commands.txt")
-    now: Any = SimpleNamespace(processes=RunningProcesses((talker,)))
-    watch._say_variables(robot, ObservedProcesses(0, [closed]), now)
-    assert len(shown) == 1 and shown[0].endswith("its command in commands.txt does not set: GAIN")
-
-
-@pytest.mark.parametrize(
-    ("text", "unit"),
-    [
-        ("0::/system.slice/robot@3.service\n", "robot@3.service"),
-        ("1:name=systemd:/system.slice/system-r.slice/r@3.service\n0::/\n", "r@3.service"),
-        ("0::/user.slice/user-1000.slice/user@1000.service/app.slice/x.service\n", ""),
-        ("0::/system.slice/../x y.service\n", ""),
-        ("0::/\n", ""),
-    ],
-)
-def test_the_unit_of_a_process(tmp_path: Path, text: str, unit: str) -> None:
-    made_up(tmp_path, 7, "/opt/talker", parent=1, cgroup=text)
-    assert process_origin(7, tmp_path) == ProcessOrigin(unit, "/opt")
-    assert process_origin(8, tmp_path) == ProcessOrigin()
-
-
-SPAWNED = ("python3", "-c", "from multiprocessing.spawn import spawn_main; spawn_main(4)", "x")
-FORKSERVER = ("python3", "-c", "from multiprocessing.forkserver import main; main(4)")
-
-
-@pytest.mark.parametrize(
-    ("commands", "program"),
-    [
-        ([("/bin/sh",), ("python3", "a.py")], 0),
-        ([("/bin/sh",), ("python3", "a.py"), ("python3", "a.py")], 8),
-        ([("/opt/a",), ("/opt/a",), ("/opt/a",)], 7),
-        ([("/bin/sh",), ("python3.12", "a.py"), SPAWNED], 8),
-        ([("python3", "a.py"), FORKSERVER, FORKSERVER], 7),
-        ([("/lib/systemd", "--user"), SPAWNED], 0),
-    ],
-)
-def test_the_program_of_a_process(
-    tmp_path: Path, commands: list[tuple[str, ...]], program: int
-) -> None:
-    for pid, command in enumerate(commands, 7):
-        made_up(tmp_path, pid, *command, parent=pid - 1 if pid > 7 else 1)
-    folder = os.open(tmp_path / str(pid), os.O_RDONLY)
-    first = _forked_by(folder, command)
-    os.close(folder)
-    assert first == (program, commands[program - 7] if program else ())
-
-
-@pytest.mark.parametrize("path", ["system.slice/docker-{}.scope", "docker/{}"])
-def test_the_container_of_a_process(tmp_path: Path, path: str) -> None:
-    made_up(tmp_path, 7, "/opt/talker", parent=1, cgroup=f"0::/{path.format('0af' * 21 + '0')}\n")
-    assert process_origin(7, tmp_path) == ProcessOrigin("", "/opt", (), "0af0af0af0af")
-
-
-def made_up(proc: Path, pid: int, *command: str, parent: int, cgroup: str = "0::/\n") -> None:
-    folder = proc / str(pid)
-    folder.mkdir()
-    (folder / "cgroup").write_text(cgroup)
-    (folder / "cwd").symlink_to("/opt")
-    (folder / "cmdline").write_text("".join(f"{word}\0" for word in command))
-    (folder / "stat").write_text(f"{pid} (x) S {parent} " + "0 " * 30)
 
 
 LAUNCH = ("/usr/bin/python3", "/opt/ros/jazzy/bin/ros2", "launch", "my_robot", "all.py", "a:=b c")
@@ -1485,15 +1254,3 @@ def test_a_process_that_was_launched_is_launched_secured(tmp_path: Path, robot: 
     robot.by_hand = set(PID)
     undone = robot.close("--undo", status=1).out
     assert undone.count("restart it open: cd /opt && /usr/bin/python3 /opt/ros/jazzy/bin/ros2") == 1
-
-
-def test_wildcards_and_denials_count_in_what_is_shown(tmp_path: Path) -> None:
-    text = policy_text({
-        "/a": publish("/odom"),
-        "/b": subscribe("/odom"),
-        "/look": subscribe("/*"),
-        "/not": subscribe("/*") + subscribe("/odom").replace("ALLOW", "DENY"),
-    })  # fmt: skip
-    (tmp_path / "p.xml").write_text(text)
-    lines = access_lines(read_policy(tmp_path / "p.xml"), tmp_path)
-    assert lines == ["topic /odom: /a -> /b, /look", "topic /*: nobody -> /look, /not"]

@@ -1,0 +1,73 @@
+"""What started a process: a unit, a program of several processes, a container."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from sros_tool.runtime.processes import (
+    ProcessOrigin,
+    _forked_by,
+    process_origin,
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [
+        ("0::/system.slice/robot@3.service\n", "robot@3.service"),
+        ("1:name=systemd:/system.slice/system-r.slice/r@3.service\n0::/\n", "r@3.service"),
+        ("0::/user.slice/user-1000.slice/user@1000.service/app.slice/x.service\n", ""),
+        ("0::/system.slice/../x y.service\n", ""),
+        ("0::/\n", ""),
+    ],
+)
+def test_the_unit_of_a_process(tmp_path: Path, text: str, unit: str) -> None:
+    made_up(tmp_path, 7, "/opt/talker", parent=1, cgroup=text)
+    assert process_origin(7, tmp_path) == ProcessOrigin(unit, "/opt")
+    assert process_origin(8, tmp_path) == ProcessOrigin()
+
+
+SPAWNED = ("python3", "-c", "from multiprocessing.spawn import spawn_main; spawn_main(4)", "x")
+
+
+FORKSERVER = ("python3", "-c", "from multiprocessing.forkserver import main; main(4)")
+
+
+@pytest.mark.parametrize(
+    ("commands", "program"),
+    [
+        ([("/bin/sh",), ("python3", "a.py")], 0),
+        ([("/bin/sh",), ("python3", "a.py"), ("python3", "a.py")], 8),
+        ([("/opt/a",), ("/opt/a",), ("/opt/a",)], 7),
+        ([("/bin/sh",), ("python3.12", "a.py"), SPAWNED], 8),
+        ([("python3", "a.py"), FORKSERVER, FORKSERVER], 7),
+        ([("/lib/systemd", "--user"), SPAWNED], 0),
+    ],
+)
+def test_the_program_of_a_process(
+    tmp_path: Path, commands: list[tuple[str, ...]], program: int
+) -> None:
+    for pid, command in enumerate(commands, 7):
+        made_up(tmp_path, pid, *command, parent=pid - 1 if pid > 7 else 1)
+    folder = os.open(tmp_path / str(pid), os.O_RDONLY)
+    first = _forked_by(folder, command)
+    os.close(folder)
+    assert first == (program, commands[program - 7] if program else ())
+
+
+@pytest.mark.parametrize("path", ["system.slice/docker-{}.scope", "docker/{}"])
+def test_the_container_of_a_process(tmp_path: Path, path: str) -> None:
+    made_up(tmp_path, 7, "/opt/talker", parent=1, cgroup=f"0::/{path.format('0af' * 21 + '0')}\n")
+    assert process_origin(7, tmp_path) == ProcessOrigin("", "/opt", (), "0af0af0af0af")
+
+
+def made_up(proc: Path, pid: int, *command: str, parent: int, cgroup: str = "0::/\n") -> None:
+    folder = proc / str(pid)
+    folder.mkdir()
+    (folder / "cgroup").write_text(cgroup)
+    (folder / "cwd").symlink_to("/opt")
+    (folder / "cmdline").write_text("".join(f"{word}\0" for word in command))
+    (folder / "stat").write_text(f"{pid} (x) S {parent} " + "0 " * 30)

@@ -1,0 +1,101 @@
+"""The processes of a robot: the ids that they have, and the commands that start them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from sros_tool.close import (
+    talk_proof,
+    watch,
+)
+from sros_tool.close.processes import ClosedProcess, ObservedProcesses
+from sros_tool.policy.model import Policy
+from sros_tool.runtime.processes import (
+    Process,
+    ProcessEnclave,
+    ProcessOrigin,
+    RunningProcesses,
+    UnseenProcess,
+)
+from sros_tool.terminal import visible
+from tests.close.test_assignment import process
+
+
+def test_a_command_is_written_so_that_it_controls_no_terminal() -> None:
+    """Any user may start a process with such arguments, also with bytes that are not UTF-8."""
+    words = ("/opt/talk", "\x1b[2J'%\\", "\udc9b1", "a b\n")
+    talker = ClosedProcess("/talker", 7, words, "/opt", 0, "", "program")
+    for command in (talker.secured_command(Path()), talker.open_command(0)):
+        assert visible(command) == command
+        arguments = command.removeprefix("cd /opt && sros run export /talker -- ")
+        printed = f"printf '%s|' {arguments.removeprefix('cd /opt && ')}"
+        done = subprocess.run(["sh", "-c", printed], capture_output=True, check=True)
+        assert done.stdout == b"|".join(map(os.fsencode, words)) + b"|"
+
+
+def test_a_process_to_stop_is_named_by_the_id_that_it_has_now() -> None:
+    talker = ClosedProcess("/talker", 7, ("talk", "a"), "/opt", 0, "", "program")
+    again, other = process(8, "talk", "a"), process(7, "talk", "b")
+    unseen = UnseenProcess(7, (), "another user's", speaks=False)
+    for processes, pid in (
+        (RunningProcesses((process(7, "talk", "a"), again)), 7),
+        (RunningProcesses((other, again)), 8),
+        (RunningProcesses((process(9, "talk", "a", "--ros-args", "--enclave", "/talker"),)), 9),
+        (RunningProcesses((process(9, "talk", "a", "--ros-args", "--enclave", "/other"),)), 0),
+        (RunningProcesses((other,)), 0),
+        (RunningProcesses((other,), hidden="those of other users"), 7),
+        (RunningProcesses(unseen=(unseen,)), 7),
+    ):
+        assert talker.with_current_pid(processes).pid == pid
+    assert talker._replace(unit="talker.service").with_current_pid(RunningProcesses()).pid == 7
+
+
+def test_commands_name_the_rmw_and_on_zenoh_the_enclave() -> None:
+    """Without them, a process runs open or on another RMW, or others do not see it."""
+    start = "/talker", 1, ("python3", "talk"), "/opt", 0, "", "program"
+    talker = ClosedProcess(*start, rmw="rmw_zenoh_cpp")
+    run = "sros run export {} --rmw rmw_zenoh_cpp --"
+    assert talker.secured_command(Path()) == (
+        f"cd /opt && {run.format('/talker')} python3 talk --ros-args --enclave /talker"
+    )
+    router = talker._replace(enclave="/router", command=("rmw_zenohd",))
+    assert router.secured_command(Path()) == f"cd /opt && {run.format('/router')} rmw_zenohd"
+    named = {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}
+    on_cyclone = Process(1, ("talk",), named, datetime.now(UTC))
+    origin = ProcessOrigin("", "/opt")
+    cyclone = ClosedProcess.from_process(on_cyclone, "/talker", origin, "program")
+    started = "cd /opt && sros run export /talker --rmw rmw_cyclonedds_cpp -- talk"
+    assert cyclone.secured_command(Path()) == started
+    assert cyclone.open_command(0) == "cd /opt && env RMW_IMPLEMENTATION=rmw_cyclonedds_cpp talk"
+    other = replace(on_cyclone, environment={"RMW_IMPLEMENTATION": "rmw_other"})
+    assert ClosedProcess.from_process(other, "/talker", origin, "program").rmw == ""
+    empty = Policy(())
+    assert ObservedProcesses(0, [talker, router]).enclaves_outside(empty) == ["/talker"]
+    assert ObservedProcesses(0, [router._replace(rmw="")]).enclaves_outside(empty) == ["/router"]
+    in_domain = "cd /opt && env ROS_DOMAIN_ID=7 RMW_IMPLEMENTATION=rmw_zenoh_cpp python3 talk"
+    assert talker.open_command(7) == in_domain
+    observed = ObservedProcesses(7, [talker])
+    assert observed.command_of_new(Path("export"), "/horn") == f"{run.format('/horn')} COMMAND"
+    variables = {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}
+    process = Process(1, ("python3", "talk"), variables, datetime.now(UTC))
+    now: Any = SimpleNamespace(secured=[(process, ProcessEnclave("/export", "/talker"))])
+    unseen = talk_proof.unseen_text(now, "/talker", "/talker")
+    assert "start process 1 (talk) with `--ros-args --enclave /talker` at its end" in unseen
+
+
+def test_variables_that_a_command_does_not_set_are_named() -> None:
+    variables = {"HOME": "/", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp", "GAIN": "2"}
+    talker = Process(1, ("talk",), variables, datetime.now(UTC))
+    closed = ClosedProcess.from_process(talker, "/talker", ProcessOrigin("", "/opt"), "program")
+    shown: list[str] = []
+    shell = SimpleNamespace(environment={"HOME": "/root"}, say=shown.append)
+    robot: Any = SimpleNamespace(shell=shell, commands_file="commands.txt")
+    now: Any = SimpleNamespace(processes=RunningProcesses((talker,)))
+    watch._say_variables(robot, ObservedProcesses(0, [closed]), now)
+    assert len(shown) == 1 and shown[0].endswith("its command in commands.txt does not set: GAIN")
