@@ -13,13 +13,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from sros_tool.checks.kind import ChosenFindings, Finding, FindingKind, Severity, group_by_cause
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import Fleet, named_robots, with_robot_placeholder
-from sros_tool.keystore.expiry import Lifetime, survey
 from sros_tool.keystore.layout import (
     CRL_FILE,
     GOVERNANCE_P7S,
@@ -32,8 +31,11 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.markdown import bounded_list, code, plain
 from sros_tool.pki.certificates import validity_of
 from sros_tool.pki.crl import load_crl
-from sros_tool.prometheus import Metric, Sample
 from sros_tool.wording import counted, first_few
+
+if TYPE_CHECKING:
+    from sros_tool.keystore.expiry import Lifetime
+    from sros_tool.prometheus import Metric
 
 _MOST = 20_000  # characters: a comment on GitHub has at most 65,536
 _SIGNS = {"error": "🔴", "warning": "🟠", "note": "🔵"}
@@ -307,6 +309,10 @@ def keystore_metrics(
     Raises:
         KeystoreError: the path is not a keystore, or some enclaves cannot be listed.
     """
+    # A check without metrics does not load what only they need.
+    from sros_tool.keystore.expiry import survey
+    from sros_tool.prometheus import Metric, Sample
+
     lifetimes, unreadable = survey(keystore)
     expiries = [*_shared_expiries(keystore), *_enclave_expiries(keystore, lifetimes)]
     earliest: dict[str, datetime] = {}

@@ -357,12 +357,12 @@ def check(
 
 def _is_mended_by(template: str | None, finding: Finding) -> bool:
     """Return whether a keystore made from ``template`` would not have the reported weakness."""
+    if template is None:
+        return False
     from sros_tool.checks.policies import ENCLAVE_NAMES
     from sros_tool.keystore.template import load_template
 
-    if template is None or finding.kind is not ENCLAVE_NAMES:
-        return False
-    return load_template(template).unique_subject
+    return finding.kind is ENCLAVE_NAMES and load_template(template).unique_subject
 
 
 def _requirements(
@@ -720,15 +720,16 @@ def _fleet_of(circumstances: Circumstances, paths: Sequence[Path]) -> Fleet | No
 
     None if there is no fleet, or if it cannot be read.
     """
-    from sros_tool.fleet.expansion import fleet_with_enclaves
     from sros_tool.keystore.fleet import load_fleet
-    from sros_tool.policy.document import files_of_policies
 
     if circumstances.fleet is None:
         opened = [circumstances.opened[path] for path in paths if path in circumstances.opened]
         with suppress(SrosError):  # what is wrong with it is a finding
             return load_fleet(opened[0]) if len(opened) == 1 else None
         return None
+    from sros_tool.fleet.expansion import fleet_with_enclaves
+    from sros_tool.policy.document import files_of_policies
+
     files: list[Path] = []
     for path in paths:
         if path not in circumstances.opened:

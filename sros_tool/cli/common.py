@@ -695,11 +695,13 @@ def domain_of(text: str | None) -> int | None:
 
     Raises `UsageError`.
     """
-    from sros_tool.runtime.variables import DOMAIN, domain_from
-
+    if text is None:
+        return None
     if text == "":
         raise UsageError("--domain is empty", "", "Name a domain, or leave the option out.")
-    return None if text is None else domain_from({DOMAIN: text})
+    from sros_tool.runtime.variables import DOMAIN, domain_from
+
+    return domain_from({DOMAIN: text})
 
 
 # ── secrets ─────────────────────────────────────────────────────────────────────────────

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 DEFAULT_TEMPLATE = "development"
 EVERYTHING, NODE_BASICS = "everything", "node_basics"
+CA_SERVICE_SCHEME = "issuer:"
+"""Begins the place of an identity CA's key that stands for a CA service, such as issuer:NAME."""
 _LONGEST_AUTHORITY_NAME = 40  # characters; a common name also has the role and a number
 _DATA_LEVELS = (Level.NONE, Level.SIGN, Level.ENCRYPT)
 _KINDS: dict[str, str] = {"topic": "topics", "service": "services", "action": "actions"}
@@ -92,6 +94,11 @@ class Template:
 def template_names() -> tuple[str, ...]:
     """Return the names of the templates that ship with sros."""
     return tuple(sorted(path.stem for path in templates_dir().glob("*.toml")))
+
+
+def is_ca_service(place: str) -> bool:
+    """Return whether the place of a CA's key stands for a CA service."""
+    return place.startswith(CA_SERVICE_SCHEME)
 
 
 def load_template(choice: str) -> Template:

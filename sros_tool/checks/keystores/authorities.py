@@ -20,7 +20,6 @@ from sros_tool.errors import SrosError
 from sros_tool.faults import ORIGINAL_KEYSTORE
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import FLEET_REMEDY
-from sros_tool.keystore.issuing.ca_service import is_ca_service
 from sros_tool.keystore.layout import (
     CRL,
     FLEET,
@@ -33,8 +32,8 @@ from sros_tool.keystore.layout import (
     key_path,
 )
 from sros_tool.keystore.loading import authority_refusals, refusals_text
-from sros_tool.keystore.rights import RecordedRights
 from sros_tool.keystore.settings import edit_remedy
+from sros_tool.keystore.template import is_ca_service
 from sros_tool.pki.certificates import (
     authority_text,
     same_key,
@@ -421,6 +420,8 @@ def _record_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
         yield LEDGER_DAMAGED.found("ledger", gap, file)
     if count := keystore.ledger.unchained:
         yield LEDGER_UNCHAINED.found("ledger", f"{count} lines have no chain", file)
+        from sros_tool.keystore.rights import RecordedRights
+
         unproven = RecordedRights(keystore.opened, keystore.ledger).unproven_entries()
         if names := [name for name in keystore.names if name in unproven]:
             yield LEDGER_UNPROVEN.found("ledger", names_text(names), file)

@@ -28,6 +28,7 @@ from cryptography import x509
 from cryptography.x509.oid import NameOID
 
 from sros_tool.errors import KeystoreError, PkiError, UsageError
+from sros_tool.keystore.template import CA_SERVICE_SCHEME, is_ca_service
 from sros_tool.pki import tolerant
 from sros_tool.pki.certificates import (
     extension,
@@ -42,7 +43,6 @@ from sros_tool.pki.chains import denies_issuing
 from sros_tool.pki.keys import PublicKey, algorithm
 from sros_tool.validity import Window, iso
 
-_SCHEME = "issuer:"
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,39}", re.ASCII)
 _MOST_BYTES = 64 * 1024
 _MOST_SAID = 500
@@ -77,14 +77,9 @@ class CertificateRequest:
     validity: Window
 
 
-def is_ca_service(place: str) -> bool:
-    """Return whether the place of a CA's key stands for a CA service."""
-    return place.startswith(_SCHEME)
-
-
 def check_ca_service(place: str) -> None:
     """Raise `UsageError` if ``place`` stands for a CA service, and its name is not valid."""
-    if is_ca_service(place) and not _NAME.fullmatch(place.removeprefix(_SCHEME)):
+    if is_ca_service(place) and not _NAME.fullmatch(place.removeprefix(CA_SERVICE_SCHEME)):
         raise UsageError(
             f"'{place}' is not the name of a CA service",
             "issuer:NAME stands for the program sros-issuer-NAME on the PATH; NAME has lower-case "
@@ -102,7 +97,7 @@ class CaService:
     @property
     def program(self) -> str:
         """The name of the program that asks the service."""
-        return f"sros-issuer-{self.place.removeprefix(_SCHEME)}"
+        return f"sros-issuer-{self.place.removeprefix(CA_SERVICE_SCHEME)}"
 
     def issue(
         self, request: CertificateRequest, authority: x509.Certificate, now: datetime

@@ -15,10 +15,10 @@ from shlex import quote
 
 from sros_tool.errors import DocumentError, KeystoreError, PkiError, UsageError
 from sros_tool.files import remove_file, write_new_file
-from sros_tool.keystore.issuing.ca_service import CaService, check_ca_service, is_ca_service
+from sros_tool.keystore.issuing.ca_service import CaService, check_ca_service
 from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, ROLES, ca_key, key_path
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.keystore.template import Template
+from sros_tool.keystore.template import Template, is_ca_service
 from sros_tool.keystore.transaction import Transaction
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 from sros_tool.pki.token import (
