@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -51,6 +52,21 @@ def browser() -> Iterator[Browser]:
         )
         yield running
         running.close()
+
+
+@pytest.fixture(scope="session")
+def axe(request: pytest.FixtureRequest) -> str:
+    """The script of axe-core, which pytest keeps between runs: npm takes long to fetch packages."""
+    lock = json.loads((WEB / "package-lock.json").read_text())
+    key = f"axe-core/{lock['packages']['node_modules/axe-core']['integrity'].replace('/', '_')}"
+    cache = request.config.cache
+    script: str | None = cache.get(key, None) if cache else None
+    if not script:
+        built: Path = request.getfixturevalue("built")
+        script = (built / "node_modules/axe-core/axe.min.js").read_text()
+        if cache:
+            cache.set(key, script)
+    return script
 
 
 @pytest.fixture(scope="session")

@@ -189,7 +189,8 @@ class Running(Forked):
     """A forked run of the program, at which a test can look and which it can send signals.
 
     It leads a session of its own, and calls ``first`` before the program.  Its standard input is
-    the file ``read_from``, and its standard output goes to the file ``write_to``, if any.
+    the file ``read_from``, and its standard output goes to the file ``write_to``, if any; if
+    ``together``, its errors, too.
     """
 
     def __init__(
@@ -200,6 +201,7 @@ class Running(Forked):
         first: Callable[[], object] | None = None,
         read_from: Path = Path(os.devnull),
         write_to: Path | None = None,
+        together: bool = False,
     ) -> None:
         words = [str(argument) for argument in arguments]
         self._out, self._err = TemporaryFile(), TemporaryFile()  # noqa: SIM115 - live as long
@@ -213,7 +215,8 @@ class Running(Forked):
 
         def work() -> int:
             out = os.open(write_to, os.O_WRONLY) if write_to else self._out.fileno()
-            _become_program(words, None, cwd, begin, out, self._err.fileno(), read_from)
+            err = out if together else self._err.fileno()
+            _become_program(words, None, cwd, begin, out, err, read_from)
 
         super().__init__(work, env=dict(env or os.environ), errors=Path(os.devnull))
 

@@ -37,7 +37,7 @@ from pathlib import Path
 
 from sros_tool.runtime.netns import enter_isolation, try_isolation
 from tests.support.children import PATIENCE
-from tests.support.harness import forked
+from tests.support.harness import Running, forked
 
 PROJECT = Path(__file__).resolve().parents[2]
 HOME = "/home/robot"
@@ -161,7 +161,7 @@ def fits(expected: tuple[str, ...], said: str, *, begun: bool = False) -> bool:
 
 @dataclass
 class _Terminal:
-    process: subprocess.Popen[bytes]
+    process: subprocess.Popen[bytes] | Running
     output: Path
     folder: Path
     shown: tuple[str, ...] = ()
@@ -256,16 +256,22 @@ class _Run:
 
     def start(self, name: str, command: Command) -> None:
         output = self.folder / f"{name}.log"
+        words = _simple(command.text)
         with output.open("wb") as log:
-            process = subprocess.Popen(
-                ["bash", "-c", f"exec {command.text}"],
-                cwd=self.cwd,
-                env=self.env,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
+            if words and words[0] == "sros":
+                process: subprocess.Popen[bytes] | Running = Running(
+                    *words[1:], env=self.env, cwd=self.cwd, write_to=output, together=True
+                )
+            else:
+                process = subprocess.Popen(
+                    ["bash", "-c", f"exec {command.text}"],
+                    cwd=self.cwd,
+                    env=self.env,
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    start_new_session=True,
+                )
         self.terminals[name] = _Terminal(process, output, self.folder / "home")
         self.terminals[name].wait(command.output, f"{self.page}:{command.line}: {command.text}")
 
