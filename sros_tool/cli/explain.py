@@ -949,6 +949,11 @@ def _who_lines(
     for outcome in in_part:
         parts = ", ".join(outcome.in_part)
         lines.append((outcome.enclave, f"{outcome.enclave}  in part: {parts}"))
+    holding = [outcome for outcome in answer.outcomes if outcome.by_permissions_of]
+    for outcome in holding:
+        holders = first_few(outcome.by_permissions_of, 3)
+        text = f"{outcome.enclave}  with the permissions of {holders}, which fit its certificate"
+        lines.append((outcome.enclave, text))
     for outcome in able:
         wildcard = f"  by the wildcard {outcome.wildcard}" if outcome.wildcard else ""
         where = f"  in domain {outcome.domains}" if by_domains else ""
@@ -967,7 +972,8 @@ def _who_lines(
     if in_part:
         whole = f"{len(in_part)} of {count}{asked_in} may {answer.question} in part, {len(able)} "
         whole += "as a whole"
-    yield f"{whole}{where}"
+    further = f", and {len(holding)} more with other permissions" if holding else ""
+    yield f"{whole}{where}{further}"
 
 
 # ── --reach ────────────────────────────────────────────────────────────────────────────────

@@ -9,6 +9,7 @@ from fnmatch import fnmatchcase
 from typing import NamedTuple
 
 from sros_tool.dds.decision.access import AccessVerb, Outcome, OutcomeWord, ReasonWord
+from sros_tool.dds.decision.grants import other_fitting_enclaves
 from sros_tool.dds.decision.vendors import PRINCIPAL, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.distributions import SUPPORTED, Shipped
@@ -53,6 +54,7 @@ from sros_tool.names import is_expression
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.values import shows
+from sros_tool.wording import first_few
 
 
 @shows("zenoh")
@@ -208,6 +210,7 @@ def explain_on_dds(
         *_note_on_parts(evaluator, answer),
         *_not_a_topic_notes(answer, asked_enclave),
         *_similar_name_notes(answer),
+        *_note_on_fitting_permissions(evaluator, answer),
         *(note_on_lacking_keys(copied) if copied else ()),
         *_earlier_permissions_notes(answer, context.at),
         *_note_on_anybody([_opened_parts(evaluator, question)], refuse),
@@ -335,6 +338,44 @@ def _similar_name_notes(answer: Answer) -> Iterator[Note]:
         yield Note("explain.likely-name", f"{text}meant.")
 
 
+def _note_on_fitting_permissions(evaluator: Evaluator, answer: Answer) -> Iterator[Note]:
+    """Yield a note if a denied enclave can do it with the permissions of another enclave."""
+    if answer.allowed or not answer.question.right:
+        return
+    holders = [
+        holder.name
+        for holder in _fitting_holders(evaluator)
+        if Evaluator(evaluator.vendor, holder, evaluator.context).answer(answer.question).allowed
+    ]
+    if holders:
+        text = (
+            f"whoever has the key of {evaluator.enclave.name} may do it with the permissions of "
+            f"{first_few(holders, 3)}, which are not secret and fit its certificate. Choose names "
+            "that do not consist of parts of another name, or unique subjects (template "
+            "production)."
+        )
+        yield Note("explain.fitting-permissions", text)
+
+
+def _fitting_holders(evaluator: Evaluator) -> Iterator[LoadedEnclave]:
+    """Yield other enclaves of the keystore whose permissions also fit an enclave's certificate.
+
+    Only enclaves are read whose paths have all parts of the enclave's path.
+    """
+    enclave, keystore = evaluator.enclave, evaluator.enclave.keystore
+    own_parts, certified = {*enclave.name.split("/")}, {enclave.name: enclave.subject}
+    if keystore is None or enclave.state is None:
+        return
+    for name in keystore.names:
+        if name == enclave.name or not own_parts <= {*name.split("/")}:
+            continue
+        holder = deciding_enclave(keystore, name, moment=evaluator.context.at)
+        grant = holder.state.grant if holder.state else None
+        granted = {name: [grant.subject] if grant else []}
+        if other_fitting_enclaves(evaluator.vendor.traits, certified, granted):
+            yield holder
+
+
 # ── Zenoh, next to it ──────────────────────────────────────────────────────────────────────
 
 
@@ -392,7 +433,8 @@ class OpenedParts(NamedTuple):
 
 
 @shows(
-    *("enclave", "allowed", "in_part", "outcome", "reason", "expression", "wildcard", "domains"),
+    *("enclave", "allowed", "in_part", "by_permissions_of", "outcome", "reason", "expression"),
+    *("wildcard", "domains"),
     null_if_empty=("expression", "wildcard", "domains"),
 )
 class VendorOutcome(NamedTuple):
@@ -412,6 +454,11 @@ class VendorOutcome(NamedTuple):
     in_part: Sequence[str] = ()
     """The parts of an action, such as ``send_goal``, by which the enclave can command the server
     (with call) or inform the clients (with execute), although it does not have the whole right."""
+    by_permissions_of: Sequence[str] = ()
+    """The other enclaves whose permissions fit the certificate of this enclave and allow it, so
+    that whoever has the key of this enclave may do it, too."""
+    subject: str = ""
+    granted: str = ""
 
     @property
     def allowed(self) -> bool:
@@ -504,6 +551,8 @@ def _outcome(evaluator: Evaluator, name: str, question: Question) -> VendorOutco
         expression,
         opened=_opened_parts(evaluator, question),
         in_part=_allowed_parts(evaluator, answer),
+        subject=evaluator.enclave.subject,
+        granted=answer.grant.subject if answer.grant else "",
     )
 
 
@@ -582,6 +631,10 @@ class VendorOfPolicy(NamedTuple):
         return _note_on_anybody(opened, f"Change the template, or run {REFUSE_STRANGERS}.")
 
 
+_MOST_NARROWED = 100
+"""If more enclaves are asked about, all are decided: permissions of others perhaps fit."""
+
+
 class VendorOfKeystore(NamedTuple):
     """The decisions of a vendor on the enclaves ``names`` of a keystore; without names, on all."""
 
@@ -632,7 +685,27 @@ class VendorOfKeystore(NamedTuple):
             opened = OpenedParts.joined(outcome.opened for outcome in decisions.values())
             return decision._replace(domains=domains, in_part=in_part, opened=opened)
 
-        return decide_each(self.keystore.names if self.names is None else self.names, outcome)
+        every = self.keystore.names
+        names = every if self.names is None else self.names
+        holders: Sequence[str] = ()
+        if len(names) > _MOST_NARROWED:
+            holders = every
+        elif names != every:
+            own_parts = [{*name.split("/")} for name in names]
+            holders = [n for n in every if any(parts <= {*n.split("/")} for parts in own_parts)]
+        outcomes = decide_each([*dict.fromkeys((*names, *holders))], outcome)
+        asked = {*names}
+        return tuple(o for o in self._with_holders(outcomes) if o.enclave in asked)
+
+    def _with_holders(self, outcomes: Sequence[VendorOutcome]) -> tuple[VendorOutcome, ...]:
+        """Return denials with the allowed enclaves whose permissions the denied ones can use."""
+        certified = {o.enclave: o.subject for o in outcomes if o.subject and not o.allowed}
+        granted = {o.enclave: [o.granted] for o in outcomes if o.granted and o.allowed}
+        vendors = {self.vendor, *(self.stated(o.enclave) or self.vendor for o in outcomes)}
+        holders: dict[str, tuple[str, ...]] = {}
+        for vendor in vendors if granted else ():
+            holders |= other_fitting_enclaves(vendor.traits, certified, granted)
+        return tuple(o._replace(by_permissions_of=holders.get(o.enclave, ())) for o in outcomes)
 
     def printed(self, question: Question, outcomes: Sequence[VendorOutcome]) -> WhoByVendor:
         """Return the outcomes in the form that ``--json`` prints."""

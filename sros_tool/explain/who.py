@@ -67,6 +67,10 @@ class EnclaveOutcome(Protocol):
     def in_part(self) -> Sequence[str]:
         """The acting parts of an action that the enclave may do, but not the whole."""
 
+    @property
+    def by_permissions_of(self) -> Sequence[str]:
+        """The other enclaves whose permissions fit this enclave's certificate and allow it."""
+
 
 _Outcome = TypeVar("_Outcome", bound=EnclaveOutcome)
 
@@ -101,8 +105,11 @@ class AnswerForAll(NamedTuple):
 
     @property
     def allowed(self) -> bool:
-        """Whether any enclave has the right, or processes without an identity have it."""
-        return any(outcome.allowed or outcome.anybody for outcome in self.outcomes)
+        """Whether any enclave can do it, or processes without an identity can."""
+        return any(
+            outcome.allowed or outcome.anybody or outcome.by_permissions_of
+            for outcome in self.outcomes
+        )
 
 
 def note_on_export(root: Path) -> Iterator[Note]:

@@ -197,6 +197,11 @@ class ZenohAnswer:
         return False
 
     @property
+    def by_permissions_of(self) -> tuple[str, ...]:
+        """None: Zenoh reads no permissions."""
+        return ()
+
+    @property
     def in_brief(self) -> ZenohInBrief:
         """Whether Zenoh allows the access, and why."""
         mode = self.mode.value if self.mode else None

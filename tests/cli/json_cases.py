@@ -53,6 +53,10 @@ POLICIES = {
     "other.xml": policy_text({"/a": publish("/x", "/z"), "/new": publish("/x")}),
     "protected.xml": policy_text({"/a": publish('/x<?sros protect="sign"?>')}),
     "denied.xml": policy_text({"/a": _DENIED, "/b": publish("/x")}),
+    "guarded.xml": policy_text(
+        {"/a": _WILD + _DENIED.replace("topic", "service").replace("publish", "request")}
+    ),
+    "moved.xml": policy_text({"/a": f'{_WILD}</profile><profile ns="/" node="m">{publish("/x")}'}),
     "wild.xml": policy_text({"/a": _WILD, "/b": publish("/x")}),
     "quiet.xml": policy_text({"/a": publish("/x"), "/quiet": ""}),
     "large.xml": policy_text({"/a": publish(*(f"/{'n' * 60}/x{i}" for i in range(900)))}),
@@ -328,6 +332,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("crew.xml crew.xml --fleet near.toml --fleet far.toml", 1),
         Case("--no-new-access policy.xml policy.xml"),
         Case("--no-new-access policy.xml wild.xml", 1),
+        Case("--no-new-access guarded.xml moved.xml", 1),
         Case("--no-new-access ks wild.xml", 1),
         Case("--no-new-access protected.xml policy.xml", 1),
         Case("--no-new-access policy.xml protected.xml"),

@@ -577,6 +577,26 @@ def test_a_name_that_is_an_action_is_asked_about_as_one(
     assert "an-action" not in chosen.err
 
 
+def test_permissions_of_another_enclave_that_fit_are_said(tmp_path: Path) -> None:
+    """Cyclone DDS takes the permissions of /robot/mux for /mux, unless subjects are unique."""
+    enclaves = {"/mux": publish("/t"), "/robot/mux": publish("/cmd_vel"), "/base": publish("/b")}
+    (tmp_path / "p.xml").write_text(policy_text(enclaves))
+    for template in ("sros2", "production"):
+        keystore = tmp_path / template
+        sros("create_keystore", keystore, "--template", template).ok()
+        sros("generate_artifacts", "-k", keystore, "-p", tmp_path / "p.xml").ok()
+        for vendor in ("cyclonedds", "fastdds"):
+            fits = (template, vendor) == ("sros2", "cyclonedds")
+            words = ("publish", "/cmd_vel", "--vendor", vendor)
+            who = explain(keystore, "--who", *words).ok().out.splitlines()
+            line = "/mux  with the permissions of /robot/mux, which fit its certificate"
+            assert who[:-1] == [line] * fits + ["/robot/mux"]
+            assert who[-1].endswith(", and 1 more with other permissions" if fits else "/cmd_vel")
+            assert explain(keystore, "--who", *words, "--match", "/mux").status == 1 - fits
+            single = explain(keystore, "/mux", *words)
+            assert ("with the permissions of /robot/mux, which are not" in single.err) is fits
+
+
 def test_a_name_that_is_an_action_is_asked_about_as_one_of_everybody(fibonacci: Path) -> None:
     for word, right, who in (("call", "call", CLIENT), ("serve", "execute", SERVER)):
         found = explain(fibonacci, "--who", word, "/fibonacci")
