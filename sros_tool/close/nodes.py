@@ -38,9 +38,14 @@ class ObservedNodes:
 
     @cached_property
     def as_observed(self) -> Sequence[ObservedNode]:
-        """The nodes with the enclaves and names that they had, as they were given or written."""
-        if self._nodes is not None:
-            return self._nodes
+        """The nodes with the enclaves and names that they had, as they were given or written.
+
+        Nodes whose enclave the graph did not show are left out.
+        """
+        nodes = self._written_nodes() if self._nodes is None else self._nodes
+        return [node for node in nodes if node.enclaves]
+
+    def _written_nodes(self) -> Sequence[ObservedNode]:
         path = self.robot.observation_file
         try:
             return observation_from_json(parse_json(read_bytes(path, "observation"))).nodes

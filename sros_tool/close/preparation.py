@@ -90,8 +90,8 @@ def _do_steps(
                 _, output, messages = robot.shell.run((*step.words, "--dry-run"), False)
                 robot.shell.say_lines(messages if output else "")
         elif state == "open" and not is_stopped:
-            state, problem = _do(robot, step)
-            problems += [problem] if problem else []
+            state, step_problems = _do(robot, step)
+            problems += step_problems
             is_stopped = step.guards and state == "findings"
         done.append(CloseStep(step.command, state))
         if step.into == robot.observation_file and not dry_run:
@@ -101,8 +101,8 @@ def _do_steps(
     return done, problems, is_stopped
 
 
-def _do(robot: LocalRobot, step: CommandStep) -> tuple[str, str]:
-    """Do a step; return its state, and why the robot is not closed yet, or "".
+def _do(robot: LocalRobot, step: CommandStep) -> tuple[str, list[str]]:
+    """Do a step; return its state, and why the robot is not closed yet.
 
     Raises:
         SrosError: the robot cannot be watched.
@@ -120,10 +120,10 @@ def _do(robot: LocalRobot, step: CommandStep) -> tuple[str, str]:
         if VIOLATED.id in output:
             needed = shlex.quote(str(robot.requirements))
             remedy += f"; if you want the change, edit {needed}, or remove it for new ones"
-        return "findings", f"findings of `{step.command}`{remedy}"
+        return "findings", [f"findings of `{step.command}`{remedy}"]
     if step.into:
         replace_file(step.into, output.encode())
-    return "done", ""
+    return "done", []
 
 
 def _warn_of_rmw(robot: LocalRobot, observed: ObservedProcesses) -> None:

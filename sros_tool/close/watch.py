@@ -48,10 +48,11 @@ _StartedProcesses = dict[tuple[str, ...], tuple[Process, ProcessOrigin]]
 """Processes by their commands, with what started them."""
 
 
-def watch(robot: LocalRobot, step: CommandStep) -> str:
+def watch(robot: LocalRobot, step: CommandStep) -> list[str]:
     """Watch the robot by a step, and write its nodes and processes into the folder.
 
-    Return, as a sentence, which of the observed rights an earlier policy lacks.
+    Return, as sentences, which nodes have no enclave, and which of the observed rights an earlier
+    policy lacks.
 
     Raises:
         SrosError: the robot cannot be watched.
@@ -121,16 +122,18 @@ def _looking(robot: LocalRobot, started: _StartedProcesses) -> Iterator[None]:
         looking.join()
 
 
-def _remember(robot: LocalRobot, document: str, started: _StartedProcesses) -> str:
+def _remember(robot: LocalRobot, document: str, started: _StartedProcesses) -> list[str]:
     """Write which process has which nodes, and the policy of the observer.
 
     ``document`` is the observation, and ``started`` are the processes that ran while sros watched.
-    Return, as a sentence, which of the observed rights an earlier policy lacks.
+    Return, as sentences, which nodes have no enclave, and which of the observed rights an earlier
+    policy lacks.
     """
     replace_file(robot.observer, (policies_dir() / "observer.xml").read_bytes())
     running, learned = RunningRobot(robot), json.loads(document)
-    observed_nodes = ObservedNodes(robot, observation_from_json(learned).nodes)
-    nodes = [node for node in observed_nodes.in_their_enclaves() if not is_tool(node)]
+    every_node = observation_from_json(learned).nodes
+    in_enclaves = ObservedNodes(robot, every_node).in_their_enclaves()
+    nodes = [node for node in in_enclaves if not is_tool(node)]
     observed = _observed_processes(robot, nodes, learned["ended"], running, started)
     enclaves_here = {process.enclave for process in observed.processes}
     not_here = (robot.not_here - enclaves_here).union(robot.named_elsewhere)
@@ -148,7 +151,18 @@ def _remember(robot: LocalRobot, document: str, started: _StartedProcesses) -> s
         robot.shell.say(others)
     if os.path.lexists(robot.observed_policy):  # of an earlier watch
         remove_file(robot.observed_policy)
-    return _lacking_text(robot, nodes) if learned["dry_run"] else ""
+    without_enclave = [node.fqn for node in every_node if not node.enclaves and not is_tool(node)]
+    problems = [_without_enclave_text(robot, without_enclave)] if without_enclave else []
+    lacking = _lacking_text(robot, nodes) if learned["dry_run"] else ""
+    return problems + [lacking] * bool(lacking)
+
+
+def _without_enclave_text(robot: LocalRobot, names: Sequence[str]) -> str:
+    return (
+        f"{first_few(names, MOST_NAMES)}: the identifier of the participant is that of a secured "
+        f"one, so '{robot.policy}' has no rights for this node; if it is of the robot, start it "
+        f"open, and watch again: {robot.close_command} --for 1m"
+    )
 
 
 def _observed_processes(

@@ -856,6 +856,16 @@ def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None
     assert "/talker -- /opt/run talker\n" in commands
 
 
+def test_a_node_whose_enclave_the_graph_does_not_show_is_named(robot: Robot) -> None:
+    """Any participant can have an identifier that looks like that of a secured one."""
+    robot.nodes += (ros_node("ghost", "8f0f0000681200000000", "publish rt/cmd_vel"),)
+    said = robot.close(status=1).out
+    assert "/ghost: the identifier of the participant is that of a secured one, so 'rob" in said
+    robot.by_hand = set(PID)
+    robot.nodes = (TALKER, LISTENER)
+    assert "2 nodes with 36 endpoints as before" in robot.close("--proof").out
+
+
 def test_a_node_that_was_restarted_without_its_namespace(robot: Robot) -> None:
     left = ros_node("left/listener", LISTENER[3], "subscribe rt/left/chatter")
     robot.nodes = (TALKER, left)
