@@ -74,7 +74,7 @@ class ActionModule(RobotAction):
         """Return the result without enclaves to restart that are not of this robot."""
         for key in ("restart", "routers"):
             if self._sent is not None and key in returned:
-                returned[key] = [each for each in returned[key] if each in self._sent]
+                returned[key] = [enclave for enclave in returned[key] if enclave in self._sent]
         return super().shown(returned)
 
 
@@ -88,8 +88,8 @@ def export(arguments: dict[str, Any]) -> bytes:
     program = arguments.get("program") or ["sros"]
     words = ["distribute_key", str(arguments["keystore"]), "--keyless"]
     if patterns := arguments.get("patterns"):
-        for each in patterns:
-            words += ["--match", str(each)]
+        for pattern in patterns:
+            words += ["--match", str(pattern)]
     else:
         words += ["--robot", str(arguments["robot"])]
     done = ask([*program, *words, "-"])

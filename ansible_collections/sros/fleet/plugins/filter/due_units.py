@@ -44,14 +44,14 @@ _value:
 
 def due_units(units: list[Any], changed: list[str], routers: list[str] | None = None) -> list[str]:
     """Return the names of the units to restart, those of Zenoh routers first."""
-    due = [each for each in units if changed and _runs_in(each, changed)]
-    first = [each for each in due if _names_one(each, routers or [])]
-    return [each["name"] for each in [*first, *(each for each in due if each not in first)]]
+    due = [unit for unit in units if changed and _runs_in(unit, changed)]
+    first = [unit for unit in due if _names_one(unit, routers or [])]
+    return [unit["name"] for unit in [*first, *(unit for unit in due if unit not in first)]]
 
 
 def without_unit(changed: list[str], units: list[Any]) -> list[str]:
     """Return the enclaves in which no unit runs."""
-    return [each for each in changed if not any(_runs_in(unit, [each]) for unit in units)]
+    return [enclave for enclave in changed if not any(_runs_in(unit, [enclave]) for unit in units)]
 
 
 def _runs_in(unit: dict[str, Any], enclaves: list[str]) -> bool:

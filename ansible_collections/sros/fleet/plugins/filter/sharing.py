@@ -54,7 +54,7 @@ def sharing(hosts: Mapping[str, Any], meant: Sequence[str]) -> list[str]:
             continue
         if not variables.get("sros_patterns"):
             found.setdefault(str(variables.get("sros_robot") or host), []).append(host)
-    return [f"{robot} ({', '.join(each)})" for robot, each in found.items() if len(each) > 1]
+    return [f"{robot} ({', '.join(hosts)})" for robot, hosts in found.items() if len(hosts) > 1]
 
 
 class FilterModule:

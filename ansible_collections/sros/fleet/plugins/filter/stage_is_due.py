@@ -48,13 +48,17 @@ _DIGEST = re.compile(r"[0-9a-fA-F]{64}")
 def stage_is_due(status: dict[str, Any], stage: str, replaced: Any) -> bool:
     """Return whether a stage is to be done, to replace the CAs with the digests ``replaced``."""
     digests = [replaced] if isinstance(replaced, str) else list(replaced)
-    if not digests or not all(_DIGEST.fullmatch(str(each)) for each in digests):
+    if not digests or not all(_DIGEST.fullmatch(str(digest)) for digest in digests):
         raise AnsibleFilterError(
             "sros_replace_ca has to be the SHA-256 of the CA certificate that is to be replaced, 64"
             " hexadecimal digits. See `sros rotate_ca KEYSTORE --status --json`."
         )
-    wanted = {str(each).lower() for each in digests}
-    issuing = {each["sha256"] for each in status["authorities"] if each["state"] == "issuing"}
+    wanted = {str(digest).lower() for digest in digests}
+    issuing = {
+        authority["sha256"]
+        for authority in status["authorities"]
+        if authority["state"] == "issuing"
+    }
     now = status["stage"]
     if stage == "distribute":
         return now == stage or (now == "none" and bool(wanted & issuing))

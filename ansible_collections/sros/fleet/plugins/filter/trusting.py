@@ -54,16 +54,16 @@ def trusting(
     listed: Mapping[str, Any], hosts: Mapping[str, Any], revoked: Collection[str] = ()
 ) -> dict[str, list[str]]:
     """Return who was not served, and what the ``revoked`` robots have besides their own."""
-    served = [hosts[each]["sros_served"] for each in hosts_with(hosts, "sros_served")]
+    served = [hosts[host]["sros_served"] for host in hosts_with(hosts, "sros_served")]
     owners: Mapping[str, str] = listed.get("robots") or {}
     lacking: set[str] = set()
     enclaves = []
     for name in listed["enclaves"]:
         owner = owners.get(name)
         if owner is None:
-            got = any(_fits(name, each["patterns"]) for each in served)
+            got = any(_fits(name, robot["patterns"]) for robot in served)
         else:  # that another host got it, too, brings its robot nothing
-            own = [each["patterns"] for each in served if each["robot"] == owner]
+            own = [robot["patterns"] for robot in served if robot["robot"] == owner]
             got = any(not patterns or _fits(name, patterns) for patterns in own)
         if got:
             continue
@@ -94,14 +94,14 @@ def _kept(
             continue
         if (variables.get("sros_robot") or host) in revoked:
             patterns, own = (
-                variables.get(f"sros_{each}") or [] for each in ("patterns", "own_keys")
+                variables.get(f"sros_{variable}") or [] for variable in ("patterns", "own_keys")
             )
             kept.update(name for name in names if name in own or _fits(name, patterns))
     return sorted(kept), unknown
 
 
 def _fits(name: str, patterns: Sequence[str]) -> bool:
-    return any(fnmatchcase(name, each) for each in patterns)
+    return any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
 class FilterModule:

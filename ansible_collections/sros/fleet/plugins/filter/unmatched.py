@@ -47,10 +47,10 @@ def unmatched(pattern: str | Sequence[str], groups: Mapping[str, Sequence[str]])
         inventory.add_group(group)
         for host in hosts:
             inventory.add_host(host, group=group)
-    written = pattern if isinstance(pattern, str) else [str(each) for each in pattern]
-    parts = [str(each) for each in split_host_pattern(written)]
-    meant = {each: inventory.get_hosts(each.lstrip("!&")) for each in parts}
-    return [each for each in parts if not meant[each]]
+    written = pattern if isinstance(pattern, str) else [str(part) for part in pattern]
+    parts = [str(part) for part in split_host_pattern(written)]
+    meant = {part: inventory.get_hosts(part.lstrip("!&")) for part in parts}
+    return [part for part in parts if not meant[part]]
 
 
 class FilterModule:

@@ -74,7 +74,7 @@ def check_enclave(name: str) -> str:
     if (
         not name.startswith("/")
         or len(name) > _LONGEST_NAME
-        or not all(_TOKEN.fullmatch(each) for each in parts)
+        or not all(_TOKEN.fullmatch(part) for part in parts)
     ):
         raise RefusedError(
             f"{name[:200]!r} is not the name of an enclave. It has letters, digits and underscores,"
@@ -109,7 +109,7 @@ def read_archive(packed: bytes) -> Files:
     except (tarfile.TarError, zlib.error, EOFError, OSError, ValueError, OverflowError) as error:
         raise RefusedError(f"The export is damaged or not a .tar.gz archive: {error}.") from error
     for enclave in enclaves_in(files):
-        missing = [each for each in REQUIRED_FILES if folder_of(enclave) + "/" + each not in files]
+        missing = [file for file in REQUIRED_FILES if folder_of(enclave) + "/" + file not in files]
         if missing:
             raise RefusedError(
                 "The export of enclave {} lacks {}.".format(enclave, ", ".join(missing))
@@ -202,10 +202,10 @@ def confirmation(robot: str, files: Files, now: float, due: list) -> dict:
         "format": 1,
         "robot": robot,
         "time": moment.strftime("%Y-%m-%dT%H:%M:%SZ"),
-        "files": {path: hashlib.sha256(each).hexdigest() for path, each in confirmed.items()},
+        "files": {path: hashlib.sha256(data).hexdigest() for path, data in confirmed.items()},
         "certificates": {
-            path: certificate_digests(each)
-            for path, each in confirmed.items()
+            path: certificate_digests(data)
+            for path, data in confirmed.items()
             if path.rpartition("/")[2] in (CERTIFICATE_FILE, *AUTHORITY_FILES)
         },
         "restart": sorted(due),

@@ -53,9 +53,15 @@ def harmless(text: str, *, most: int | None = _MOST_SHOWN, lines: bool = False) 
         text = text[:most] + "..."
     text = text.replace("\r\n", "\n")
     if lines:
-        text = "".join(each if each in "\n\t" or _is_visible(each) else "?" for each in text)
+        text = "".join(
+            character if character in "\n\t" or _is_visible(character) else "?"
+            for character in text
+        )
         return _LONG_BLANK.sub(" ", text)
-    text = "".join(each if _is_visible(each) else " " if each in "\n\t" else "?" for each in text)
+    text = "".join(
+        character if _is_visible(character) else " " if character in "\n\t" else "?"
+        for character in text
+    )
     return re.sub("  +", " ", text)
 
 

@@ -105,7 +105,7 @@ class Place:
             for folder, folders, files, handle in os.fwalk(".", dir_fd=top, onerror=_fail):
                 below = os.path.relpath(folder, ".")
                 self._leave_out_agent(below, folders, handle)
-                names = [(each, True) for each in folders] + [(each, False) for each in files]
+                names = [(entry, True) for entry in folders] + [(entry, False) for entry in files]
                 for name, is_folder in names:
                     path = name if below == "." else f"{below}/{name}"
                     if not self._belongs(path, name, is_folder, handle):
@@ -201,7 +201,7 @@ class Place:
 
     def is_pending(self) -> bool:
         """Return whether a process was killed in a change that was decided."""
-        return any(os.path.lexists(self._beside(each)) for each in ("remove", "apply"))
+        return any(os.path.lexists(self._beside(suffix)) for suffix in ("remove", "apply"))
 
     def prepare(self, files: Files) -> None:
         """Write all files into `stage`, which only this user can open."""
@@ -235,7 +235,7 @@ class Place:
 
     def _end(self) -> None:
         """Go on with a change that was decided, from the step that it reached."""
-        remove, apply, old = (self._beside(each) for each in ("remove", "apply", "old"))
+        remove, apply, old = (self._beside(suffix) for suffix in ("remove", "apply", "old"))
         if os.path.lexists(remove):
             with _opened(self._parent) as parent:
                 if os.path.lexists(self.path) and not self._is_kept(self._name, parent):
@@ -332,7 +332,7 @@ class Place:
             handle = os.open(self._beside(record), _FILE)
             with os.fdopen(handle, "rb") as file:
                 names = json.loads(file.read(MOST_OF_FILE).decode())
-            return sorted({check_enclave(each) for each in names})
+            return sorted({check_enclave(enclave) for enclave in names})
         except FileNotFoundError:
             return []
         except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:

@@ -34,8 +34,8 @@ _SUBJECT = re.compile(r"<subject_name>([^<]{1,2000})</subject_name>")
 _REASON = re.compile(r"(?:depth lookup|Verify error): ?(.+)")
 _MOST_SHOWN = 1000
 _CERTIFICATE, _LIST = (
-    re.compile(rb"-----BEGIN %b-----[A-Za-z0-9+/=\s]+-----END %b-----\n?" % (each, each))
-    for each in (b"CERTIFICATE", b"X509 CRL")
+    re.compile(rb"-----BEGIN %b-----[A-Za-z0-9+/=\s]+-----END %b-----\n?" % (label, label))
+    for label in (b"CERTIFICATE", b"X509 CRL")
 )
 _MOST_LISTS = 8
 _NUMBER = re.compile(r"X509v3 CRL Number: (?:critical)?\s+(\w+)")
@@ -68,7 +68,7 @@ def verify(folder: str, enclaves: list[str], program: list[str]) -> dict:
     problems: list[str] = []
     for name in enclaves:
         found = _by_openssl(openssl, os.path.join(folder, folder_of(name)), name)
-        problems += [f"{name}: {each}" for each in found]
+        problems += [f"{name}: {problem}" for problem in found]
     return {"by": "openssl", "ok": not problems, "problems": problems, "remarks": []}
 
 
@@ -143,7 +143,7 @@ def _read_list(block: bytes, authority: bytes, spare: str) -> _List | None:
             "Revocation lists cannot be compared: this robot lacks openssl. Install the package"
             " openssl on it."
         )
-    at = {each: os.path.join(spare, each) for each in ("list.pem", "ca.pem")}
+    at = {file: os.path.join(spare, file) for file in ("list.pem", "ca.pem")}
     for path, content in zip(at.values(), (block, authority)):
         with open(path, "wb") as file:
             file.write(content)
@@ -161,10 +161,10 @@ def _by_sros(folder: str, enclaves: list[str], program: list[str]) -> dict:
     done = _run([*program, "verify", folder, "--json"])
     try:
         answer = json.loads(done.stdout)
-        loadable = {each["name"]: bool(each["loadable"]) for each in answer["enclaves"]}
+        loadable = {enclave["name"]: bool(enclave["loadable"]) for enclave in answer["enclaves"]}
         texts: dict[str, list[str]] = {}
-        for each in answer["findings"]:
-            texts.setdefault(each["enclave"] or "", []).append(str(each["text"]))
+        for finding in answer["findings"]:
+            texts.setdefault(finding["enclave"] or "", []).append(str(finding["text"]))
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise RefusedError(
             "`sros verify` gave no answer: {}".format(_short(done.stderr.decode(errors="replace")))
@@ -174,16 +174,16 @@ def _by_sros(folder: str, enclaves: list[str], program: list[str]) -> dict:
     for name in enclaves:
         found = texts.pop(name, [])
         if loadable.get(name):
-            remarks += [f"{name}: {each}" for each in found]
+            remarks += [f"{name}: {problem}" for problem in found]
         else:
-            problems += [f"{name}: {each}" for each in found or ["it is not loadable"]]
+            problems += [f"{name}: {problem}" for problem in found or ["it is not loadable"]]
     return {"by": "sros", "ok": not problems, "problems": problems, "remarks": remarks}
 
 
 def _by_openssl(openssl: str, folder: str, name: str) -> list[str]:
     """Return why an enclave cannot be used, as far as OpenSSL can tell."""
-    at = {each: os.path.join(folder, each) for each in (KEY_FILE, CERTIFICATE_FILE, "crl.pem")}
-    identity, permissions = (os.path.join(folder, each) for each in AUTHORITY_FILES)
+    at = {file: os.path.join(folder, file) for file in (KEY_FILE, CERTIFICATE_FILE, "crl.pem")}
+    identity, permissions = (os.path.join(folder, file) for file in AUTHORITY_FILES)
     problems: list[str] = []
     chain = [openssl, "verify", "-no-CApath", "-partial_chain", "-CAfile", identity]
     if os.path.exists(at["crl.pem"]):
@@ -227,7 +227,7 @@ def _by_openssl(openssl: str, folder: str, name: str) -> list[str]:
         if done.returncode:
             problems.append(f"{file}: {_why(done)}")
         elif file == "permissions.p7s":
-            problems += [f"{file}: {each}" for each in _permissions(done.stdout, name)]
+            problems += [f"{file}: {problem}" for problem in _permissions(done.stdout, name)]
     return problems
 
 
@@ -235,7 +235,7 @@ def _permissions(document: bytes, name: str) -> list[str]:
     """Return what is wrong with a permissions document that is signed: dates and subject."""
     text = document.decode(errors="replace")
     problems = []
-    if not any(_names(each, name) for each in _SUBJECT.findall(text)):
+    if not any(_names(subject, name) for subject in _SUBJECT.findall(text)):
         problems.append("it is not for this enclave")
     now = datetime.datetime.fromtimestamp(time.time(), datetime.timezone.utc)
     for which, written in _DATES.findall(text):
@@ -255,8 +255,8 @@ def _permissions(document: bytes, name: str) -> list[str]:
 
 def _names(subject: str, name: str) -> bool:
     """Return whether a subject's common name is that of an enclave."""
-    parts = [each.strip() for each in subject.replace("/CN=", ",CN=").split(",")]
-    return any(each == "CN=" + name for each in parts)
+    parts = [part.strip() for part in subject.replace("/CN=", ",CN=").split(",")]
+    return any(part == "CN=" + name for part in parts)
 
 
 def _run(command: list[str]) -> subprocess.CompletedProcess:
@@ -285,7 +285,9 @@ def _why(done: subprocess.CompletedProcess) -> str:
 
 
 def _short(text: str) -> str:
-    shown = "".join(each if each.isprintable() else "?" for each in " ".join(text.split()))
+    shown = "".join(
+        character if character.isprintable() else "?" for character in " ".join(text.split())
+    )
     return shown if len(shown) <= _MOST_SHOWN else shown[:_MOST_SHOWN] + "..."
 
 

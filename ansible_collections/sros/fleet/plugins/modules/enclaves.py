@@ -253,7 +253,9 @@ def _look(place: Place, asked: dict, now: float) -> dict:
             pass
     present = place.read()
     names = [
-        each for each in enclaves_in(present) if folder_of(each) + "/" + CERTIFICATE_FILE in present
+        enclave
+        for enclave in enclaves_in(present)
+        if folder_of(enclave) + "/" + CERTIFICATE_FILE in present
     ]
     found = verify(place.path, names, asked["verifier"])
     return {
@@ -275,15 +277,15 @@ def _after(before: Files, sent: Files) -> Files:
     """
     after = dict(sent)
     for name in enclaves_in(sent):
-        keys = [folder_of(name) + "/" + each for each in KEY_FILES]
-        if not any(each in sent for each in keys):
-            if not any(each in before for each in keys):
+        keys = [folder_of(name) + "/" + file for file in KEY_FILES]
+        if not any(path in sent for path in keys):
+            if not any(path in before for path in keys):
                 raise RefusedError(
                     f"The key of enclave {name} is neither on the keystore machine nor on this"
                     " robot. Make another one on the robot with the play sros.fleet.requests."
                 )
             own = (*keys, folder_of(name) + "/" + REQUEST_FILE)
-            after.update((each, before[each]) for each in own if each in before)
+            after.update((path, before[path]) for path in own if path in before)
     for name in set(enclaves_in(before)) - set(enclaves_in(sent)):
         waits = folder_of(name) + "/" + REQUEST_FILE in before
         if waits and folder_of(name) + "/" + CERTIFICATE_FILE not in before:
@@ -305,7 +307,9 @@ def _install(
     removed = sorted(set(enclaves_in(before)) - set(enclaves_in(after)))
     present = before == after and place.is_closed()
     names = [
-        each for each in enclaves_in(after) if folder_of(each) + "/" + CERTIFICATE_FILE in after
+        enclave
+        for enclave in enclaves_in(after)
+        if folder_of(enclave) + "/" + CERTIFICATE_FILE in after
     ]
     result = {
         "changed": not present,
@@ -315,7 +319,7 @@ def _install(
         "diff": _difference(before, after),
     }
     # In an enclave that never had a certificate no process can run.
-    has_certificate = {enclave_of(each) for each in before if each.endswith("/" + CERTIFICATE_FILE)}
+    has_certificate = {enclave_of(path) for path in before if path.endswith("/" + CERTIFICATE_FILE)}
     ran = has_certificate.union(place.delivered())
     due = sorted({*place.due(), *(ran & set(changed))} & set(enclaves_in(after)))
     if check and not present:
@@ -354,7 +358,7 @@ def _install(
 
 
 def _routers(files: Files) -> list:
-    return sorted(enclave_of(each) for each in files if each.endswith("/router.json5"))
+    return sorted(enclave_of(path) for path in files if path.endswith("/router.json5"))
 
 
 _SIGNED_TEXT = re.compile(r"Content-Type: text/plain\n\n(.*?)\n-{6}", re.DOTALL)

@@ -95,8 +95,8 @@ def main() -> None:
         answer = None
     if done.returncode not in module.params["ok_statuses"] or not isinstance(answer, dict):
         module.fail_json(msg=decoded(done.stderr or done.stdout), status=done.returncode)
-    for each in answer.get("notes", []):
-        module.warn(harmless(each["text"]))
+    for note in answer.get("notes", []):
+        module.warn(harmless(note["text"]))
     changed = bool(answer.get("changes")) and not module.params["reads"]
     module.exit_json(changed=changed, answer=answer, status=done.returncode)
 

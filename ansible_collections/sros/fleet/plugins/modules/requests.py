@@ -87,7 +87,7 @@ def main() -> None:
     }
     module = AnsibleModule(argument_spec=arguments, supports_check_mode=True)
     try:
-        names = [check_enclave(each) for each in module.params["enclaves"]]
+        names = [check_enclave(name) for name in module.params["enclaves"]]
         place = Place(module.params["dest"], module.params["owner"])
         if module.check_mode:
             lacking = _lacking(place.read(), names)
@@ -106,7 +106,7 @@ def main() -> None:
                     place.discard()
     except (RefusedError, OSError) as error:
         module.fail_json(msg=str(error))
-    requests = {each: new[folder_of(each) + "/" + REQUEST_FILE].decode() for each in names}
+    requests = {name: new[folder_of(name) + "/" + REQUEST_FILE].decode() for name in names}
     module.exit_json(changed=new != files, made=made, requests=requests)
 
 
@@ -114,7 +114,7 @@ def _lacking(files: Files, names: list) -> list:
     return [
         name
         for name in names
-        if not any(folder_of(name) + "/" + each in files for each in KEY_FILES)
+        if not any(folder_of(name) + "/" + file in files for file in KEY_FILES)
     ]
 
 
@@ -123,7 +123,7 @@ def _with_requests(files: Files, names: list, spare: str) -> Files:
     openssl = shutil.which("openssl")
     new = dict(files)
     for name in names:
-        key, request = (folder_of(name) + "/" + each for each in (KEY_FILE, REQUEST_FILE))
+        key, request = (folder_of(name) + "/" + file for file in (KEY_FILE, REQUEST_FILE))
         present = files.get(request, b"").decode(errors="replace")
         has_key = not _lacking(files, [name])
         if has_key and _PEM.search(present):

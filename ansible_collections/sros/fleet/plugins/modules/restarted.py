@@ -65,11 +65,11 @@ def main() -> None:
             with place.locked():
                 due = place.due()
                 if done & set(due):
-                    place.set_due([each for each in due if each not in done])
+                    place.set_due([enclave for enclave in due if enclave not in done])
     except (RefusedError, OSError) as error:
         module.fail_json(msg=str(error))
     module.exit_json(
-        changed=bool(done & set(due)), restart=[each for each in due if each not in done]
+        changed=bool(done & set(due)), restart=[enclave for enclave in due if enclave not in done]
     )
 
 

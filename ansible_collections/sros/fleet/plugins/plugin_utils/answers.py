@@ -61,36 +61,36 @@ def document(value: Any) -> str:
     return harmless(_str(value), most=_LONGEST_DOCUMENT, lines=True)
 
 
-def list_of(each: Reader, most: int = _MOST_ITEMS) -> Reader:
+def list_of(read_item: Reader, most: int = _MOST_ITEMS) -> Reader:
     """Return the reader of a list with at most ``most`` items."""
 
     def read(value: Any) -> list[Any]:
         if not isinstance(value, list) or len(value) > most:
             raise ValueError
-        return [each(one) for one in value]
+        return [read_item(item) for item in value]
 
     return read
 
 
-def first_of(each: Reader, most: int) -> Reader:
+def first_of(read_item: Reader, most: int) -> Reader:
     """Return the reader of a list of which the first items and the number of others are taken."""
 
     def read(value: Any) -> list[Any]:
         if not isinstance(value, list):
             raise TypeError
         more = [f"and {len(value) - most} more"] if len(value) > most else []
-        return [*(each(one) for one in value[:most]), *more]
+        return [*(read_item(item) for item in value[:most]), *more]
 
     return read
 
 
-def map_of(each: Reader) -> Reader:
+def map_of(read_item: Reader) -> Reader:
     """Return the reader of an object whose keys are names."""
 
     def read(value: Any) -> dict[str, Any]:
         if not isinstance(value, dict) or len(value) > _MOST_ITEMS:
             raise ValueError
-        return {name(key): each(one) for key, one in value.items()}
+        return {name(key): read_item(item) for key, item in value.items()}
 
     return read
 

@@ -44,17 +44,17 @@ def check_facts(variables: Mapping[str, Any]) -> None:
 
 def _replacing(variables: Mapping[str, Any]) -> list[str]:
     """Return the names of facts that are variables, sorted."""
-    facts = [str(each) for each in variables.get("ansible_facts") or {}]
+    facts = [str(fact) for fact in variables.get("ansible_facts") or {}]
     if not constants.INJECT_FACTS_AS_VARS:
-        return sorted(each for each in facts if each.startswith(_SETTINGS))
+        return sorted(fact for fact in facts if fact.startswith(_SETTINGS))
     # Ansible takes the prefix ansible_ off the names of facts, and not off those of variables.
     options = _options()
-    steering = {each for each in facts if {each, f"ansible_{each}"} & options}
+    steering = {fact for fact in facts if {fact, f"ansible_{fact}"} & options}
     return sorted(
-        each
-        for each in facts
-        if each in steering
-        or (each in variables and each not in _OF_SETUP and not each.startswith(_OF_ANSIBLE))
+        fact
+        for fact in facts
+        if fact in steering
+        or (fact in variables and fact not in _OF_SETUP and not fact.startswith(_OF_ANSIBLE))
     )
 
 
@@ -65,9 +65,9 @@ def _options() -> set[str]:
     the path of the socket of ssh, or the program that copies files.
     """
     plugins = (
-        each
+        options
         for kind in ("connection", "shell", "become")
-        for each in (constants.config.get_configuration_definitions(kind) or {}).values()
+        for options in (constants.config.get_configuration_definitions(kind) or {}).values()
     )
     return {
         variable["name"]

@@ -109,7 +109,7 @@ class RobotAction(ActionBase):  # type: ignore[misc]
             if isinstance(value, str):
                 done[key] = harmless(value, most=None, lines=True)
             elif value:
-                done[key] = [harmless(str(each), most=None) for each in value]
+                done[key] = [harmless(str(item), most=None) for item in value]
         return done
 
     def _parse_returned_data(self, res: Mapping[str, Any], *_profile: Any) -> dict[str, Any]:
@@ -123,9 +123,11 @@ class RobotAction(ActionBase):  # type: ignore[misc]
 def _compared(differences: list[dict[str, Any]]) -> str:
     """Return the differences as `diff -u` shows them."""
     text = ""
-    for each in differences:
-        before, after = (each.get(which, "").splitlines() for which in ("before", "after"))
-        old, new = (f"{which}: {each.get(f'{which}_header', '')}" for which in ("before", "after"))
+    for difference in differences:
+        before, after = (difference.get(which, "").splitlines() for which in ("before", "after"))
+        old, new = (
+            f"{which}: {difference.get(f'{which}_header', '')}" for which in ("before", "after")
+        )
         compared = unified_diff(before, after, old, new, lineterm="")
         text += "".join(f"{line}\n" for line in compared)
         if len(text) > _MOST_OF_DIFFERENCES:
@@ -148,5 +150,5 @@ def _presented(returned: Mapping[str, Any], host: str) -> dict[str, Any]:
         result["msg"] = f"{host}: {result['msg']}"
     said = [*returned.get("remarks", ()), *map(harmless, returned.get("warnings", ()))]
     if said:
-        result["warnings"] = [f"{host}: {each}" for each in said]
+        result["warnings"] = [f"{host}: {text}" for text in said]
     return result
