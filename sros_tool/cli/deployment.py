@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.delivery.robot import ImportedEnclave
     from sros_tool.keystore.delivery.signing import Signed
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.policy.model import Policy
 
 _STREAM = Path("-")
@@ -99,8 +100,8 @@ def distribute_key(
     if not rest or not (names or all_enclaves or patterns or robots):
         raise UsageError("distribute_key takes a keystore, one or more enclaves and a target")
     target = PATH.convert(rest[-1], None, None)
-    _check_target(root, rest[-1])
     keystore = OpenedKeystore(root)
+    _check_target(keystore, rest[-1])
     selection = select(
         keystore, names, patterns, robots=robots, all_enclaves=all_enclaves, keyless=keyless
     )
@@ -158,14 +159,13 @@ def distribute_key(
         echo(f"left out enclave {name}: its key was made on its robot", err=True)
 
 
-def _check_target(root: Path, word: str) -> None:
+def _check_target(keystore: OpenedKeystore, word: str) -> None:
     """Raise `UsageError` if the last word is an enclave of the keystore: TARGET is missing."""
     from sros_tool.errors import InvalidNameError
-    from sros_tool.keystore.layout import has_enclave
     from sros_tool.names import check_enclave_name
 
     try:
-        is_enclave = not Path(word).exists() and has_enclave(root, check_enclave_name(word))
+        is_enclave = not Path(word).exists() and keystore.has_enclave(check_enclave_name(word))
     except InvalidNameError:
         return
     if is_enclave:

@@ -59,7 +59,7 @@ from sros_tool.keystore.layout import (
     ca_key,
     enclave_path,
 )
-from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, open_keystore
+from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore
 from sros_tool.keystore.template import Template
 from sros_tool.names import ACTION_SEPARATOR, NODE_SERVICES, dds_names, service_of
 from sros_tool.pki import smime
@@ -187,7 +187,8 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario, now: datetime
     Raises:
         KeystoreError: ``root`` is not a keystore, or no two enclaves may talk to each other.
     """
-    keystore = open_keystore(root)
+    keystore = OpenedKeystore(root)
+    keystore.check()
     domains = keystore.governance.domains()
     read = _read_enclaves(keystore, now, next(iter(domains)))
     template = keystore.template

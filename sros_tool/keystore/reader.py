@@ -490,11 +490,6 @@ class OpenedKeystore:
         """The ROS domains that the governance names."""
         return self.governance.domains().closed()
 
-    def check_domain(self, domain: int | None) -> None:
-        """Raise `KeystoreError` if the governance lacks ``domain``; None is accepted."""
-        if domain is not None:
-            check_domain(self.domains, domain, self.root)
-
     # ── enclaves ──
 
     def folder(self, name: str) -> Path:
@@ -550,17 +545,6 @@ class _Failure(NamedTuple):
     """Why a part of a keystore cannot be read."""
 
     error: SrosError | OSError
-
-
-def open_keystore(root: Path) -> OpenedKeystore:
-    """Return the keystore ``root``, opened for reading.
-
-    Raises:
-        KeystoreError: ``root`` is not a keystore.
-    """
-    keystore = OpenedKeystore(root)
-    keystore.check()
-    return keystore
 
 
 def check_domain(domains: DomainSet, domain: int | None, root: Path) -> None:
