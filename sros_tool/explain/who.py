@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 from sros_tool.dds.decision.access import is_open_to_unauthenticated
-from sros_tool.dds.decision.vendors import TESTED
+from sros_tool.dds.decision.grants import other_fitting_enclaves
+from sros_tool.dds.decision.vendors import CYCLONE_DDS, TESTED
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import KeystoreError, Note
@@ -16,11 +17,18 @@ from sros_tool.explain.answer import Question, about_action, ask
 from sros_tool.explain.asking import taken_for_action
 from sros_tool.faults import REFUSE_STRANGERS
 from sros_tool.fleet.robots import Fleet
-from sros_tool.keystore.layout import enclave_names, is_original_keystore, remedy_in_keystore
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    enclave_names,
+    enclave_path,
+    is_original_keystore,
+    remedy_in_keystore,
+)
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import RightsSource, rights_by_domains
 from sros_tool.keystore.selection import likely_names, missing_enclave_error
 from sros_tool.names import is_expression
+from sros_tool.pki.certificates import load_certificate, subject_text
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right
 from sros_tool.reach import (
@@ -34,6 +42,7 @@ from sros_tool.reach import (
 )
 from sros_tool.values import shows
 from sros_tool.wording import first_few
+from sros_tool.xml import read_bytes
 
 
 class EnclaveOutcome(Protocol):
@@ -321,6 +330,12 @@ def follow_reach(
             f"them: whom they influence is not followed. {refuse}"
         )
         notes.append(Note("explain.anybody", text))
+    if of_keystore and (holders := _fitting_holders(source, enclave)):
+        text = (
+            f"on Cyclone DDS, whoever has the key of {enclave} can also use the permissions of "
+            f"{first_few(holders, 3)}, which fit its certificate: this is not followed."
+        )
+        notes.append(Note("explain.fitting-permissions", text))
     if source.routers and enclave not in source.routers:
         routers = first_few(list(source.routers), 3)
         text = (
@@ -330,6 +345,26 @@ def follow_reach(
         )
         notes.append(Note("explain.zenoh-router", text))
     return FollowedReach(source.path, (*without, *questions), domain, reach, source.fleet, notes)
+
+
+def _fitting_holders(source: RightsSource, enclave: str) -> list[str]:
+    """Return the enclaves of a keystore whose permissions also fit the certificate of another one.
+
+    Only enclaves are compared whose paths have all parts of the enclave's path.
+    """
+    parts = {*enclave.split("/")}
+    granted = {
+        name: [grant.subject for grant in permissions.grants]
+        for name, permissions in source.documents.items()
+        if name != enclave and parts <= {*name.split("/")}
+    }
+    file = enclave_path(source.path, enclave) / CERTIFICATE_FILE
+    if not granted or not file.exists():
+        return []
+    certificate = load_certificate(read_bytes(file, "certificate"), f"'{file}'")
+    certified = {enclave: subject_text(certificate.subject)}
+    fitting = (other_fitting_enclaves(v.traits, certified, granted) for v in CYCLONE_DDS)
+    return sorted({holder for of in fitting for holder in of.get(enclave, ())})
 
 
 def _admits_strangers(governance: Governance) -> bool:

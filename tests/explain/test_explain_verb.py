@@ -595,6 +595,8 @@ def test_permissions_of_another_enclave_that_fit_are_said(tmp_path: Path) -> Non
             assert explain(keystore, "--who", *words, "--match", "/mux").status == 1 - fits
             single = explain(keystore, "/mux", *words)
             assert ("with the permissions of /robot/mux, which are not" in single.err) is fits
+        reach = explain(keystore, "--reach", "/mux").ok().err
+        assert ("can also use the permissions of /robot/mux" in reach) is (template == "sros2")
 
 
 def test_a_name_that_is_an_action_is_asked_about_as_one_of_everybody(fibonacci: Path) -> None:
