@@ -972,7 +972,7 @@ def _who_lines(
     if in_part:
         whole = f"{len(in_part)} of {count}{asked_in} may {answer.question} in part, {len(able)} "
         whole += "as a whole"
-    further = f", and {len(holding)} more with other permissions" if holding else ""
+    further = f", and {len(holding)} with permissions of another enclave" if holding else ""
     yield f"{whole}{where}{further}"
 
 

@@ -591,7 +591,9 @@ def test_permissions_of_another_enclave_that_fit_are_said(tmp_path: Path) -> Non
             who = explain(keystore, "--who", *words).ok().out.splitlines()
             line = "/mux  with the permissions of /robot/mux, which fit its certificate"
             assert who[:-1] == [line] * fits + ["/robot/mux"]
-            assert who[-1].endswith(", and 1 more with other permissions" if fits else "/cmd_vel")
+            assert who[-1].endswith(
+                ", and 1 with permissions of another enclave" if fits else "/cmd_vel"
+            )
             assert explain(keystore, "--who", *words, "--match", "/mux").status == 1 - fits
             single = explain(keystore, "/mux", *words)
             assert ("with the permissions of /robot/mux, which are not" in single.err) is fits
