@@ -538,10 +538,12 @@ class _Review:
         if len(changed) > _MOST_CHANGED:
             raise DocumentError(f"the change has more than {_MOST_CHANGED} files")
         names = {entry.id: name for name, entry in changed}
-        shipped = {part.read_bytes() for part in (policies_dir() / "common").rglob("*.xml")}
+        common = (policies_dir() / "common").rglob("*.xml")
+        shipped = {(part.name, part.read_bytes()) for part in common}
         entries = dict(changed)
         for path in self._policies_among(changed, self.head):
-            if self.request.repository.content(entries[path].id) not in shipped:
+            content = self.request.repository.content(entries[path].id)
+            if (Path(path).name, content) not in shipped:
                 lines.append((f"{_NOT_USED} --leave-out {quote(path)}, or delete it", path))
                 status = _FOUND
         for path in self._used_in_part(changed, reviewed, fleet):

@@ -274,12 +274,14 @@ def test_an_error_is_said_once(change: Change, tmp_path: Path) -> None:
 
 
 def test_a_common_part_that_ships_with_sros_needs_no_review(change: Change) -> None:
-    part, name = (change.folder / "common/lifecycle_node.xml").read_text(), "common/new.xml"
-    change.commit({name: part})
+    part, name = (change.folder / "common/lifecycle_node.xml").read_text(), "lifecycle_node.xml"
+    change.commit({f"new/{name}": part})
     assert change.review("--policy", "robot.xml").status == 0
-    change.commit({name: part.replace("ALLOW", "DENY")})
-    edited = change.review("--policy", "robot.xml")
-    assert edited.status == 1 and f"'{name}' changes and is not reviewed" in edited.out
+    # An unreviewed policy can include the rights of another common part under its name.
+    for path, text in ((f"new/{name}", part.replace("ALLOW", "DENY")), ("new/node.xml", part)):
+        change.commit({f"new/{name}": None if path != f"new/{name}" else text, path: text})
+        edited = change.review("--policy", "robot.xml")
+        assert edited.status == 1 and f"'{path}' changes and is not reviewed" in edited.out
 
 
 def test_what_a_partial_clone_lacks_is_not_passed_over(change: Change) -> None:
