@@ -58,9 +58,9 @@ def _focus_completions(
     """Return the names and enclaves of the first SOURCE that begin with ``incomplete``."""
     from sros_tool.keystore.rights import load_rights
 
-    given = ctx.params.get("sources") or ctx.args
+    sources = ctx.params.get("sources") or ctx.args
     try:
-        rights = load_rights(Path(given[0])).rights if given else frozenset()
+        rights = load_rights(Path(sources[0])).rights if sources else frozenset()
     except (SrosError, OSError):
         return []
     names = {right.enclave for right in rights} | {right.name for right in rights}

@@ -392,14 +392,14 @@ def _marked_rights(
     sides = [{_identity(edge): edge for edge in side} for side in (first, second)]
     edges = []
     for key in {**sides[0], **sides[1]}:
-        one, other = sides[0].get(key), sides[1].get(key)
-        if one and other:
-            by = tuple(sorted({*one.by, *other.by})) if one.by and other.by else ()
-            edges.append(one if allowed_by else replace(one, by=by))
-        elif one:
-            edges.append(replace(one, mark=OverlaySide.FIRST))
-        elif other:
-            edges.append(replace(other, mark=OverlaySide.SECOND))
+        left, right = sides[0].get(key), sides[1].get(key)
+        if left and right:
+            by = tuple(sorted({*left.by, *right.by})) if left.by and right.by else ()
+            edges.append(left if allowed_by else replace(left, by=by))
+        elif left:
+            edges.append(replace(left, mark=OverlaySide.FIRST))
+        elif right:
+            edges.append(replace(right, mark=OverlaySide.SECOND))
     return edges
 
 

@@ -88,8 +88,8 @@ def focused_picture(
         UsageError: nothing in the sources has such a name.
     """
     system = _System(picture, sources)
-    wanted = dict.fromkeys(meant for word in words for meant in system.names_meant(word))
-    focuses = tuple(system.focus(kind, name) for kind, name in wanted)
+    meant_names = dict.fromkeys(meant for word in words for meant in system.names_meant(word))
+    focuses = tuple(system.focus(kind, name) for kind, name in meant_names)
     if routers > 1:
         left_out = f"; what passes between the {routers} Zenoh routers is not considered"
         focuses = tuple(replace(focus, sentence=f"{focus.sentence}{left_out}") for focus in focuses)
@@ -138,11 +138,13 @@ class FocusFlow:
     def of(cls, picture: Picture) -> FocusFlow:
         """Return the flow of information of a picture that has a focus."""
         focused = frozenset(focus.name for focus in picture.focus if focus.kind == _ENCLAVE)
-        wanted = [(focus.kind, focus.name) for focus in picture.focus if focus.kind != _ENCLAVE]
+        focused_names = [
+            (focus.kind, focus.name) for focus in picture.focus if focus.kind != _ENCLAVE
+        ]
         targets = frozenset(
             (name.kind, name.name)
             for name in picture.names
-            for kind, asked in wanted
+            for kind, asked in focused_names
             if name.kind == kind and (name.name == asked or overlap(asked, name.name))
         )
         before: dict[str, int] = {}

@@ -493,9 +493,9 @@ class _Draft:
             self._enclaves[path] = tuple(self._per_unit(text, self._inside[unit]))
         return path
 
-    def _per_unit(self, text: UnitText, colour: int) -> Iterator[str]:
+    def _per_unit(self, text: UnitText, number: int) -> Iterator[str]:
         """Yield the text once for each unit of a class, with that unit's name."""
-        for unit in self._classes[colour]:
+        for unit in self._classes[number]:
             yield text.fill(partial(self._plain_word, unit))
 
     def _plain_word(self, unit: int, _unit: int, position: int) -> str:
@@ -633,14 +633,16 @@ class _Draft:
             and self._is_drawn(n)
             and self._inside.get(n) != self._inside[usual]
         }
-        seen: dict[int, dict[_Part, Edge | str]] = {n: {} for n in (*near.keys(), *near.values())}
+        parts_of: dict[int, dict[_Part, Edge | str]] = {
+            n: {} for n in (*near.keys(), *near.values())
+        }
         for kind, units, part in self._seen:
-            for unit in seen.keys() & set(units):
-                seen[unit].setdefault((kind, self._symbols_around(units, unit)), part)
+            for unit in parts_of.keys() & set(units):
+                parts_of[unit].setdefault((kind, self._symbols_around(units, unit)), part)
         different: list[DifferentUnit] = []
         differing_parts: set[Edge | str] = set()
         for n in sorted(near, key=self._unit_name_order):
-            own_parts, near_parts = seen[n], seen[near[n]]
+            own_parts, near_parts = parts_of[n], parts_of[near[n]]
             if self._are_alike(own_parts, near_parts):
                 more = [part for key, part in own_parts.items() if key not in near_parts]
                 fewer = [part for key, part in near_parts.items() if key not in own_parts]

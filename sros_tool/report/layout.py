@@ -629,12 +629,12 @@ def _tops(
         near[first_id].append(second_id)
         near[second_id].append(first_id)
     for number in sorted(range(len(columns)), key=lambda number: abs(number - tallest)):
-        wanted = {}
+        wanted_middles = {}
         for item in columns[number] if number != tallest else ():
             centres = [tops[end] + height[end] / 2 for end in near[item.id] if end in tops]
-            wanted[item.id] = sum(centres) / len(centres) if centres else extent[tallest]
+            wanted_middles[item.id] = sum(centres) / len(centres) if centres else extent[tallest]
         lead = 0 if number % 2 else _LEAD
-        tops |= place_column(columns[number], wanted, _GAP, _TOP, lead)
+        tops |= place_column(columns[number], wanted_middles, _GAP, _TOP, lead)
     return tops
 
 
@@ -736,12 +736,12 @@ def _inversions(ends: Sequence[int], size: int) -> int:
     """Return the number of inverted pairs, computed with a Fenwick tree."""
     tree = [0] * (size + 1)
     crossings = 0
-    for seen, end in enumerate(ends):
+    for count, end in enumerate(ends):
         at, before = end + 1, 0
         while at:
             before += tree[at]
             at -= at & -at
-        crossings += seen - before
+        crossings += count - before
         at = end + 1
         while at <= size:
             tree[at] += 1

@@ -147,8 +147,9 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
     places = {enclave: robot.name for enclave, robot in robots.items()}
     hosts = places | _hosts(drawing.hosts)
     if observed:
-        seen = union(list(map(PictureSource.titled, observed, titles[len(read) :])))
-        read.append(seen.moved_to_homes(enclaves_of_nodes(seen.nodes, read[0].nodes)))
+        observation = union(list(map(PictureSource.titled, observed, titles[len(read) :])))
+        homes = enclaves_of_nodes(observation.nodes, read[0].nodes)
+        read.append(observation.moved_to_homes(homes))
     picture = _compared_picture(read, hosts, use=bool(drawing.observed))
     governed = [source.governance for source in read if source.governance]
     if len(governed) == 2 and governed[0] != governed[1]:
@@ -393,8 +394,8 @@ def _with_requirements(
         template=load_template(drawing.template) if drawing.template else None,
         keystore=keystore,
     )
-    wanted = read_requirements(file, system.fleet)
-    decided = decide_all(wanted, system)
+    stated = read_requirements(file, system.fleet)
+    decided = decide_all(stated, system)
     findings = decided_findings(decided, system)
     violations = tuple(
         PicturedViolation(
@@ -410,7 +411,7 @@ def _with_requirements(
     assumed = tuple(
         f"{demand(requirement)}: {assumption_text(name)}" for requirement, name in decided.assumed
     )
-    requirements = Requirements(len(wanted) - len(violations), violations, assumed)
+    requirements = Requirements(len(stated) - len(violations), violations, assumed)
     paths = {enclave.path for enclave in picture.enclaves}
     pictured = tuple(_pictured_finding(finding, paths) for finding in findings)
     picture = replace(picture, findings=(*picture.findings, *pictured))

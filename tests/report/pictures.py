@@ -67,9 +67,9 @@ def edges(picture: Picture, enclave: str) -> set[tuple[str, str, str]]:
 
 def edge(picture: Picture, enclave: str, right: str, name: str) -> Edge:
     """The one edge of that kind."""
-    found = [e for e in picture.edges if (e.enclave, e.right, e.name) == (enclave, right, name)]
-    assert len(found) == 1, found
-    return found[0]
+    edges = [e for e in picture.edges if (e.enclave, e.right, e.name) == (enclave, right, name)]
+    assert len(edges) == 1, edges
+    return edges[0]
 
 
 def large_policy(robots: int, parts: int, topics: int) -> str:

@@ -27,11 +27,11 @@ ASSETS = WEB.parent / "sros_tool" / "report" / "assets"
 
 def test_the_lock_file_pins_every_package_and_names_no_host() -> None:
     lock = json.loads((WEB / "package-lock.json").read_text())
-    packages = {path: each for path, each in lock["packages"].items() if path}
+    packages = {path: package for path, package in lock["packages"].items() if path}
     assert len(packages) > 10
-    for path, each in packages.items():
-        assert "resolved" not in each, path
-        assert each["integrity"].startswith("sha512-"), path
+    for path, package in packages.items():
+        assert "resolved" not in package, path
+        assert package["integrity"].startswith("sha512-"), path
 
 
 def test_every_library_in_the_script_has_its_licence_beside_it() -> None:

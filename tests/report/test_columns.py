@@ -18,7 +18,7 @@ ITEMS = st.lists(
 def test_items_keep_order_distance_and_the_top(
     drawn: list[tuple[int, str, int]],
 ) -> None:
-    drawn.sort(key=lambda each: each[1])
+    drawn.sort(key=lambda item: item[1])
     column = [ColumnItem(str(n), height, group) for n, (height, group, _) in enumerate(drawn)]
     wanted = {str(n): float(centre) for n, (_, _, centre) in enumerate(drawn)}
     tops = place_column(column, wanted, gap=10, top=30, lead=24)

@@ -60,7 +60,7 @@ def test_a_wildcard_is_seen_though_its_known_names_are_denied_or_stated(tmp_path
     table = render(picture, Folding.of(picture), "markdown", AT)
     assert "| topic `/arm/*` | `/a` | others, for single names only |" in table
     used = source_of(tmp_path, {"/a": group("topics", "publish", "/log")}, "used.xml")
-    unused = {each.text for each in overlay(source, used, "use").differences}
+    unused = {difference.text for difference in overlay(source, used, "use").differences}
     assert "/a ALLOW publish topic /arm/*" in unused
     assert "/a ALLOW publish topic /log*" not in unused
 
@@ -152,7 +152,7 @@ def test_protection_is_the_weakest_of_the_topics_behind_a_name() -> None:
             ("services", "/camera/set"),
         )
     }
-    assert {name: each.level for name, each in shown.items()} == {
+    assert {name: protection.level for name, protection in shown.items()} == {
         "/camera/image": Shown.NONE,
         "/scan": Shown.ENCRYPT,
         "/*": Shown.NONE,  # some of it

@@ -23,7 +23,7 @@ TAKEN_TOGETHER = "a browser"
 
 
 def row(name: str, **values: Any) -> dict[str, Any]:
-    given = {
+    usual = {
         "name": name,
         "expected": "not heard",
         "observed": "not heard",
@@ -38,7 +38,7 @@ def row(name: str, **values: Any) -> dict[str, Any]:
         "remedy": "",
         "scenario": "attacks",
     }
-    return {**given, **values}
+    return {**usual, **values}
 
 
 def result(*rows: dict[str, Any]) -> dict[str, Any]:
@@ -53,7 +53,7 @@ def result(*rows: dict[str, Any]) -> dict[str, Any]:
         "names": ["topic /chatter"],
         "own_network": True,
         "network_reason": "",
-        "as_expected": all(each["as_expected"] for each in rows),
+        "as_expected": all(row["as_expected"] for row in rows),
         "scenarios": [{**scenario, "rows": list(rows)}],
         "rows": list(rows),
     }
@@ -71,7 +71,7 @@ def test_what_was_not_tried_is_said_and_nothing_of_it_is_green() -> None:
         (summary,) = scenario.cssselect("summary")[:1]
         assert summary.text_content() == "every way in 1 of 2 as they should"
         assert not summary.cssselect(".good")
-    tiles = {each.text_content(): each.get("class", "") for each in page.cssselect("li.tile")}
+    tiles = {tile.text_content(): tile.get("class", "") for tile in page.cssselect("li.tile")}
     assert "good" not in tiles["1 of 2 attempts ended as they should"]
     assert {"1 skipped", "3 left out", "4 not tried, but needed for a proof"} <= set(tiles)
     text = page.text_content()
@@ -100,16 +100,16 @@ def test_every_row_is_told_with_what_came_of_it() -> None:
     )
     assert "Made by sros 1.2.3 on 2027-01-01." in page
     rows = html.fromstring(page).xpath("//table[@class='rows']//tr[td]")
-    told = [" ".join(" ".join(each.itertext()).split()) for each in rows]
-    assert len(told) == 5
-    assert told[0].startswith("ok an unsecured node listens not heard not heard who cannot")
-    assert "without the refusal of strangers heard heard" in told[1]
-    assert "known to be open Names are in clear. None." in told[2]
-    assert told[3].startswith("differs something else not heard heard")
-    assert told[4].startswith("skipped")
+    texts = [" ".join(" ".join(row.itertext()).split()) for row in rows]
+    assert len(texts) == 5
+    assert texts[0].startswith("ok an unsecured node listens not heard not heard who cannot")
+    assert "without the refusal of strangers heard heard" in texts[1]
+    assert "known to be open Names are in clear. None." in texts[2]
+    assert texts[3].startswith("differs something else not heard heard")
+    assert texts[4].startswith("skipped")
     assert "3 of 5" in page and "heard 0 of 50; control" in page
     attacks = html.fromstring(page).xpath("//tr[@class='attack']")
-    assert [each.text_content() for each in attacks] == ["joining", "looking"]
+    assert [attack.text_content() for attack in attacks] == ["joining", "looking"]
 
 
 def test_scenarios_are_folded_unless_something_needs_a_look() -> None:
@@ -122,11 +122,11 @@ def test_scenarios_are_folded_unless_something_needs_a_look() -> None:
         for rows in rows_of
     ]
     page = html.fromstring(render_demo_page(shown, ""))
-    told = [
+    summaries = [
         ("open" in scenario.attrib, [chip.text for chip in scenario.cssselect("summary > .chip")])
         for scenario in page.cssselect("details.scenario")
     ]
-    assert told == [
+    assert summaries == [
         (False, ["1 of 1 as they should"]),
         (False, ["2 of 2 as they should", "1 open"]),
         (True, ["1 of 2 as they should"]),
@@ -169,15 +169,15 @@ def fleet_page() -> str:
 @pytest.mark.browser
 def test_it_opens_from_disk_and_runs_nothing(browser: Browser, axe: str, tmp_path: Path) -> None:
     rows = [row(text, mechanism=text, attack=text, detail=text) for text in HOSTILE]
-    said: list[str] = []
+    messages: list[str] = []
     names = {"demo": HOSTILE, "fleet": 3 * HOSTILE[:1]}
     for kind, text in {"demo": render_demo_page(result(*rows), ""), "fleet": fleet_page()}.items():
         path = tmp_path / f"{kind}.html"
         path.write_text(text)
         page = new_page(browser)
-        page.on("console", lambda message: said.append(message.text))
+        page.on("console", lambda message: messages.append(message.text))
         page.goto(path.as_uri())
-        assert not said
+        assert not messages
         shown = page.locator("tbody th[scope=row]").all_text_contents()
         assert shown == [*map(visible_line, names[kind])]
         assert page.evaluate("window.broken") is None

@@ -31,9 +31,9 @@ def seen(folder: Path, enclaves: dict[str, str], *words: str) -> Picture:
 
 
 def value(*words: object) -> dict[str, Any]:
-    found = json.loads(sros("view", *words, "--json").ok().out)
-    assert isinstance(found, dict)
-    return found
+    picture = json.loads(sros("view", *words, "--json").ok().out)
+    assert isinstance(picture, dict)
+    return picture
 
 
 CHAIN = {
@@ -53,7 +53,7 @@ def test_the_answer_is_a_sentence_and_only_what_leads_to_the_name_is_drawn(tmp_p
         "2 other enclaves influence the publisher, 1 of them directly",
     )
     assert {name.name for name in picture.names} == {"/cmd_vel", "/plan", "/goal"}
-    assert "/camera" not in {each.path for each in picture.enclaves}
+    assert "/camera" not in {enclave.path for enclave in picture.enclaves}
     scene = flow_scene(picture)
     check_flow(scene_columns := {c.id: c.column for c in scene.cards}, picture)
     assert scene_columns["s/planner"] < scene_columns["s/mux"] < scene_columns["l/base"]
@@ -78,9 +78,11 @@ def test_an_enclave_is_a_focus_with_both_directions(tmp_path: Path) -> None:
         "/planner can influence 3 enclaves (2 directly), and 1 enclave can influence it",
     )
     (answer,) = picture.focus
-    assert {each.enclave for each in answer.influenced} == {"/mux", "/base", "/recorder"}
-    assert [each.path for each in answer.influencing] == ["/web -publish /goal-> /planner"]
-    assert "/image" not in {each.name for each in picture.names}
+    assert {influence.enclave for influence in answer.influenced} == {"/mux", "/base", "/recorder"}
+    assert [influence.path for influence in answer.influencing] == [
+        "/web -publish /goal-> /planner"
+    ]
+    assert "/image" not in {name.name for name in picture.names}
 
 
 @pytest.mark.parametrize(
@@ -124,7 +126,7 @@ def test_services_and_actions_say_who_calls_and_who_answers(tmp_path: Path) -> N
         "/half": group("services", "request", "/dock/_action/send_goal"),
     }
     picture = seen(tmp_path, enclaves, "/reset", "/dock")
-    assert [(each.kind, each.senders, each.receivers) for each in picture.focus] == [
+    assert [(focus.kind, focus.senders, focus.receivers) for focus in picture.focus] == [
         ("services", ("/client",), ("/server",)),
         ("enclave", (), ()),
         ("actions", ("/half", "/server"), ("/dock",)),
@@ -134,7 +136,7 @@ def test_services_and_actions_say_who_calls_and_who_answers(tmp_path: Path) -> N
     asked["/client"] = group("services", "request", "/server/get_parameters")
     (answer,) = seen(tmp_path, asked, "/server").focus
     assert answer.influencing == ()
-    assert [each.enclave for each in answer.influenced] == ["/client"]
+    assert [influence.enclave for influence in answer.influenced] == ["/client"]
 
 
 def test_what_the_governance_leaves_open_is_open_to_all(tmp_path: Path) -> None:
@@ -144,11 +146,11 @@ def test_what_the_governance_leaves_open_is_open_to_all(tmp_path: Path) -> None:
     shipped = (MOBILE_ROBOT.parent.parent / "keystore_templates/production.toml").read_text()
     rule = '\n[[protection.topic]]\nnames = ["/cmd_vel"]\nwrite_access_control = false\n'
     template.write_text(shipped + rule)
-    found = value(policy, "--template", template, "--focus", "/cmd_vel")["focus"]
-    assert found[0]["sentence"].startswith(
+    answers = value(policy, "--template", template, "--focus", "/cmd_vel")["focus"]
+    assert answers[0]["sentence"].startswith(
         "every enclave may publish /cmd_vel, which the governance leaves open; "
     )
-    assert len(found[0]["senders"]) == len(CHAIN)
+    assert len(answers[0]["senders"]) == len(CHAIN)
 
 
 def test_a_wildcard_pair_without_a_known_name_is_drawn_with_an_example(tmp_path: Path) -> None:
@@ -158,7 +160,7 @@ def test_a_wildcard_pair_without_a_known_name_is_drawn_with_an_example(tmp_path:
         + group("topics", "publish", "/z/z"),
     }
     (answer,) = (picture := seen(tmp_path, enclaves, "/z/z")).focus
-    assert [each.enclave for each in answer.influencing] == ["/a"]
+    assert [influence.enclave for influence in answer.influencing] == ["/a"]
     assert ("/a", "publish") in {(edge.enclave, edge.right) for edge in picture.edges}
 
 
@@ -190,10 +192,10 @@ def test_every_enclave_of_an_answer_is_drawn_and_linked(
     picture = focused_picture(picture, [source], [word])
     flow = FocusFlow.of(picture)
     network = Network(rights, excluded=OF_EVERY_NODE, questions=QUESTIONS)
-    for each in picture.focus:
-        starts = {each.name} if each.kind == "enclave" else set(each.senders)
+    for focus in picture.focus:
+        starts = {focus.name} if focus.kind == "enclave" else set(focus.senders)
         far = {path: len(hops) + 1 for path, hops in network.influencers_of(starts).items()}
-        assert {one.enclave: one.hops for one in each.influencing} == far
+        assert {influence.enclave: influence.hops for influence in focus.influencing} == far
     scene = flow_scene(picture, 9)
     drawn = {(card.id[0] == "s", path) for card in scene.cards for path in card.members}
     assert drawn >= {(True, path) for path in flow.before} | {(False, path) for path in flow.after}
@@ -230,7 +232,7 @@ def test_an_export_may_lack_enclaves(keystore: Path, tmp_path: Path) -> None:
     """An enclave is not said to be the only one, where others may be elsewhere."""
     robot, page = tmp_path / "robot", tmp_path / "page.html"
     sros("distribute_key", keystore, "/a", robot).ok()
-    (right, *_) = [each for each in load_rights(robot).rights if each.right == "publish"]
+    (right, *_) = [right for right in load_rights(robot).rights if right.right == "publish"]
     for source, alone in ((keystore, True), (robot, False), (robot / "enclaves/a", False)):
         asked = ("view", source, "--focus", right.name)
         ended = sros(*asked, "--format", "markdown").ok()
@@ -269,16 +271,18 @@ def test_what_breaks_a_requirement_is_red_and_said(tmp_path: Path) -> None:
     policy.write_text(policy_text(enclaves))
     only = '[[only]]\npublish = ["/cmd_vel"]\nenclaves = ["/mux"]\n'
     wanted.write_text(only + '[[must]]\nenclave = "/mux"\npublish = ["/cmd_vel"]\n')
-    found = value(policy, "--requirements", wanted)
-    assert found["requirements"]["hold"] == 1
-    (violation,) = found["requirements"]["violations"]
+    shown_picture = value(policy, "--requirements", wanted)
+    assert shown_picture["requirements"]["hold"] == 1
+    (violation,) = shown_picture["requirements"]["violations"]
     line = 1 + policy.read_text().split("/cmd*")[0].count("\n")
     text = f"{policy.name}:{line}: /web: may publish /cmd_vel by /cmd*, but "
     assert violation["text"].startswith(text)
-    (finding,) = (each for each in found["findings"] if each["id"].startswith("requirement."))
+    (finding,) = (
+        finding for finding in shown_picture["findings"] if finding["id"].startswith("requirement.")
+    )
     assert (finding["enclave"], finding["severity"]) == ("/web", "error")
     assert finding["text"].startswith(f"{policy.name}:{line}: may publish /cmd_vel")
-    assert [(e["enclave"], e["name"]) for e in found["edges"] if e["violates"]] == [
+    assert [(e["enclave"], e["name"]) for e in shown_picture["edges"] if e["violates"]] == [
         ("/web", "/cmd_vel")
     ]
     shown = sros("view", policy, "--requirements", wanted, "--format", "svg").ok()

@@ -26,19 +26,21 @@ ROBOTS = [f"r{number}" for number in range(1, 13)]
 
 def fleet(more: dict[str, str] | None = None) -> dict[str, str]:
     """A robot of two enclaves for each name, a dispatcher of all, and what is ``more``."""
-    found = {}
+    enclaves = {}
     for name in ROBOTS:
-        found[f"/{name}/base"] = group("topics", "publish", f"/{name}/odom", f"/fleet/{name}_state")
-        found[f"/{name}/nav"] = group("topics", "subscribe", f"/{name}/odom", f"/{name}/goal")
-    found["/dispatcher"] = group("topics", "publish", *(f"/{name}/goal" for name in ROBOTS))
-    found["/dispatcher"] += group("topics", "subscribe", "/fleet/*")
+        enclaves[f"/{name}/base"] = group(
+            "topics", "publish", f"/{name}/odom", f"/fleet/{name}_state"
+        )
+        enclaves[f"/{name}/nav"] = group("topics", "subscribe", f"/{name}/odom", f"/{name}/goal")
+    enclaves["/dispatcher"] = group("topics", "publish", *(f"/{name}/goal" for name in ROBOTS))
+    enclaves["/dispatcher"] += group("topics", "subscribe", "/fleet/*")
     for path, text in (more or {}).items():
-        found[path] = found.get(path, "") + text
-    return found
+        enclaves[path] = enclaves.get(path, "") + text
+    return enclaves
 
 
 def drawn(folding: Folding) -> set[tuple[str, str, str]]:
-    return {(each.enclave, each.right, each.name) for each in folding.picture.edges}
+    return {(edge.enclave, edge.right, edge.name) for edge in folding.picture.edges}
 
 
 def test_equal_robots_are_one_in_the_order_of_their_numbers(tmp_path: Path) -> None:
@@ -87,7 +89,7 @@ def test_a_robot_that_differs_stands_alone_and_says_in_what(
     assert different.more == (more,) and different.fewer == ((fewer,) if fewer else ())
     marked = {(e.enclave, e.name) for e in folding.picture.edges if e.differs}
     assert len(marked) == 1
-    assert {each.path for each in folding.picture.enclaves} >= {"/r5/base", "/{r1…r12}/base"}
+    assert {enclave.path for enclave in folding.picture.enclaves} >= {"/r5/base", "/{r1…r12}/base"}
     assert any(link.differs for scene in folding.scenes() for link in scene.links)
 
 
@@ -140,7 +142,7 @@ def test_units_are_equal_only_in_all_their_rights(tmp_path: Path, more: str) -> 
 def test_robots_that_name_each_other_are_equal_by_how_many(tmp_path: Path) -> None:
     enclaves = {
         f"/{name}/nav": group("topics", "publish", f"/{name}/pose")
-        + group("topics", "subscribe", *(f"/{each}/pose" for each in ROBOTS))
+        + group("topics", "subscribe", *(f"/{name}/pose" for name in ROBOTS))
         for name in ROBOTS
     }
     assert drawn(Folding.of(picture_of(tmp_path, enclaves))) == {
@@ -151,9 +153,9 @@ def test_robots_that_name_each_other_are_equal_by_how_many(tmp_path: Path) -> No
     # All report to one of them, which is drawn by its own name.
     leader = {f"/{name}/nav": group("topics", "publish", "/r3/inbox") for name in ROBOTS}
     leader["/r3/nav"] += group("topics", "subscribe", "/r3/inbox")
-    found = Folding.of(picture_of(tmp_path, leader))
-    assert ("/{r1…r12}/nav", "publish", "/r3/inbox") in drawn(found)
-    assert "/r3/nav" in {each.path for each in found.picture.enclaves}
+    folding = Folding.of(picture_of(tmp_path, leader))
+    assert ("/{r1…r12}/nav", "publish", "/r3/inbox") in drawn(folding)
+    assert "/r3/nav" in {enclave.path for enclave in folding.picture.enclaves}
 
 
 def test_equal_units_may_name_one_of_another_kind(tmp_path: Path) -> None:
@@ -249,8 +251,8 @@ def test_names_without_the_other_side_are_marked_everywhere(tmp_path: Path) -> N
             }
         )
     )
-    found = json.loads(sros("view", policy, "--json").ok().out)
-    assert {each["name"]: each["lacks"] for each in found["names"]} == {
+    picture = json.loads(sros("view", policy, "--json").ok().out)
+    assert {name["name"]: name["lacks"] for name in picture["names"]} == {
         "/idle": "sender",
         "/lost": "receiver",
         "/nobody": "receiver",
@@ -263,7 +265,7 @@ def test_names_without_the_other_side_are_marked_everywhere(tmp_path: Path) -> N
     assert svg.count('class="card names lacking"') == 4
     assert "may be used by one side only" in svg
     open_to_all = sros("view", policy, "--template", "sros2", "--json").ok().out
-    assert {each["lacks"] for each in json.loads(open_to_all)["names"]} == {
+    assert {name["lacks"] for name in json.loads(open_to_all)["names"]} == {
         "",
         "sender",
         "receiver",

@@ -26,13 +26,13 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 
 @pytest.mark.parametrize("form", some(["svg", "dot", "mermaid", "markdown", "json"], 1))
 def test_two_runs_write_the_same_bytes(form: str, robot_keystore: Path) -> None:
-    found = set()
+    outputs = set()
     for seed in ("1", "2"):
         words = ("-m", "sros_tool", "view", robot_keystore, "--format", form)
         done = python(*words, env=importing(PYTHONHASHSEED=seed))
         assert len(done.stdout) > 5000
-        found.add(done.stdout)
-    assert len(found) == 1
+        outputs.add(done.stdout)
+    assert len(outputs) == 1
 
 
 @pytest.mark.parametrize(
@@ -73,8 +73,8 @@ def test_a_broken_keystore_is_drawn_all_the_same(robot_keystore: Path, tmp_path:
     (camera / "key.pem").symlink_to(tmp_path / "elsewhere" / "key.pem")
     (camera / "permissions.p7s").write_bytes(b"nonsense")
     value = json.loads(sros("view", root, "--format", "json").ok().out)
-    found = next(e for e in value["enclaves"] if e["path"] == "/mobile_robot/camera")
-    assert any("key.pem" in problem for problem in found["problems"])
+    camera = next(e for e in value["enclaves"] if e["path"] == "/mobile_robot/camera")
+    assert any("key.pem" in problem for problem in camera["problems"])
     assert any(f["severity"] == "error" for f in value["findings"])
     assert str(tmp_path) not in json.dumps(value)
 
@@ -122,7 +122,7 @@ def test_a_table_has_every_right_that_not_every_node_needs(tmp_path: Path) -> No
     assert cells["/cmd_vel"][0].strip() == "`/mobile_robot/velocity_mux`"
     assert "`/mobile_robot/recorder` is denied by `/front_camera/*`" in table
     for name, sides in cells.items():
-        lacks = {each.lacks for each in picture.names if each.name == name}
+        lacks = {drawn_name.lacks for drawn_name in picture.names if drawn_name.name == name}
         nobody = {Lack.SENDER: sides[0].strip(), Lack.RECEIVER: sides[1].strip()}
         assert {side for side, text in nobody.items() if text[:6] == "nobody"} == lacks - {
             Lack.NOTHING
@@ -131,10 +131,10 @@ def test_a_table_has_every_right_that_not_every_node_needs(tmp_path: Path) -> No
     assert "`/parameter_events`" in every and "`/parameter_events`" not in table
     (tmp_path / "hostile.xml").write_text(hostile_permissions())
     hostile = sros("view", tmp_path / "hostile.xml", "--format", "markdown").ok().out
-    found = [line for line in hostile.splitlines() if line[:1] == "|"]
-    assert len(found) > 2
-    for row in found:  # three cells, whatever names are in them
-        assert len(re.findall(r"(?<!\\)\|", row)) == 4, row
+    table_rows = [line for line in hostile.splitlines() if line[:1] == "|"]
+    assert len(table_rows) > 2
+    for table_row in table_rows:  # three cells, whatever names are in them
+        assert len(re.findall(r"(?<!\\)\|", table_row)) == 4, table_row
     two = sros("view", MOBILE_ROBOT, MOBILE_ROBOT, "--format", "markdown")
     assert two.status == 2 and "`sros diff_policy A B --format markdown`" in two.err
 

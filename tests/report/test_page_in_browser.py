@@ -113,8 +113,8 @@ def test_search_finds_enclaves_and_names_and_shows_who_may_do_what(
         page.fill("#search", "velocity_m")
         assert "/mobile_robot/velocity_mux" in page.inner_text("#results button >> nth=0")
         page.fill("#search", "cmd_vel")
-        found = page.locator("#results button").all_inner_texts()
-        assert [each.split("\n")[-1] for each in found] == [
+        results = page.locator("#results button").all_inner_texts()
+        assert [result.split("\n")[-1] for result in results] == [
             "/cmd_vel",
             "/cmd_vel_nav",
             "/cmd_vel_teleop",
@@ -208,12 +208,12 @@ def open_keystores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def distances(network: Network, name: str, upstream: bool) -> dict[str, int]:
     """The enclaves that a name is reached from (or that it reaches), each with its hops."""
     hops = [hop for enclave in network.enclaves for hop in network.hops(enclave)]
-    found = {(hop.source if upstream else hop.target): 1 for hop in hops if hop.name == name}
-    for enclave in list(found):
+    distance = {(hop.source if upstream else hop.target): 1 for hop in hops if hop.name == name}
+    for enclave in list(distance):
         reach = network.reach(enclave)
         for other, path in (reach.learns_from if upstream else reach.influences).items():
-            found[other] = min(found.get(other, 99), 1 + len(path))
-    return found
+            distance[other] = min(distance.get(other, 99), 1 + len(path))
+    return distance
 
 
 @pytest.mark.parametrize("open_to_all", some(["nothing", "some names", "writing"], 1))
@@ -261,10 +261,10 @@ def shown_flow(page: Page, name: str, upstream: bool) -> tuple[int, int]:
     assert page.inner_text("#details h2") == name
     page.click("text=Who can influence it" if upstream else "text=Whom it influences")
     summary = page.inner_text("#summary")
-    found = re.search(r"(\d+) enclaves? can .* within 2 hops(?:, (\d+) over)?", summary)
-    assert found, summary
+    counts_shown = re.search(r"(\d+) enclaves? can .* within 2 hops(?:, (\d+) over)?", summary)
+    assert counts_shown, summary
     page.click("#back")
-    return int(found[1]), int(found[2] or found[1])
+    return int(counts_shown[1]), int(counts_shown[2] or counts_shown[1])
 
 
 OF_ROBOTS = {
@@ -344,9 +344,7 @@ def test_what_ends_at_the_same_moment_is_one_row_where_there_is_much(
     path.write_text(render_page(picture, scenes_of(picture), NOW))
     with opened(browser, path) as page:
         page.click("#tab-timeline")
-        rows = [
-            each.split("\n")[0] for each in page.locator("#timeline tbody tr").all_inner_texts()
-        ]
+        rows = [row.split("\n")[0] for row in page.locator("#timeline tbody tr").all_inner_texts()]
         assert len(rows) == 3
         assert f"certificate {paths[0]}" in rows[0].replace("\t", " ")
         assert "certificate of 100 enclaves" in rows[1]
@@ -411,7 +409,7 @@ def test_tab_leads_through_every_control_and_out_of_the_map(
             )
         wanted = ["theme", "print", "tab-map", "search", "filter-enclave", "zoom-in", "canvas", "g"]
         # One stop for all cards, where the arrow keys do the rest; then the page begins again.
-        assert [each for each in seen if each in wanted][: len(wanted)] == wanted
+        assert [name for name in seen if name in wanted][: len(wanted)] == wanted
         assert seen[seen.index("g") + 1] not in ("g", "canvas")
 
 
@@ -423,12 +421,16 @@ def test_axe_finds_nothing(browser: Browser, robot_page: Path, axe: str, size: s
         def check(where: str, part: str, **options: object) -> None:
             options = {"resultTypes": ["violations"], **options}
             result = page.evaluate("([part, options]) => axe.run(part, options)", [part, options])
-            found = [
-                (each["id"], each["nodes"][0]["html"][:150], each["nodes"][0]["failureSummary"])
-                for each in result["violations"]
+            violations = [
+                (
+                    violation["id"],
+                    violation["nodes"][0]["html"][:150],
+                    violation["nodes"][0]["failureSummary"],
+                )
+                for violation in result["violations"]
             ]
-            assert not found, (where, found)
-            assert any(each["id"] == "color-contrast" for each in result["passes"])
+            assert not violations, (where, violations)
+            assert any(rule["id"] == "color-contrast" for rule in result["passes"])
 
         def check_in_both_themes(where: str, part: str = ".panel:not([hidden])") -> None:
             """Check a part, the contrast with it, and in the other theme the contrast alone."""
@@ -612,7 +614,7 @@ def test_the_table_has_every_name_and_those_that_only_one_side_may_use(
         page.click("#tab-names")
         assert "only names that one side may use (1)" in page.inner_text("#names")
         rows = page.locator("#names tbody tr")
-        assert ["/lost" in each for each in rows.all_inner_texts()] == [False, True]
+        assert ["/lost" in row for row in rows.all_inner_texts()] == [False, True]
         page.fill("#search-names", "USED")
         assert rows.count() == 1
         page.fill("#search-names", "")

@@ -89,7 +89,7 @@ def test_a_sample_draws_what_all_enclaves_draw(large: Path) -> None:
 
 
 def cards(folding: Folding) -> set[tuple[str, str, str]]:
-    return {(each.path, each.group, each.note) for each in folding.picture.enclaves}
+    return {(enclave.path, enclave.group, enclave.note) for enclave in folding.picture.enclaves}
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,9 @@ def test_a_unit_whose_files_are_broken(large: Path, file: str) -> None:
     """Permissions are compared; of the rest, nothing is known and that is said."""
     (large / "enclaves/a4/nav" / file).write_bytes(b"x")
     picture, _ = drawing(large, sampled=True)
-    assert ("/a4/nav" in {each.path for each in picture.enclaves}) == (file == "permissions.p7s")
+    assert ("/a4/nav" in {enclave.path for enclave in picture.enclaves}) == (
+        file == "permissions.p7s"
+    )
     assert any("signatures, certificates" in line for line in picture.headlines)
 
 
