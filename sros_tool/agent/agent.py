@@ -464,8 +464,9 @@ class _Round:
         )
 
     def _digests(self, names: Iterable[str]) -> dict[str, str]:
-        """Return two digests of the files of each enclave: of all but the key, and without its own
-        documents, which say nothing of whom else it trusts.
+        """Map each enclave to two digests: of its files without the key, and of its trust files.
+
+        The trust files decide which other enclaves it accepts.
         """
         with Folder(self._folder) as opened:
             return {
@@ -729,7 +730,7 @@ class _Round:
 
 
 def _boot_digest(robot: str, boot: str) -> str | None:
-    """Return a SHA-256 for the start of the machine, from which it cannot be told; None without."""
+    """Return a SHA-256 that hides the random id of the machine's start; None without an id."""
     return hashlib.sha256(f"{robot} {boot}".encode()).hexdigest() if boot else None
 
 

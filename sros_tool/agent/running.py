@@ -50,11 +50,10 @@ class EnclaveProcesses(NamedTuple):
     """The processes in the enclaves of a security folder."""
 
     states: Mapping[str, RunningFiles]
-    """The files that the processes of each enclave have loaded, of those that run from the folder.
-    """
+    """By enclave, whether its processes that run from the folder have loaded the current files."""
     list_states: Mapping[str, RunningFiles]
-    """The same of the revocation list and the CAs alone: ``current`` also if only the enclave's own
-    documents are newer than a process."""
+    """Like `states`, but only for the revocation list and the CAs: ``current`` also if only the
+    enclave's own certificate, permissions or governance are newer than a process."""
     elsewhere: tuple[str, ...]
     """The enclaves of the folder in which a process runs from another folder: a restart of a unit
     does not help there.
@@ -129,7 +128,7 @@ def _enclave_of(process: Process) -> str:
 
 
 def _folder_is_known(process: Process) -> bool:
-    """Return whether the folder from which a process runs was found, or is not there any more."""
+    """Return whether the enclave folder of a process was found, or does not exist."""
     return bool(process.enclave and (process.enclave.folders or not process.enclave.problem))
 
 

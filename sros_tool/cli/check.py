@@ -716,7 +716,7 @@ def _print_markdown(chosen_findings: ChosenFindings, fleet: Fleet | None) -> Non
 
 
 def _fleet_of(circumstances: Circumstances, paths: Sequence[Path]) -> Fleet | None:
-    """Return the fleet of policies, with their enclave paths, or the fleet of a keystore.
+    """Return the fleet of --fleet with the enclaves of the policies, or else the keystore's fleet.
 
     None if there is no fleet, or if it cannot be read.
     """

@@ -461,7 +461,7 @@ def _finding_line(finding: Finding) -> str:
 
 
 def _absolute_lines(change: RightsChange) -> Iterator[str]:
-    """Yield a line for each name that begins or ceases to move with the namespace of its node."""
+    """Yield a line for each name that became absolute, or relative to its node's namespace."""
     from sros_tool.fleet.robots import folded
     from sros_tool.policy.model import ALLOW
 

@@ -17,7 +17,7 @@ _MOST_LINES = 20
 
 
 def access_lines(policy: Policy, folder: Path) -> list[str]:
-    """Return a line for each name in a policy, with who may use it on either side.
+    """Return a line for each name in a policy: its senders and its receivers.
 
     Names that are used only as every node uses them (the common parts) are left out.
     """

@@ -102,7 +102,10 @@ def assign(
 
 
 def _process_prefix(node: ObservedNode) -> str:
-    """Return what the participants of a process have in common: Fast DDS shows host and id."""
+    """Return the prefix of a GUID that is the same for all participants of a process.
+
+    With Fast DDS it states the host and the process id.
+    """
     is_fast = node.participant.startswith(_FAST_DDS)
     return node.participant[:12] if is_fast else node.participant
 

@@ -30,10 +30,10 @@ def left_alone(
     moved: Collection[tuple[Endpoint, Endpoint]],
     denied: Iterable[DeniedRight],
 ) -> list[str]:
-    """Return, as text, what nodes use by a name whose whole other side ``moved`` to another one.
+    """Return clauses on names that nodes still use, though all peers ``moved`` to another name.
 
-    ``before`` are the nodes to compare, of ``expected``, with the names that count now; what is
-    ``denied`` is left out.
+    ``before`` are the nodes to compare, a part of the nodes ``expected`` now; ``denied`` endpoints
+    are left out.
     """
     refused = _denied_endpoints(denied)
     robot_nodes = [node for node in expected.nodes if not is_tool(node)]
@@ -70,7 +70,7 @@ def node_name(node: ObservedNode) -> str:
 
 
 def _endpoints_of(nodes: Iterable[ObservedNode]) -> Iterator[tuple[str, Endpoint]]:
-    """Yield the endpoints of nodes with the names of the nodes, as they stay with every start."""
+    """Yield node name and endpoint, with ``*`` for the parts that change with every start."""
     for node in nodes:
         for topic, way in node.endpoints:
             yield node_name(node), Endpoint(topic.replace(node.name, stable_name(node.name)), way)

@@ -38,7 +38,7 @@ class ObservedNodes:
 
     @cached_property
     def as_observed(self) -> Sequence[ObservedNode]:
-        """The nodes with the enclaves and names that they had, as they were given or written.
+        """The nodes with the enclaves and names that they had on the open robot.
 
         Nodes whose enclave the graph did not show are left out.
         """
@@ -62,10 +62,10 @@ class ObservedNodes:
         return read_policy(self.robot.policy)
 
     def in_their_enclaves(self) -> Iterator[ObservedNode]:
-        """Yield the nodes with the names that they had, in the enclaves that the policy has.
+        """Yield the nodes with their old names, in the enclaves that the policy gives them now.
 
-        A node whose profile was moved to another enclave is in that enclave; a node without an
-        enclave has the enclave that it had.
+        A node whose profile was moved is in the enclave of its profile; a node without a profile
+        keeps its old enclave.
         """
         names = {enclave.path for enclave in self.policy.enclaves}
         enclave_of = {
@@ -103,7 +103,7 @@ class ObservedNodes:
 
     @cached_property
     def renamed(self) -> Mapping[str, tuple[str, str]]:
-        """The namespaces and names that the policy gives observed nodes now, by their old names.
+        """Map the old full names of renamed nodes to the namespace and name in the policy.
 
         A node was renamed if it alone of its enclave has no profile any more, and one profile of
         that enclave alone is for a node that was not observed.
@@ -125,9 +125,9 @@ class ObservedNodes:
 
     @cached_property
     def _allowed_endpoints(self) -> Mapping[ObservedNode, Mapping[Endpoint, Sequence[Endpoint]]]:
-        """The endpoints that renamed nodes may have now, by those that they had, likeliest first.
+        """Map each old endpoint of a renamed node to its allowed new names, the likeliest first.
 
-        An endpoint that the enclave denies under every possible name has its likeliest name.
+        If the enclave denies all possible names, only the likeliest name is kept.
         """
         possible = {
             node: {
@@ -162,7 +162,7 @@ class ObservedNodes:
     def _current_endpoints(
         self, node: ObservedNode, now: Observation | None
     ) -> Mapping[Endpoint, Endpoint]:
-        """Map the endpoints of a renamed node to those that it should have under its new name."""
+        """Map the old endpoints of a renamed node to the endpoints that it should have now."""
         name = expand("~", *self.renamed[node_name(node)])
         seen_nodes = (other for other in (now.nodes if now else ()) if node_name(other) == name)
         current = {endpoint for other in seen_nodes for endpoint in other.endpoints}
@@ -172,7 +172,7 @@ class ObservedNodes:
         }
 
     def moved_endpoints(self, now: Observation | None = None) -> Set[tuple[Endpoint, Endpoint]]:
-        """Return the endpoints of renamed nodes that are renamed, too, with their new names."""
+        """Return pairs of old and new endpoint, for the endpoints that renaming a node changes."""
         return {
             (before, after)
             for node in self._allowed_endpoints
@@ -206,9 +206,9 @@ class ObservedNodes:
         return audit(observation, enclaves, OBSERVER).denied
 
     def names_in(self, enclave: str) -> tuple[set[str], str]:
-        """Return the names of an enclave's nodes, observed or in the policy, and a replaced one.
+        """Return the full names of an enclave's nodes, and the old name of a renamed node or "".
 
-        The replaced name is that of a node to which the policy gives another one; "" for none.
+        The names are those of observed nodes and of nodes in the policy.
         """
         with suppress(SrosError):  # a broken file must not keep the robot closed
             observed = {node_name(node) for node in self.as_observed if enclave in node.enclaves}
@@ -222,10 +222,10 @@ class ObservedNodes:
 def _possible_endpoints(
     endpoint: Endpoint, node: ObservedNode, ns: str, name: str
 ) -> Sequence[Endpoint]:
-    """Return an endpoint of a node as it may be named under another node name, likeliest first.
+    """Return the possible endpoints of a renamed node for an old one, the likeliest first.
 
-    Private names of the node move with it.  The graph does not show whether a program wrote another
-    name of its namespace as a relative one, which moves, or as an absolute one.
+    Private names of the node change with the node.  Another name of its namespace changes only if
+    the program wrote it as a relative name, which the graph does not show.
     """
     prefix, fqn = endpoint.topic[:2], endpoint.topic[2:]
     private, near = expand("~/", node.ns, node.name), expand("", node.ns, "")

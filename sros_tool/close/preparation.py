@@ -78,7 +78,7 @@ def _denied_access(robot: LocalRobot) -> list[str]:
 def _do_steps(
     robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: bool
 ) -> tuple[list[CloseStep], list[str], bool]:
-    """Do the steps; return their states, what was found, and whether that keeps later ones open."""
+    """Do the steps; return their states, the problems, and whether a problem stopped the rest."""
     done: list[CloseStep] = []
     problems: list[str] = []
     is_stopped = False
@@ -127,7 +127,7 @@ def _do(robot: LocalRobot, step: CommandStep) -> tuple[str, list[str]]:
 
 
 def _warn_of_rmw(robot: LocalRobot, observed: ObservedProcesses) -> None:
-    """Say so if nodes on the RMW of their process, or of this shell, cannot run secured."""
+    """Warn if an RMW that the processes use was built without security."""
     environment = robot.shell.environment
     default = environment.get(RMW) or next(iter(rmw_implementations(environment)), "")
     for rmw in sorted({process.rmw or default for process in observed.processes}):

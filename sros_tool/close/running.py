@@ -105,7 +105,7 @@ class RunningRobot:
         return process.user in (0, self.robot.export.stat().st_uid)
 
     def why_not_current(self, process: Process, enclave: ProcessEnclave) -> str:
-        """Return what precedes "the processes of ENCLAVE" where they do not count as closed."""
+        """Return why a process is not closed, as text before "the processes of ENCLAVE"."""
         if not self.may_use_files(process):
             return f"user {process.user}, who cannot read the files, runs"
         if process.environment.get(STRATEGY) != "Enforce":

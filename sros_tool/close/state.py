@@ -45,7 +45,10 @@ class Proof(NamedTuple):
 
     @property
     def is_accepted_by_partial(self) -> bool:
-        """Whether ``--partial`` accepts the claim: not without an observer that hears the robot."""
+        """Whether ``--partial`` accepts that the claim could not be tested.
+
+        It never accepts that for the claims that need an observer of the running robot.
+        """
         return self.holds is None and self.claim not in (TALK, SILENCE)
 
 

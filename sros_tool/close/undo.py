@@ -90,7 +90,7 @@ def _secured_units(running: RunningRobot, observed: ObservedProcesses) -> Iterat
 
 
 def _say_how_to_start(running: RunningRobot, observed: ObservedProcesses) -> None:
-    """Show how to start the processes open that do not run, or run by another command."""
+    """Show how to start, without security, processes that do not run or have another command."""
     robot, secured, nodes = running.robot, _secured_processes(running), ObservedNodes(running.robot)
     known = running.with_later_processes(robot.processes)
     commands = {tuple(process.command) for process in known.processes}
@@ -110,7 +110,7 @@ def _say_how_to_start(running: RunningRobot, observed: ObservedProcesses) -> Non
 
 
 def _secured_guests(running: RunningRobot, observed: ObservedProcesses) -> Iterator[str]:
-    """Yield the processes in enclaves of the export in which no process was observed."""
+    """Yield processes that run in an enclave of the export in which none was observed."""
     secured = _secured_processes(running)
     for name in sorted(secured.keys() - {process.enclave for process in observed.processes}):
         guest = secured[name]
@@ -121,7 +121,7 @@ def _secured_guests(running: RunningRobot, observed: ObservedProcesses) -> Itera
 
 
 def _unknown_processes(running: RunningRobot) -> Iterator[str]:
-    """Yield secured processes that sros does not know, so that none of them is taken for open."""
+    """Yield processes that may run secured, although sros did not start them from this folder."""
     pids = {process.pid for process, _ in running.secured_everywhere}
     for other in running.in_domain:
         if (enclave := other.enclave) and other.pid not in pids and not other.is_daemon:
@@ -140,7 +140,10 @@ def _unknown_processes(running: RunningRobot) -> Iterator[str]:
 
 
 def _is_like(process: Process, observed: ClosedProcess, nodes: Collection[str]) -> bool:
-    """Return whether a process may be an observed one, which has these nodes, by other words."""
+    """Return whether a process may be an observed one that was started with another command.
+
+    ``nodes`` are the full names of the observed process's nodes.
+    """
     if named := node_argument(process.program[1]):
         return expand("~", *named) in nodes
     return program_of(process.program[1]) == program_of(tuple(observed.command))

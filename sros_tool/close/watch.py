@@ -95,7 +95,7 @@ def _check_open(robot: LocalRobot) -> None:
 
 @contextmanager
 def _looking(robot: LocalRobot, started: _StartedProcesses) -> Iterator[None]:
-    """Put into ``started`` the processes that run in this context, with what started them."""
+    """Add to ``started`` all processes that run during the context, and what started them."""
     table, over = ProcessTable(), threading.Event()
 
     def look() -> None:
@@ -172,7 +172,7 @@ def _observed_processes(
     running: RunningRobot,
     started: _StartedProcesses,
 ) -> ObservedProcesses:
-    """Return the processes of nodes that run now, and of nodes that ended while sros watched."""
+    """Return the processes of the observed nodes, also those that ended while sros watched."""
     processes = running.processes.processes
     pids = [process.pid for process in processes if "libddsc" in process.libraries]
     stayed = [node for node in nodes if node.participant not in ended_participants]
@@ -190,7 +190,7 @@ def _observed_processes(
 
 
 def _say_variables(robot: LocalRobot, observed: ObservedProcesses, running: RunningRobot) -> None:
-    """Name the variables of processes that their commands do not set, and this shell neither."""
+    """Print variables of the processes that neither their commands nor this shell set."""
     rmws = {process.pid: process.rmw for process in observed.processes}
     for process in running.processes.processes:
         more = process.environment.keys() - {*robot.shell.environment, *_SHELL_VARIABLES}
@@ -242,9 +242,9 @@ def _lacking_text(robot: LocalRobot, nodes: Sequence[ObservedNode]) -> str:
 
 
 def _lost_namespaces(nodes: Sequence[ObservedNode], policy: Policy) -> Iterator[str]:
-    """Yield a clause for each node that the policy has in one other namespace alone.
+    """Yield a clause for each node that the policy has only in one other namespace.
 
-    Namespaces in which a node of this name was seen, too, do not count.
+    A namespace does not count if a node of this name was seen there, too.
     """
     seen = {node_name(node) for node in nodes}
     namespaces: dict[str, set[str]] = {}

@@ -300,7 +300,7 @@ def _text(value: object) -> str:
 
 
 def _line(product: str, version: Version) -> str:
-    """Return the release line of a release, as the advisories name it."""
+    """Return the branch of releases that a version belongs to, such as 2.14 for 2.7 to 2.14."""
     if product != "Fast DDS":
         return f"{version[0]}.{version[1]}"
     for first, line in ((3, 3), "3.6"), ((3, 0), "3.2"), ((2, 7), "2.14"):

@@ -135,7 +135,7 @@ class UserKeystore(NamedTuple):
         return (self.service or SERVICE) if name == SERVICE else name
 
     def permitted_enclave(self, row: Row) -> str:
-        """Return the enclave that plays attacker and permitted party of a row, else ""."""
+        """Return the enclave that plays both the attacker and a permitted party of a row, or ""."""
         attackers, other_enclaves = (
             {
                 (party.role, self.cast.get(party.identity.enclave, ""))

@@ -283,7 +283,7 @@ _CERTIFICATE = "-----BEGIN CERTIFICATE-----"
 
 
 class Wiretap:
-    """A capture of a row's packets; ``problem`` says why capturing is not permitted, or "".
+    """A capture of the packets of a demo row; ``problem`` says why it is not permitted, or "".
 
     ``texts`` has the text of each party, by name; ``topic`` is the topic as packets name it.  The
     capture starts at once: create it in the network of the row, and inside a running asyncio loop.

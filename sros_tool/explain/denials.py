@@ -381,7 +381,10 @@ def _denied_common_part(
     node_rights: frozenset[NodeRight],
     common: CommonParts,
 ) -> tuple[str, ...]:
-    """Return the first common part of which a node has no right and was denied a right, or ()."""
+    """Return the common part that a profile does not include and needs, as a tuple; or ().
+
+    A denied right shows that it needs the part, and no right of the part that it is missing.
+    """
     if is_expression(profile[1]):
         return ()
     for part in _NODE_PARTS:

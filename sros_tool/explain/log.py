@@ -616,7 +616,7 @@ class _Examiner:
         )
 
     def _for_export(self, text: str) -> str:
-        """Return a remedy with this export as KEYSTORE of the commands that need no CA keys."""
+        """Return a remedy with this export as KEYSTORE, except in commands that need CA keys."""
         parts = _COMMAND.split(text)
         named = [
             part if NEEDS_CA_KEYS.match(part) else _with_name(part, "KEYSTORE", self._root)
@@ -664,10 +664,10 @@ class _Examiner:
         return replace(finding, found=tuple(known), checked=bool(known), remedy=text)
 
     def missing_namespaces(self, denials: Iterable[Denial]) -> dict[tuple[str, str], str]:
-        """Map pairs of process and enclave to the namespace that every denied name of it lacks.
+        """Map pairs of process and enclave to the namespace that all denied names lack.
 
-        Only if a service of a node is among the names: the process lacks its namespace then, and
-        not a name its remapping.
+        Only if a service of a node is among the names: otherwise a remapping may be missing, and
+        not the namespace of the process.
         """
         by_process = defaultdict[tuple[str, str], list[Denial]](list)
         for denial in denials:
@@ -870,7 +870,10 @@ class _Examiner:
 
 
 def _with_name(text: str, word: str, name: str) -> str:
-    """Return a remedy to be formatted with ``name``, quoted, for a word; unchanged for ""."""
+    """Return a remedy with the quoted ``name`` in place of ``word``; unchanged for "".
+
+    Braces are doubled, because the remedy is a format string.
+    """
     if not name:
         return text
     plain = quote(name).replace("{", "{{").replace("}", "}}")

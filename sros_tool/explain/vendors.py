@@ -416,14 +416,14 @@ def _runs_on_zenoh(keystore: OpenedKeystore, name: str) -> bool:
 
 
 class OpenedParts(NamedTuple):
-    """What processes without an identity may do, or else the acting parts that they may do."""
+    """Whether processes without an identity have a right, or else which acting parts of it."""
 
     whole: bool = False
     parts: tuple[str, ...] = ()
 
     @staticmethod
     def joined(opened: Iterable[OpenedParts]) -> OpenedParts:
-        """Return what is opened in any enclave or domain."""
+        """Return the union of several: open in at least one enclave or domain."""
         known = tuple(opened)
         if any(opened_parts.whole for opened_parts in known):
             return OpenedParts(whole=True)

@@ -510,7 +510,7 @@ class _Folding(NamedTuple):
 
 
 def _foldings(fleet: Fleet, enclave: str, text: str) -> list[tuple[_Folding, str]]:
-    """Return the ways to fold a line: by its own robot, by the only other robot, or by both."""
+    """Return texts with a placeholder for the line's own robot, the other robot, or both."""
     own = robot_of(fleet, enclave)
     named = [robot for robot in named_robots(fleet, "", text) if robot != own]
     other = named[0] if len(named) == 1 else None

@@ -382,7 +382,7 @@ def resolve(sighting: Sighting) -> Observation:
 def _enclaves(
     sighting: Sighting, processes: dict[str, frozenset[_Name]]
 ) -> dict[str, frozenset[str]]:
-    """Map each process to its possible enclaves; the sighting excludes all others.
+    """Map each process to the enclaves in which, by the listed nodes, it may run.
 
     ``processes`` maps participants to the names of their nodes.
     """

@@ -960,13 +960,13 @@ class _KeystoreRecords:
         return tuple(sorted(name for name in names if not has_enclave(self._root, name)))
 
     def short_lived(self, first: Mapping[str, _Expiring]) -> tuple[str, ...]:
-        """Return the short-lived enclaves among those whose files expire first."""
+        """Return those enclaves of ``first``, the files that expire first, that are short-lived."""
         names = {file.enclave for file in first.values() if file.enclave}
         template = self._keystore.template
         return tuple(sorted(name for name in names if template.longest_validity(name) is not None))
 
     def validity(self, compared_robot: _ComparedRobot) -> dict[str, _Expiring]:
-        """Return the robot's file that expires first, by kind, by the ledger."""
+        """Map each kind of file to the robot's file that expires first, by the ledger."""
         first: dict[str, _Expiring] = {}
         for kind, digests in compared_robot.expiring.items():
             entries = (self._issued.get(digest) for digest in digests)

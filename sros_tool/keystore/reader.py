@@ -269,7 +269,7 @@ class OpenedKeystore:
 
     @property
     def has_all_enclaves(self) -> bool:
-        """Whether it has all enclaves of its CAs.
+        """Whether every enclave that its CAs issued is here.
 
         An export may lack some, and has the governance only in the folders of its enclaves.
         """

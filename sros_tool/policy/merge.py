@@ -428,7 +428,7 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
 
 
 def _shared_enclaves(before: Policy, policies: Iterable[Policy], after: Policy) -> Iterator[str]:
-    """Yield a text on each enclave to which policies add nodes without naming any that it has.
+    """Yield a text on each enclave that gets new nodes from policies without its present nodes.
 
     Nodes of the same name in other namespaces are `instances`.
     """

@@ -431,7 +431,10 @@ def _permissions_fit(vendor: Vendor, side: AccessSource, name: str, subject: str
 
 @dataclass(frozen=True, slots=True)
 class _Access:
-    """The access of an enclave in one world and domain: sets of topics, and a test of one."""
+    """The access of an enclave in one world and domain.
+
+    ``topics`` are the allowed topics; ``decide`` decides on a single topic.
+    """
 
     topics: Mapping[AccessVerb, NameSet]
     decide: Callable[[AccessVerb, str], bool]
@@ -721,7 +724,7 @@ def _added_gains(
     domain: int,
     limit: SearchLimit,
 ) -> Iterator[Gain]:
-    """Yield a gain for ``topics``, which an enclave may use only after a change."""
+    """Yield `Gain` values for ``topics``, which an enclave may use only after a change."""
     before, after = sides
     for verb in _VERBS:
         gained_topics = topics[verb]

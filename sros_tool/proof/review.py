@@ -312,7 +312,7 @@ class _Review:
     head: CommitFiles
     base: CommitFiles | None
     robots: dict[str, Fleet | None] = field(default_factory=dict)
-    """The robots of what the steps with a subject examine."""
+    """Map the subject of a step to the fleet of the policy or keystore that it examines."""
 
     def _allows(self, kind: str) -> bool:
         """Return whether the request allows what steps of this kind find."""

@@ -481,7 +481,7 @@ class NamesOfRights:
 def _with_all_wildcards(
     rights: Collection[Right], edges_of: Callable[[Known], list[Edge]]
 ) -> tuple[Known, list[Edge]]:
-    """Return known names, and the edges for them in which every wildcard of the rights is seen.
+    """Return the names to draw and the edges to them, so that every wildcard is visible.
 
     Edges to known names do not show a wildcard if all names that it matches are denied, or if the
     enclave also has rights to these names themselves.  Then it is drawn as a name.

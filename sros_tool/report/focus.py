@@ -179,7 +179,7 @@ class FocusFlow:
         return replace(flow, stages={key: stage for key, stage in stages.items() if stage})
 
     def ends(self, edge: Edge, stage: int) -> tuple[bool, bool]:
-        """Return whether a right is drawn to its name, and from it, in the column ``stage``."""
+        """Return whether lines to the name, and from the name, are drawn in column ``stage``."""
         if stage not in self.stages.get((edge.kind, edge.name), ()):
             return False, False
         before, after = self._stages(edge)
@@ -570,7 +570,7 @@ class _Draft:
         )
 
     def _node(self, side: int, stage: int, enclave: str) -> str:
-        """Return the id of an enclave's card on one side of the names in a column (0: left)."""
+        """Return the id of an enclave's card, left (``side`` 0) or right of a column of names."""
         before = stage > 0 or (stage == 0 and side == 0)
         return f"{'s' if before else 'l'}{self._nodes[before, enclave]}"
 

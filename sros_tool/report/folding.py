@@ -57,7 +57,7 @@ _TITLE_LETTERS = 30
 """Maximum length of the title of a frame, in characters; a frame is as wide as a card."""
 _ENCLAVE = "enclave"
 _Part = tuple[int, tuple[int, ...]]
-"""What is seen of a unit: the number of its kind, and the units in its texts as symbols."""
+"""A part of the picture about a unit: a number for its kind, and the units that it names."""
 
 
 class Folding(NamedTuple):
@@ -211,7 +211,7 @@ class UnitNames:
                     self.of[path] = named_units.pop()
 
     def text(self, text: str) -> UnitText:
-        """Return a text split at the units that it names, as words or between underscores."""
+        """Return a text split at the names of units: whole words, or parts between underscores."""
         split = self._texts.get(text)
         if split is None:
             split = self._texts[text] = self._read(text)

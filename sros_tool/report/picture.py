@@ -420,7 +420,7 @@ class EqualUnits(NamedTuple):
     members: tuple[str, ...]
     """Names of the units."""
     domains: str = ""
-    """Their ROS domains, if the picture has units of other domains; else empty."""
+    """ROS domains of the units, if other units have other domains; else empty."""
 
     @property
     def title(self) -> str:

@@ -302,7 +302,9 @@ def _forms(places: Mapping[str, Source]) -> frozenset[Chunks]:
 def _names_of(
     difference: Difference, right: str, allowed: Mapping[str, Source], denied: Mapping[str, Source]
 ) -> frozenset[Chunks]:
-    """Return the chunks of the names of a difference; ``allowed`` and ``denied`` tell their places.
+    """Return the chunks of the names in a difference.
+
+    ``allowed`` and ``denied`` map its names to the lines that state them, for errors.
 
     Raises:
         PolicyError: the names cannot be expressed, or take more than `MOST_EXPRESSIONS`.

@@ -227,7 +227,7 @@ _PLAIN_PARTS: dict[Subjects, Callable[[str], str]] = {
     Subjects.SUBSET: str,
     Subjects.TRIMMED_SUBSET: _without_blanks,
 }
-"""How each rule that splits subjects reads the parts."""
+"""Functions that normalize the parts of a subject, for the rules that split subjects."""
 
 _COMPARE: dict[Subjects, Callable[[str, str], bool]] = {
     Subjects.EXACT: _same_attributes,

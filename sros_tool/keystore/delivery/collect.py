@@ -301,7 +301,7 @@ class _ReceivedMessage:
     crl: str | None = None
     """The revocation list in the message, which counts if a CA of the keystore signed it."""
     stranger: x509.Certificate | None = None
-    """The certificate of the signer of a message that does not count."""
+    """The signer's certificate, if the message does not count."""
     remarks: list[str] = field(default_factory=list)
     requests: list[_DecidedRequest] = field(default_factory=list)
 

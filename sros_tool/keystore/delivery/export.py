@@ -273,10 +273,10 @@ def released_files(keystore: OpenedKeystore, name: str) -> dict[str, bytes]:
 
 
 def _evaluated_until(files: Mapping[str, bytes], state: OpenedEnclave, now: datetime) -> datetime:
-    """Return the first moment at which sound files may get a problem that no list causes.
+    """Return until when files without a problem need no other evaluation: the first expiry.
 
-    It is ``now`` for files whose evaluation looks at revocation lists in other ways: there are
-    lists in the file of a CA, or Zenoh configurations.
+    Revocation lists are evaluated separately.  It is ``now`` for files that depend on them in other
+    ways: there are lists in the file of a CA, or Zenoh configurations.
     """
     by_name = {path.rpartition("/")[2]: data for path, data in files.items()}
     authorities = [by_name[file] for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)]

@@ -55,7 +55,7 @@ class PublishedRelease(NamedTuple):
         return f"targets/{folder}/{self.sha256}.{name}"
 
     def checked(self) -> PublishedRelease:
-        """Return the release; raise `ValueError` if it is none that sros publishes."""
+        """Return the release; raise `ValueError` if a value is one that sros never publishes."""
         for value, most in ((self.number, MOST_NUMBER), (self.length, OF_ONE_ROBOT.packed)):
             check_count(value, most)
         if not (isinstance(self.sha256, str) and _DIGEST.match(self.sha256)):

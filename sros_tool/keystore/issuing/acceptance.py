@@ -168,11 +168,13 @@ def refuse_stopping(
 def _stopped_enclaves(
     files: _FilesOfChange, now: datetime
 ) -> tuple[dict[Vendor, _Refusals], list[str]]:
-    """Return the enclaves that vendors would refuse, and either accept today or are new.
+    """Return the enclaves that stop working: a vendor would refuse them, and accepts them today.
+
+    New enclaves that a vendor would refuse count, too.
 
     Returns:
-        a map from vendors to those enclaves, and the enclaves left out of it because their
-            certificates were revoked before.
+        a map from vendors to the enclaves that they would refuse, and the enclaves that are left
+            out of the map because their certificates were revoked before.
     """
     stopped: dict[Vendor, dict[str, list[str]]] = {}
     put_back: list[str] = []

@@ -347,7 +347,10 @@ class _Goal:
 
 
 def _first_step(present_settings: PresentSettings, goal: _Goal) -> _Goal:
-    """Return the goal of the stage CREDENTIALS, which keeps protection, domains and name."""
+    """Return the goal of the first stage, CREDENTIALS: ``goal`` with the present protection.
+
+    The name, the description, the distributions and the domains also stay as they are.
+    """
     settings = replace(
         goal.settings,
         protection=present_settings.settings.protection,
