@@ -197,23 +197,7 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
         echo(f"  every enclave may {does}: the governance of the keystore leaves it open")
     echo(f"how to restart each process with security (all of it: {robot.start}):")
     for process in closed.observed.processes:
-        how = "by its launch, by hand" if process.launch else "by hand"
-        how = "by Docker Compose, by hand" if process.container else how
-        restarts = "restarts" if process.pid else "adds a drop-in to"
-        how = f"--apply {restarts} {process.unit}" if process.unit else how
-        if closed.secured.get(process.enclave):
-            how = "closed"
-        elif process.enclave in closed.secured:
-            how = f"closed {_EARLIER}: {how}"
-        pid = f"process {process.pid}"
-        pid += f", known by its {process.known_by}" if process.enclave not in closed.secured else ""
-        if not process.pid:
-            runs = process.enclave in closed.secured
-            ended = process.enclave in closed.observed.ended
-            pid = "has ended" if ended else "not running as observed"
-            pid = "started by another command than observed" if runs else pid
-        nodes = _nodes(policy, process.enclave)
-        echo(f"  {process.enclave}: {pid}{nodes}: {how}")
+        echo(f"  {_process_line(process, closed, policy)}")
     for name in closed.new:
         why = "has ended" if name in closed.observed.ended else "new"
         start = closed.observed.command_of_new(robot.export.absolute(), name)
@@ -235,6 +219,27 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
     if stays := len(closed.denied) - len(closed.newly_denied):
         rights = counted(stays, "right")
         echo(f"{rights} used when sros watched: denied as before (--json has all)")
+
+
+def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) -> str:
+    """Return the enclave of a process, how sros knows the process, and how it is restarted."""
+    how = "by its launch, by hand" if process.launch else "by hand"
+    how = "by Docker Compose, by hand" if process.container else how
+    restarts = "restarts" if process.pid else "adds a drop-in to"
+    how = f"--apply {restarts} {process.unit}" if process.unit else how
+    runs = process.enclave in closed.secured
+    if closed.secured.get(process.enclave):
+        how = "closed"
+    elif runs:
+        how = f"closed {_EARLIER}: {how}"
+    if process.pid:
+        state = f"process {process.pid}" + ("" if runs else f", known by its {process.known_by}")
+    elif runs:
+        state = "started by another command than observed"
+    else:
+        ended = process.enclave in closed.observed.ended
+        state = "has ended" if ended else "not running as observed"
+    return f"{process.enclave}: {state}{_nodes(policy, process.enclave)}: {how}"
 
 
 def _nodes(policy: Policy, enclave: str) -> str:
