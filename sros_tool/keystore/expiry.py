@@ -152,17 +152,6 @@ def parse_threshold(text: str) -> Threshold:
     return Threshold(elapsed=int(match[1]) / 100)
 
 
-def _lifetimes(keystore: OpenedKeystore) -> tuple[Lifetime, ...]:
-    """Return the lifetimes of a keystore's enclaves, sorted by name.
-
-    Raises:
-        KeystoreError: enclaves cannot be read; the error names all of them.
-    """
-    lifetimes, unreadable = survey(keystore)
-    refuse_unreadable(unreadable, "read")
-    return lifetimes
-
-
 def survey(keystore: OpenedKeystore) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, ...]]:
     """Return the lifetimes of the readable enclaves, and the unreadable enclaves, on all cores."""
     keystore.check()
@@ -217,7 +206,7 @@ def due_enclaves(
 def refuse_unreadable(unreadable: tuple[UnreadableEnclave, ...], verb: str) -> None:
     """Raise an error that names all ``unreadable`` enclaves; return if there are none.
 
-    ``verb`` is the past participle for the message, such as "read" or "renewed".
+    ``verb`` is the past participle for the message, such as "renewed".
     """
     if len(unreadable) == 1:
         raise unreadable[0].error

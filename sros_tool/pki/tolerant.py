@@ -31,7 +31,7 @@ _TIMES = {der.UTC_TIME: "%y%m%d%H%M%SZ", der.GENERALIZED_TIME: "%Y%m%d%H%M%SZ"}
 _DIGITS = {der.UTC_TIME: 12, der.GENERALIZED_TIME: 14}
 _FIRST_YEAR = 1950
 """The first year of a UTCTime (RFC 5280, 4.1.2.5.1)."""
-_CONTEXT_2, _CONTEXT_3 = 0x82, 0xA3
+_CONTEXT_2 = 0x82
 _UNIQUE_IDENTIFIERS = (0x81, _CONTEXT_2)
 
 

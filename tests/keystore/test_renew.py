@@ -14,7 +14,7 @@ import pytest
 from sros_tool import parallel
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import KeystoreError, SrosError, UsageError
-from sros_tool.keystore.expiry import Threshold, _lifetimes, parse_threshold
+from sros_tool.keystore.expiry import Threshold, parse_threshold, survey
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
@@ -141,7 +141,7 @@ def test_nothing_outlives_its_authority(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
     late = NOW + timedelta(days=5 * 365 - 10)
     renew(root, ["/a"], now=late)
-    (life,) = _lifetimes(OpenedKeystore(root))
+    (life,), _ = survey(OpenedKeystore(root))
     end = validity_of(certificate(root / "public/identity_ca.cert.pem")).not_after
     assert life.certificate.not_after == life.permissions.not_after == end
     assert not problems(root, "/a", end)
@@ -189,7 +189,7 @@ def test_what_is_no_threshold(text: str) -> None:
 )
 def test_due(threshold: str, day: int, due: bool, tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
-    (life,) = _lifetimes(OpenedKeystore(root))
+    (life,), _ = survey(OpenedKeystore(root))
     assert life.due(parse_threshold(threshold), NOW + timedelta(days=day)) is due
 
 
@@ -198,7 +198,7 @@ def test_a_short_life_is_not_over_as_it_begins(hours: int, tmp_path: Path) -> No
     """It is back-dated by a day, which is not part of its life."""
     short = timedelta(hours=hours)
     root = made(tmp_path / "ks", "/a", certificate_validity=short, permissions_validity=short)
-    (life,) = _lifetimes(OpenedKeystore(root))
+    (life,), _ = survey(OpenedKeystore(root))
     assert not life.due(parse_threshold("66%"), NOW)
     assert not life.due(parse_threshold("66%"), NOW + 0.6 * short)
     assert life.due(parse_threshold("66%"), NOW + 0.7 * short)
@@ -208,17 +208,17 @@ def test_the_life_of_a_certificate_of_another_ca_begins_when_it_came(tmp_path: P
     """It is back-dated by nothing: of 30 hours, 20 are over, and not the last day alone."""
     root = made(tmp_path / "ks", "/a")
     file, hour = root / "enclaves/a/cert.pem", timedelta(hours=1)
-    (life,) = _lifetimes(OpenedKeystore(root))
+    (life,), _ = survey(OpenedKeystore(root))
     short = replace(life, certificate=Window(NOW, NOW + 30 * hour))
     assert not short.due(parse_threshold("66%"), NOW + 20 * hour)
     os.utime(file, (NOW.timestamp(), NOW.timestamp()))
-    (life,) = _lifetimes(OpenedKeystore(root))
+    (life,), _ = survey(OpenedKeystore(root))
     short = replace(life, certificate=short.certificate)
     assert not short.due(parse_threshold("66%"), NOW + 19 * hour)
     assert short.due(parse_threshold("66%"), NOW + 20 * hour)
     for strange in (-1e12, 1e12):
         os.utime(file, (strange, strange))
-        (life,) = _lifetimes(OpenedKeystore(root))
+        (life,), _ = survey(OpenedKeystore(root))
         assert not replace(life, certificate=short.certificate).due(
             parse_threshold("66%"), NOW + 20 * hour
         )
@@ -335,13 +335,9 @@ def test_every_one_that_cannot_be_renewed_is_named_at_once(
     (root / "enclaves/n003/cert.pem").write_text("x")
     (root / "enclaves/n023/permissions.p7s").unlink()
     before = snapshot(root)
-    for call in (
-        lambda: renew(root, names, now=LATER),
-        lambda: renew(root, now=LATER, expiring=parse_threshold("100y")),
-        lambda: _lifetimes(OpenedKeystore(root)),
-    ):
-        with pytest.raises(KeystoreError, match="2 enclaves cannot be re.*: /n003, /n023"):  # noqa: RUF043
-            call()
+    for chosen, expiring in ((names, None), ([], parse_threshold("100y"))):
+        with pytest.raises(KeystoreError, match="2 enclaves cannot be renewed: /n003, /n023"):
+            renew(root, chosen, now=LATER, expiring=expiring)
         assert snapshot(root) == before
     assert len(renew(root, names[4:-1], now=LATER).names("renewed")) == 19
 

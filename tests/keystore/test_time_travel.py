@@ -18,7 +18,7 @@ from cryptography import x509
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore import describe as history_of_keystores
 from sros_tool.keystore.describe import HistoryStatus, history
-from sros_tool.keystore.expiry import Threshold, _lifetimes
+from sros_tool.keystore.expiry import Threshold, survey
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
@@ -362,7 +362,7 @@ def test_without_renewal_the_checks_of_years_would_fail(tmp_path: Path) -> None:
         assert not early.problems(["/a"], BEGIN)
         assert bool(early.problems(["/a"], now)) == bool(expected), days
         assert sorted({problem.file for problem in found}) == expected, days
-        (life,) = _lifetimes(OpenedKeystore(root))
+        (life,), _ = survey(OpenedKeystore(root))
         assert life.due(Threshold(remaining=timedelta(0)), now) == (days > 270)
     late = BEGIN + timedelta(days=400)
     with pytest.raises(AssertionError):
