@@ -615,21 +615,31 @@ class _Review:
             yield path
 
     def _not_reviewed_users(self, changed: Iterable[tuple[str, TreeEntry]]) -> list[str]:
-        """Return policies that are not reviewed and share an include with reviewed policies.
+        """Return policies that are not reviewed and include a file that changes.
 
-        A policy includes only what is in its own folder and below.
+        A policy includes only what is in its own folder and below.  Where no reviewed policy has
+        the file, only policies whose names end with ``.xml`` are found.
         """
         repository, files = self.request.repository, self.head.files
         parts = [
-            path for path, _ in changed if path in files and may_be_policy(self.head.written(path))
+            path
+            for path, entry in changed
+            if (
+                may_be_policy(self.head.written(path))
+                if path in files
+                else entry.mode in FILES and not _is_below(path, self.request.left_out)
+            )
         ]
+        reviewed = {parent for part in parts if part in files for parent in Path(part).parents}
         ids: dict[str, str] = {}
         for folder in sorted({parent for part in parts for parent in Path(part).parents}):
             entry = self.head.entry("" if folder == Path() else str(folder))
             assert entry
             for name, tree_entry in repository.folders([entry.id])[entry.id].items():
                 path = str(folder / name)
-                if tree_entry.mode in FILES and not _is_below(path, self.request.left_out):
+                may_include = folder in reviewed or name.lower().endswith(".xml")
+                excluded = (*self.request.left_out, *self.request.keystores)
+                if may_include and tree_entry.mode in FILES and not _is_below(path, excluded):
                     ids[path] = tree_entry.id
         sizes = repository.sizes(dict.fromkeys(ids.values()))
         ids = {

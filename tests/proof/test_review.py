@@ -277,6 +277,18 @@ def test_a_common_part_that_ships_with_sros_needs_no_review(change: Change) -> N
     part, name = (change.folder / "common/lifecycle_node.xml").read_text(), "lifecycle_node.xml"
     change.commit({f"new/{name}": part})
     assert change.review("--policy", "robot.xml").status == 0
+    include = '<xi:include href="{}" xpointer="xpointer({})"/>'
+    user = policy_text({"/u": include.format("around.xml", "/x/y/*")})
+    around = f'<x xmlns:xi="http://www.w3.org/2001/XInclude"><y>{include}</y></x>'
+    narrow = around.format("node.xml", "/profile/*")
+    files: dict[str, str | bytes | None]
+    files = {"common/user.xml": user, "common/around.xml": narrow}
+    change.base = change.commit(files)
+    change.commit({"common/around.xml": around.format(name, "/profile/*"), f"new/{name}": None})
+    included = change.review("--policy", "robot.xml")
+    assert included.status == 1
+    assert "'common/user.xml' is not reviewed, and includes a file that changes" in included.out
+    change.base = change.commit({**dict.fromkeys(files), f"new/{name}": part})
     # An unreviewed policy can include the rights of another common part under its name.
     for path, text in ((f"new/{name}", part.replace("ALLOW", "DENY")), ("new/node.xml", part)):
         change.commit({f"new/{name}": None if path != f"new/{name}" else text, path: text})
