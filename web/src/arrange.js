@@ -275,7 +275,7 @@ function rewrapped(card, width, slim) {
   const lines = whole.flatMap((text) => wrapped(text, Math.floor((width - around) / letter)));
   const notes = card.notes.flatMap((text) => inWords(text, Math.floor((width - (names && slim ? 34 : 18)) / SIZES.smallLetter)));
   const fit = { ...card, width, slim, lines, notes };
-  return { ...fit, height: Math.max(height(fit), names && slim ? 46 : 0) };
+  return { ...fit, height: Math.max(height(fit), names && slim && card.level !== "unknown" ? 46 : 0) };
 }
 
 function inWords(text, letters) {
