@@ -322,7 +322,7 @@ def crl(
         from sros_tool.keystore.lifecycle.shown import shown_lists
 
         enclaves = _names(keystore, lists)
-        print_json(shown_lists(root, lists, result, enclaves, expires_soon=soon, dry_run=dry_run))
+        print_json(shown_lists(keystore, result, enclaves, expires_soon=soon, dry_run=dry_run))
     elif lists:
         for line in _list_lines(lists, _names(keystore, lists)):
             echo(line)

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
         RotationStatus,
     )
     from sros_tool.keystore.lifecycle.update import UpdateStage
-    from sros_tool.pki.crl import RevocationList
     from sros_tool.zenoh.configuration import ZenohNetwork
 
 Rights = Annotated[
@@ -423,8 +422,7 @@ class KeystoreLists(NamedTuple):
 
 
 def shown_lists(
-    root: Path,
-    lists: Sequence[RevocationList],
+    keystore: OpenedKeystore,
     refreshed_by: Revocation | None,
     enclaves: Mapping[str, str],
     *,
@@ -432,9 +430,10 @@ def shown_lists(
     dry_run: bool,
 ) -> KeystoreLists:
     """Return the value for revocation lists; ``enclaves`` maps serial numbers to enclaves."""
+    lists = keystore.revocation_lists
     first = lists[0] if lists else None
     return KeystoreLists(
-        root,
+        keystore.root,
         dry_run,
         first.number if first else None,
         first.this_update if first else None,
@@ -456,7 +455,7 @@ def shown_lists(
             for other_list in lists[1:]
         ],
         restart=refreshed_by.restart if refreshed_by else (),
-        changes=changes_below(root, refreshed_by.changes) if refreshed_by else (),
+        changes=changes_below(keystore.root, refreshed_by.changes) if refreshed_by else (),
         notes=(*refreshed_by.notes, *refreshed_by.remarks) if refreshed_by else (),
     )
 
