@@ -147,7 +147,8 @@ def close(
         )
     shell = Shell(_run, lambda line: echo(line, err=True), os.environ, now, local_zone(os.environ))
     robot = LocalRobot(folder, domain_of(domain_text), shell, without, elsewhere)
-    if (apply or prove or undo) and not robot.observed:
+    can_undo = undo and robot.export.exists()  # its enclaves show which processes are closed
+    if (apply or prove or undo) and not (robot.observed or can_undo):
         if not folder.is_dir():
             raise UsageError(
                 f"there is no folder '{folder}' here",

@@ -384,6 +384,11 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     still = "process 4711 (run) still runs in /talker: stop it if talker.service did not start it"
     assert still in robot.close("--undo", status=1).out
     assert robot.restarts[4:] == ["daemon-reload", "restart talker.service"]
+    processes = robot.folder / "robot/processes.json"
+    processes.rename(robot.folder / "processes.json")  # as if it was broken, and removed
+    assert "the robot runs closed" in robot.close("--for", "1s", status=2).err
+    assert still in robot.close("--undo", status=1).out
+    (robot.folder / "processes.json").rename(processes)
     robot.by_hand = set()
     robot.close("--proof", status=1)
     assert made(robot.folder) == MADE
