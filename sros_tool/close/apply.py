@@ -39,5 +39,5 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
     total = [*prepared.changes, *done]
     if not proofs:
         return prepared._replace(changes=total)
-    now = current_state(robot)
+    now = current_state(robot, robot.read_policy())
     return prepared._replace(proofs=proofs, changes=total, secured=now.secured, new=now.new)

@@ -49,7 +49,7 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
             denied_before = _denied_access(robot)
     steps, problems, is_stopped = _do_steps(robot, duration, partial=partial, dry_run=dry_run)
     changes = [] if dry_run or is_stopped else remove_enclaves(robot)
-    state = current_state(robot)._replace(steps=steps, dry_run=dry_run)
+    state = current_state(robot, robot.read_policy())._replace(steps=steps, dry_run=dry_run)
     if dry_run or is_stopped:
         return state._replace(problems=problems)
     if robot.observed:

@@ -26,7 +26,7 @@ _START_SECONDS = 3.0
 def prove(robot: LocalRobot) -> CloseState:
     """Prove that the robot is closed."""
     robot.shell.check_open()
-    state = current_state(robot)
+    state = current_state(robot, robot.read_policy())
     proofs = proofs_of(robot, state, _START_SECONDS)
     fails = any(proof.fails for proof in proofs)
     if not fails and robot.policy.exists() and (changed := _enclaves_changed(robot)):

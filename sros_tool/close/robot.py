@@ -27,6 +27,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import Policy
 from sros_tool.runtime.variables import domain_of
 from sros_tool.values import as_plain
 from sros_tool.wording import first_few
@@ -179,11 +180,14 @@ class LocalRobot:
         """The keystore, or the policy if the keystore was brought to another machine."""
         return self.keystore if self.keystore.exists() else self.policy
 
+    def read_policy(self) -> Policy | None:
+        """Return the policy; None if there is none yet."""
+        return read_policy(self.policy) if self.policy.exists() else None
+
     def policy_enclaves(self) -> set[str]:
         """Return the names of the enclaves in the policy; none without a policy."""
-        if not self.policy.exists():
-            return set()
-        return {enclave.path for enclave in read_policy(self.policy).enclaves}
+        policy = self.read_policy()
+        return {enclave.path for enclave in policy.enclaves} if policy else set()
 
     def keystore_enclaves(self) -> set[str]:
         """Return the names of the enclaves in the keystore; none without a keystore."""

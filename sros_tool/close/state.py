@@ -11,7 +11,7 @@ from sros_tool.close.export import valid_until
 from sros_tool.close.processes import ClosedProcess, ObservedProcesses
 from sros_tool.close.robot import OBSERVER, LocalRobot, check_enclaves
 from sros_tool.close.running import RunningRobot
-from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import Policy
 from sros_tool.values import DryRun, FileChanges, Words, shows
 
 TALK = "everything that talked can still talk"
@@ -117,7 +117,7 @@ class CloseState(NamedTuple):
         }
 
 
-def current_state(robot: LocalRobot) -> CloseState:
+def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
     """Return the processes of the enclaves that the policy has, as they run now."""
     running = RunningRobot(robot)
     observed, new = ObservedProcesses(robot.domain), set[str]()
@@ -125,8 +125,7 @@ def current_state(robot: LocalRobot) -> CloseState:
     secured = {name: name in running.current_enclaves for name in sorted(names)}
     if robot.observed:
         observed = running.with_later_processes(robot.observed).with_current_pids(running.processes)
-    if robot.policy.exists():
-        policy = read_policy(robot.policy)
+    if policy:
         observed = observed.within(policy)
         known = {process.enclave for process in observed.processes} | names
         new = {enclave.path for enclave in policy.enclaves} - known - {*observed.elsewhere}

@@ -12,9 +12,10 @@ from sros_tool.close.processes import ClosedProcess, ObservedProcesses, process_
 from sros_tool.close.robot import LocalRobot
 from sros_tool.close.running import RunningRobot, keystore_text, secured_process
 from sros_tool.close.state import CloseState, current_state
+from sros_tool.errors import SrosError
 from sros_tool.files import remove_file
 from sros_tool.names import expand
-from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import Policy
 from sros_tool.runtime.environment import node_argument
 from sros_tool.runtime.processes import Process, program_of
 from sros_tool.values import FileChange
@@ -34,10 +35,10 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     units |= {process.unit for process in observed.processes if not running.is_open(process)} - {""}
     restart_units(robot, observed, units, dry_run=dry_run)
     changes = [FileChange("remove", str(path)) for path in drop_ins]
-    state = current_state(robot)._replace(dry_run=dry_run, changes=changes)
+    policy = _readable_policy(robot)
+    state = current_state(robot, policy)._replace(dry_run=dry_run, changes=changes)
     now = RunningRobot(robot)
-    if robot.policy.exists():
-        observed = observed.within(read_policy(robot.policy))
+    observed = observed.within(policy) if policy else observed
     _say_how_to_start(now, observed)
     problems = [
         *_commands_to_open(now, observed),
@@ -46,6 +47,15 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
         *_unknown_processes(now),
     ]
     return state._replace(problems=problems)
+
+
+def _readable_policy(robot: LocalRobot) -> Policy | None:
+    """Return the policy; None, with its error shown, if it cannot be read."""
+    try:
+        return robot.read_policy()
+    except SrosError as error:  # a broken file must not keep the robot closed
+        robot.shell.say(f"{error}")
+        return None
 
 
 def _secured_processes(running: RunningRobot) -> Mapping[str, Process]:

@@ -459,6 +459,12 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     undone = robot.close("--undo", status=1)
     assert undone.out == "restart it open: cd /opt && /opt/run talker\n"
     assert "/listener does not run; start it open: cd /opt && /opt/run listener\n" in undone.err
+    policy = robot.folder / "robot/policy.xml"
+    kept = policy.read_text()
+    policy.write_text("<policy")
+    broken = robot.close("--undo", status=1)
+    assert broken.out == undone.out and "policy.xml' is not well-form" in broken.err
+    policy.write_text(kept)
     robot.absent = set()
     would = robot.close("--undo", "--dry-run")
     undone = robot.close("--undo", status=1)
