@@ -269,11 +269,11 @@ def _forced_text(
     """Return the text that must follow position ``at``, up to a fork or a position in ``stops``."""
     text = ""
     while at not in stops:
-        ways = edges.get(at, ())
-        if len(ways) != 1 or not (letter := ways[0][0].single()):
+        moves = edges.get(at, ())
+        if len(moves) != 1 or not (letter := moves[0][0].single()):
             break
         text += letter
-        at = ways[0][1]
+        at = moves[0][1]
     return text
 
 
@@ -432,15 +432,15 @@ class _AtLeast:
         return self.of
 
     def truth(self, ask: _Test) -> _Truth:
-        sure = 0
-        left = len(self.of)
+        true_parts = 0
+        possible_parts = len(self.of)
         for part in self.of:
             inner = part.truth(ask)
-            sure += inner is True
-            left -= inner is False
-            if sure >= self.count:
+            true_parts += inner is True
+            possible_parts -= inner is False
+            if true_parts >= self.count:
                 return True
-            if left < self.count:
+            if possible_parts < self.count:
                 return False
         return None
 
@@ -726,10 +726,10 @@ def _simplified(
     if isinstance(node, _AtLeast):
         parts = [_simplified(part, certain_automata, possible_automata) for part in node.of]
         count = node.count - parts.count(True)
-        open_ones = tuple(part for part in parts if not isinstance(part, bool))
-        if count <= 0 or len(open_ones) < count:
+        undecided_parts = tuple(part for part in parts if not isinstance(part, bool))
+        if count <= 0 or len(undecided_parts) < count:
             return count <= 0
-        return _AtLeast(open_ones, count)
+        return _AtLeast(undecided_parts, count)
     rules: list[tuple[_Node, bool]] = []
     last = node.last
     for part, says in node.of:
@@ -876,16 +876,16 @@ class _Search:
             limit.spend(len(ways) * (1 + machine.size // 1024))
             for letter, moves, next_place in ways:
                 to = _moved_places(reached, moves) & machine.useful
-                new, paid = (to, next_place), cost + len(letter.encode())
+                new, new_cost = (to, next_place), cost + len(letter.encode())
                 if (
-                    costs.get(new, paid + 1) <= paid
+                    costs.get(new, new_cost + 1) <= new_cost
                     or (left := self._fewest_letters_left(to)) is None
                 ):
                     continue
-                if longest is None or paid + left <= longest:
-                    costs[new] = paid
+                if longest is None or new_cost + left <= longest:
+                    costs[new] = new_cost
                     before[new] = state, letter
-                    heapq.heappush(row, (paid + left, -paid, next(number), new))
+                    heapq.heappush(row, (new_cost + left, -new_cost, next(number), new))
         return None
 
     def _fewest_letters_left(self, positions: int) -> int | None:

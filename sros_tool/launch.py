@@ -33,7 +33,7 @@ _RUN = [sys.executable, "-P", "-m", "sros_tool", "run"]
 _prepare = Executable.prepare
 
 
-def _prepare_labelled(self: Any, context: LaunchContext, action: Action) -> None:
+def _prepare_labeled(self: Any, context: LaunchContext, action: Action) -> None:
     """Prepare a process, with the label that its output would have without the prefix of sros.
 
     Launch labels a process by the first word of its command line, the prefix included.
@@ -111,7 +111,7 @@ class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where i
         run_command = [*_RUN, root, "--policy", file, "--"]
         prefix = context.launch_configurations.get(_PREFIX, "")
         context.launch_configurations[_PREFIX] = f"{shlex.join(run_command)} {prefix}".rstrip()
-        Executable.prepare = _prepare_labelled  # not where launch only looks for this action
+        Executable.prepare = _prepare_labeled  # not where launch only looks for this action
 
 
 def _secured_launch_actions(

@@ -199,7 +199,7 @@ def expression_problem(text: str) -> str:
 
 
 def check_namespace(ns: str) -> str:
-    """Return the normalised namespace of a profile; raise `InvalidNameError` if it is not valid.
+    """Return the normalized namespace of a profile; raise `InvalidNameError` if it is not valid.
 
     "" becomes "/", as in rcl.  One trailing slash is dropped, as in ros2/sros2 (permissions.xsl),
     though a node cannot have it (rmw_validate_namespace).  Wildcards are allowed.

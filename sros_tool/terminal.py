@@ -19,7 +19,7 @@ _CONTROLS = [
     *(0x2028, 0x2029),  # ends of lines
 ]
 _BYTES = range(0xDC80, 0xDD00)  # bytes of names that are not UTF-8; 0x9B is CSI to some terminals
-_COLOURS = {
+_COLORS = {
     "error": "red",
     "warning": "yellow",
     "note": "cyan",
@@ -29,7 +29,7 @@ _COLOURS = {
 }
 
 
-class Coloured(NamedTuple):
+class Colored(NamedTuple):
     """A word printed in color on a terminal, unless $NO_COLOR is set (https://no-color.org)."""
 
     word: str
@@ -75,12 +75,12 @@ def visible_json(document: str) -> str:
     return document.translate(_json_escapes())
 
 
-def echo(*parts: str | Coloured, err: bool = False) -> None:
+def echo(*parts: str | Colored, err: bool = False) -> None:
     """Print one line, on standard error with ``err``."""
     _print(parts, visible_line, err=err)
 
 
-def echo_lines(*parts: str | Coloured, err: bool = False) -> None:
+def echo_lines(*parts: str | Colored, err: bool = False) -> None:
     """Print several lines that sros split itself, on standard error with ``err``."""
     _print(parts, visible, err=err)
 
@@ -119,12 +119,12 @@ def ask_secret(name: str, *, confirm: bool) -> str:
     return str(answer)
 
 
-def _print(parts: tuple[str | Coloured, ...], shown: Callable[[str], str], *, err: bool) -> None:
+def _print(parts: tuple[str | Colored, ...], shown: Callable[[str], str], *, err: bool) -> None:
     import click
 
     texts = (
-        click.style(part.word, fg=_COLOURS[part.word], bold=True)
-        if isinstance(part, Coloured)
+        click.style(part.word, fg=_COLORS[part.word], bold=True)
+        if isinstance(part, Colored)
         else shown(part)
         for part in parts
     )

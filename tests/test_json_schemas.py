@@ -24,7 +24,7 @@ BY_HAND = {"confirmation.json"}
 Shape = TypeVar("Shape")
 
 
-class Colour(StrEnum):
+class Color(StrEnum):
     RED = "red"
     BLUE = "blue"
 
@@ -45,15 +45,15 @@ class Drawn(NamedTuple, Generic[Shape]):
 @shows(optional=("note",), null_if_empty=("author",), spread=("corner", "other"))
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A picture, in ``colour``.
+    """A picture, in ``color``.
 
     This says more.
     """
 
     corner: Corner
     other: Corner | None
-    colour: Colour
-    """Its colour."""
+    color: Color
+    """Its color."""
     note: str | None = None
     """A note."""
     author: str = ""
@@ -70,12 +70,12 @@ class Picture:
 
 def test_a_class_becomes_an_object() -> None:
     schema = object_schema(Picture)
-    assert schema["description"] == "A picture, in `colour`."
+    assert schema["description"] == "A picture, in `color`."
     assert schema["additionalProperties"] is False
-    assert schema["required"] == ["x", "colour", "author", "from", "drawn", "made", "sizes"]
+    assert schema["required"] == ["x", "color", "author", "from", "drawn", "made", "sizes"]
     parts = schema["properties"]
     assert parts["x"] == {"type": "integer", "description": "Its distance from the left."}
-    assert parts["colour"]["enum"] == ["red", "blue"]
+    assert parts["color"]["enum"] == ["red", "blue"]
     assert parts["note"]["type"] == "string"
     assert parts["author"]["type"] == ["string", "null"]
     assert parts["drawn"]["type"] == ["object", "null"]
@@ -91,9 +91,9 @@ def test_a_class_becomes_an_object() -> None:
 @pytest.mark.parametrize(
     "picture",
     [
-        Picture(Corner(1), None, Colour.RED),
-        Picture(Corner(1), Corner(2), Colour.BLUE, "new", "me", Path("b"), Drawn("dot")),
-        Picture(Corner(1), None, Colour.RED, sizes={"a": (1, 2.5)}),
+        Picture(Corner(1), None, Color.RED),
+        Picture(Corner(1), Corner(2), Color.BLUE, "new", "me", Path("b"), Drawn("dot")),
+        Picture(Corner(1), None, Color.RED, sizes={"a": (1, 2.5)}),
     ],
 )
 def test_what_a_value_becomes_fits_the_schema_of_its_class(picture: Picture) -> None:
@@ -103,8 +103,8 @@ def test_what_a_value_becomes_fits_the_schema_of_its_class(picture: Picture) -> 
 @pytest.mark.parametrize(
     "picture",
     [
-        Picture(Corner(1), None, Colour.RED, drawn=Drawn("circle")),
-        Picture(Corner(1), None, Colour.RED, sizes={"a": ("1",)}),  # type: ignore[dict-item]
+        Picture(Corner(1), None, Color.RED, drawn=Drawn("circle")),
+        Picture(Corner(1), None, Color.RED, sizes={"a": ("1",)}),  # type: ignore[dict-item]
     ],
 )
 def test_another_value_does_not_fit(picture: Picture) -> None:

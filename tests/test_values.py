@@ -14,7 +14,7 @@ import pytest
 from sros_tool.values import as_plain, shows
 
 
-class Colour(StrEnum):
+class Color(StrEnum):
     RED = "red"
 
 
@@ -41,7 +41,7 @@ class Circle(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Leaf:
-    colour: Colour
+    color: Color
     points: tuple[Point, ...] = ()
     _known: dict[str, str] = field(default_factory=dict)
 
@@ -65,19 +65,19 @@ class Tree:
         (3, 3),
         (2.5, 2.5),
         ("text", "text"),
-        (Colour.RED, "red"),
+        (Color.RED, "red"),
         (Size.LARGE, 3),
         (Path("a/b"), "a/b"),
         (datetime(2027, 1, 2, 3, 4, 5, 6, tzinfo=UTC), "2027-01-02T03:04:05Z"),
         (datetime(2027, 1, 2, tzinfo=timezone(timedelta(hours=9))), "2027-01-01T15:00:00Z"),
         ((1, (2, "3")), [1, [2, "3"]]),
         (frozenset({"b", "a"}), ["a", "b"]),
-        ({Colour.RED: (Path("x"),)}, {"red": ["x"]}),
+        ({Color.RED: (Path("x"),)}, {"red": ["x"]}),
         (Point(1, 2.0), {"x": 1, "y": 2.0}),
         (Circle("o", 2), {"name": "o", "width": 4, "radius": 2}),
-        (Leaf(Colour.RED, (Point(0, 1.5),)), {"colour": "red", "points": [{"x": 0, "y": 1.5}]}),
+        (Leaf(Color.RED, (Point(0, 1.5),)), {"color": "red", "points": [{"x": 0, "y": 1.5}]}),
         (Tree("key", None), {"leaf": None, "height": 7}),
-        ([Tree("key", Leaf(Colour.RED))], [{"leaf": {"colour": "red", "points": []}, "height": 7}]),
+        ([Tree("key", Leaf(Color.RED))], [{"leaf": {"color": "red", "points": []}, "height": 7}]),
     ],
 )
 def test_a_value_becomes_what_json_has(value: object, plain: object) -> None:
@@ -87,7 +87,7 @@ def test_a_value_becomes_what_json_has(value: object, plain: object) -> None:
 
 
 def test_the_order_is_that_of_the_fields_or_of_the_names_that_are_shown() -> None:
-    assert list(as_plain(Leaf(Colour.RED))) == ["colour", "points"]
+    assert list(as_plain(Leaf(Color.RED))) == ["color", "points"]
     assert list(as_plain(Circle("o", 2))) == ["name", "width", "radius"]
 
 

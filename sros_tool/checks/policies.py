@@ -1443,7 +1443,7 @@ class NearNames:
         """Return the sorted names that look like a typing error of ``name``, except itself.
 
         Similar names differ in one part (between "/" and "_") by one letter that is added,
-        removed, replaced or swapped with its neighbour; or only in capitals and separators.
+        removed, replaced or swapped with its neighbor; or only in capitals and separators.
         Parts that differ in digits, or are shorter than four letters, are not similar.
         """
         candidates = {

@@ -1,4 +1,4 @@
-"""Checks of running ROS 2 processes: their security, their neighbours and their enclave files."""
+"""Checks of running ROS 2 processes: their security, their neighbors and their enclave files."""
 
 from __future__ import annotations
 
@@ -649,7 +649,7 @@ def process_findings(
 
 
 def _network_and_domain(process: Process) -> tuple[str, str]:
-    """Return the network and the domain of a process; equal results mean neighbours."""
+    """Return the network and the domain of a process; equal results mean neighbors."""
     return process.network, process.environment.get(DOMAIN) or "0"
 
 
@@ -867,9 +867,9 @@ def _mixed_vendor_findings(
 def _other_keystore_findings(
     secured: Sequence[Process], environment: Mapping[str, str] | None
 ) -> Iterator[Finding]:
-    """Yield findings about DDS processes that trust another identity CA than their neighbours.
+    """Yield findings about DDS processes that trust another identity CA than their neighbors.
 
-    The CA of most neighbours counts; in the network and domain of ``environment``, the CA of its
+    The CA of most neighbors counts; in the network and domain of ``environment``, the CA of its
     enclave.
     """
     own_domain = ("", environment.get(DOMAIN) or "0") if environment is not None else None

@@ -47,8 +47,8 @@ def main(arguments: list[str] | None = None, *, name: str = "sros") -> None:
 
     try:
         with without_secrets():
-            colour = False if os.environ.get("NO_COLOR") else None
-            status = program.main(arguments, prog_name=name, standalone_mode=False, color=colour)
+            color = False if os.environ.get("NO_COLOR") else None
+            status = program.main(arguments, prog_name=name, standalone_mode=False, color=color)
         if sys.stdout:  # None where it was closed
             sys.stdout.flush()
     except BrokenPipeError:

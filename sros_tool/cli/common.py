@@ -26,7 +26,7 @@ from click.core import ParameterSource
 
 from sros_tool.errors import DocumentError, PkiError, SrosError, UsageError
 from sros_tool.terminal import (
-    Coloured,
+    Colored,
     ask_secret,
     echo,
     echo_lines,
@@ -956,7 +956,7 @@ def echo_findings(findings: Sequence[Finding], *, err: bool = False) -> None:
         lines = finding_lines(first)
     word = first.severity.word
     place, _, title = lines[0].partition(f": {word}: ")
-    echo(f"{place}: ", Coloured(word), f": {title}", err=err)
+    echo(f"{place}: ", Colored(word), f": {title}", err=err)
     for line in lines[1:]:
         echo(line, err=err)
 

@@ -37,7 +37,7 @@ from sros_tool.cli.common import (
     verb,
 )
 from sros_tool.errors import UsageError
-from sros_tool.terminal import Coloured, echo, echo_bytes
+from sros_tool.terminal import Colored, echo, echo_bytes
 from sros_tool.values import FileChange, file_change
 
 if TYPE_CHECKING:
@@ -264,7 +264,7 @@ def verify(
             if enclave.loadable
             else "its key is on its robot: verify it there"
             if enclave.key_on_robot
-            else Coloured("NOT LOADABLE")
+            else Colored("NOT LOADABLE")
         )
         place = f", key on the token {enclave.token}" if enclave.token else ""
         echo(f"{enclave.name}  ", state, place)

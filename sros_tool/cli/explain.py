@@ -39,7 +39,7 @@ from sros_tool.cli.common import (
 from sros_tool.dds.decision.vendors import ZENOH, Vendor
 from sros_tool.errors import Note, SrosError, UsageError
 from sros_tool.names import is_expression
-from sros_tool.terminal import Coloured, echo
+from sros_tool.terminal import Colored, echo
 from sros_tool.validity import iso
 from sros_tool.wording import counted, first_few
 
@@ -514,7 +514,7 @@ def _echo(lines: Iterator[str]) -> None:
     for number, line in enumerate(lines):
         word, colon, rest = line.partition(":")
         if not number and word in ("yes", "no"):
-            echo(Coloured(word), f"{colon}{rest}")
+            echo(Colored(word), f"{colon}{rest}")
         else:
             echo(line)
 
@@ -525,7 +525,7 @@ _LABEL_WIDTH = 10
 _MOST_SHOWN = 10
 
 
-def _labelled_row(label: str, text: str) -> str:
+def _labeled_row(label: str, text: str) -> str:
     """Return a line of an answer: a label and a text in two columns."""
     return f"  {label:{_LABEL_WIDTH}}{text}"
 
@@ -544,9 +544,9 @@ def _vendor_lines(explanation: DdsExplanation) -> Iterator[str]:
 def _zenoh_decision_lines(on_zenoh: ZenohNextToDds | None) -> Iterator[str]:
     if on_zenoh and on_zenoh.zenoh:
         word = "yes" if on_zenoh.zenoh.allowed else f"no, {on_zenoh.zenoh.outcome}"
-        yield _labelled_row("zenoh", f"{word}: {on_zenoh.zenoh.text}")
+        yield _labeled_row("zenoh", f"{word}: {on_zenoh.zenoh.text}")
     elif on_zenoh:
-        yield _labelled_row("zenoh", f"not known: {on_zenoh.problem}")
+        yield _labeled_row("zenoh", f"not known: {on_zenoh.problem}")
 
 
 def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
@@ -558,45 +558,45 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
     may = f"yes: {name} may" if answer.allowed else f"no: {name} may not"
     documented = ", as documented" if answer.as_documented else ""
     yield f"{may} {answer.question}, on {answer.vendor.title} ({why}{documented})"
-    yield _labelled_row("why", decision.clause)
+    yield _labeled_row("why", decision.clause)
     if answer.counts_key:
-        yield _labelled_row("key", "not here; the answer assumes it")
-    yield from (_labelled_row("and", str(problem)) for problem in answer.problems[1:])
+        yield _labeled_row("key", "not here; the answer assumes it")
+    yield from (_labeled_row("and", str(problem)) for problem in answer.problems[1:])
     if len(answer.parts) > 1 and not answer.allowed:
         for part in answer.parts:
             sign = "ok" if part.decision.outcome.ok else str(part.decision.outcome)
-            yield _labelled_row("part", f"{part.part}: {sign}")
+            yield _labeled_row("part", f"{part.part}: {sign}")
     if decision.rule is not None and grant:
         deciding_rule = (
             f"{'allow' if grant.rules[decision.rule].allow else 'deny'} rule {decision.rule + 1}"
         )
-        yield _labelled_row("rule", f"{deciding_rule} of grant {grant.name}: {decision.expression}")
+        yield _labeled_row("rule", f"{deciding_rule} of grant {grant.name}: {decision.expression}")
     if answer.wildcard:
-        yield _labelled_row("wildcard", f"{answer.wildcard} also matches other names")
+        yield _labeled_row("wildcard", f"{answer.wildcard} also matches other names")
     for line in answer.lines:
         stated = line.stated
         if level := line.group.protect:
             stated += f", protected at least with {level.lower()}"
-        yield _labelled_row("from", f"{_place_text(line.source)}: {stated}")
+        yield _labeled_row("from", f"{_place_text(line.source)}: {stated}")
     if answer.policy_sha256 and not answer.enclave.policy_file and decision.rule is not None:
         digest = answer.policy_sha256
         default = template_default(digest)
-        yield _labelled_row(
+        yield _labeled_row(
             "from",
             f"the default of the keystore's template, {default}: no policy file has been signed"
             if default
             else f"a policy file: add --policy FILE to see its line (digest {digest[:12]})",
         )
     if answer.allowed:
-        yield _labelled_row("protected", ", ".join(_protection_words(answer)))
+        yield _labeled_row("protected", ", ".join(_protection_words(answer)))
     elif answer.denied_by:
-        yield _labelled_row("denied by", answer.denied_by)
+        yield _labeled_row("denied by", answer.denied_by)
     if answer.until and answer.allowed:
         from sros_tool.keystore.layout import CERTIFICATE_FILE
 
         dropped = answer.vendor.traits.drops_expired and answer.until_file == CERTIFICATE_FILE
         then = "; running nodes lose their peers then" if dropped else ""
-        yield _labelled_row("until", f"{iso(answer.until)}, when {answer.until_file} expires{then}")
+        yield _labeled_row("until", f"{iso(answer.until)}, when {answer.until_file} expires{then}")
     yield from _to_do_lines(answer)
 
 
@@ -610,14 +610,14 @@ def _to_do_lines(answer: Answer) -> Iterator[str]:
 
         for requirement in forbidding:
             text = f"{_place_text(requirement.source)} forbids this: {demand(requirement)}"
-            yield _labelled_row("required", text)
+            yield _labeled_row("required", text)
         return
     if answer.change:
         yield from _change_lines(answer)
     if answer.remedy:
-        yield _labelled_row("remedy", answer.remedy)
+        yield _labeled_row("remedy", answer.remedy)
     for number, command in enumerate(answer.commands):
-        yield _labelled_row("run" if not number else "", command)
+        yield _labeled_row("run" if not number else "", command)
 
 
 def _requirements_forbidding(answer: Answer) -> Sequence[Requirement]:
@@ -662,7 +662,7 @@ def _change_lines(answer: Answer) -> Iterator[str]:
     change, policy = answer.change, answer.enclave.policy
     if change is None:
         return
-    yield _labelled_row("change", "in the policy:")
+    yield _labeled_row("change", "in the policy:")
     for edit in change.edits:
         if edit.xml:
             group = edit.xml.partition(" ")[0].removeprefix("<")
@@ -721,21 +721,21 @@ def _zenoh_lines(explanation: ZenohExplanation) -> Iterator[str]:
     may = f"yes: {answer.enclave} may" if allowed else f"no: {answer.enclave} may not"
     mode = f" in {answer.mode} mode" if answer.mode else ""
     yield f"{may} {answer.question}, on {_ZENOH_TITLE}{mode} ({explanation.vendor_why})"
-    yield _labelled_row("why", answer.text)
+    yield _labeled_row("why", answer.text)
     yield from _link_lines(answer)
     if dropped := answer.dropped:
         dropper = f"{dropped.enforcer}: silently dropped, and {answer.enclave} gets no error"
-        yield _labelled_row("denied by", dropper)
+        yield _labeled_row("denied by", dropper)
     if allowed and answer.question.word in _DOES:
         yield from _reached_lines(answer)
     if allowed and answer.until:
-        yield _labelled_row("until", f"{iso(answer.until)}, when cert.pem expires")
+        yield _labeled_row("until", f"{iso(answer.until)}, when cert.pem expires")
     for line in stated.lines:
-        yield _labelled_row("from", f"{_place_text(line.source)}: {line.stated}")
+        yield _labeled_row("from", f"{_place_text(line.source)}: {line.stated}")
     if explanation.wants_rights:
         yield from _to_do_lines(stated)
     if explanation.written:
-        yield _labelled_row("remedy", explanation.written)
+        yield _labeled_row("remedy", explanation.written)
 
 
 def _link_lines(answer: ZenohAnswer) -> Iterator[str]:
@@ -744,13 +744,13 @@ def _link_lines(answer: ZenohAnswer) -> Iterator[str]:
     for number, link in enumerate(links[:_MOST_SHOWN]):
         between = " and ".join(link.enclaves)
         if len(links) == 1 or (number == 0 and not answer.allowed):
-            yield _labelled_row("link", f"between {between}:")
-            yield from (_labelled_row("", f"  {line}") for line in _message_lines(link.checks))
+            yield _labeled_row("link", f"between {between}:")
+            yield from (_labeled_row("", f"  {line}") for line in _message_lines(link.checks))
         else:
-            yield _labelled_row("link", f"between {between}: {_link_text(link)}")
+            yield _labeled_row("link", f"between {between}: {_link_text(link)}")
     if more := links[_MOST_SHOWN:]:
         passing = sum(link.passes for link in more)
-        yield _labelled_row(
+        yield _labeled_row(
             "link", f"{len(more)} more: {passing} pass it, {len(more) - passing} drop it"
         )
 
@@ -758,13 +758,13 @@ def _link_lines(answer: ZenohAnswer) -> Iterator[str]:
 def _reached_lines(answer: ZenohAnswer) -> Iterator[str]:
     does, wide_does = _DOES[answer.question.word]
     reachable = [reached.enclave for reached in answer.reached if not reached.problem]
-    yield _labelled_row(does, _names_text(reachable))
+    yield _labeled_row(does, _names_text(reachable))
     for reached in [reached for reached in answer.reached if reached.problem][:_MOST_SHOWN]:
-        yield _labelled_row("", f"not {reached.enclave}, which has the right: {reached.problem}")
+        yield _labeled_row("", f"not {reached.enclave}, which has the right: {reached.problem}")
     for wildcard, enclaves in answer.wildcards:
-        yield _labelled_row("wildcard", f"{wildcard} also matches other names")
+        yield _labeled_row("wildcard", f"{wildcard} also matches other names")
         if wide_does:
-            yield _labelled_row("", f"{wide_does} {_names_text(enclaves)}")
+            yield _labeled_row("", f"{wide_does} {_names_text(enclaves)}")
 
 
 def _names_text(names: Sequence[str]) -> str:

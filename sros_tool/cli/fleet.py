@@ -332,15 +332,15 @@ def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
     """Yield the counts, then lines on messages and on requests, sorted by outcome."""
     from sros_tool.keystore.delivery.collect import MESSAGE_OUTCOMES, REQUEST_OUTCOMES
 
-    would = "would be " if collected.dry_run else ""
+    would_be = "would be " if collected.dry_run else ""
     requests = [(robot.robot, request) for robot in collected.robots for request in robot.requests]
     messages = Counter(robot.outcome for robot in collected.robots)
     asked = Counter(request.outcome for _, request in requests)
     line = f"{counted(len(collected.robots), 'robot')}: "
-    line += _outcome_numbers(messages, MESSAGE_OUTCOMES, would)
+    line += _outcome_numbers(messages, MESSAGE_OUTCOMES, would_be)
     if requests:
         line += f"; {counted(len(requests), 'request')}: "
-        line += _outcome_numbers(asked, REQUEST_OUTCOMES, would)
+        line += _outcome_numbers(asked, REQUEST_OUTCOMES, would_be)
     yield line
     by_outcome = sorted(collected.robots, key=lambda robot: MESSAGE_OUTCOMES.index(robot.outcome))
     similar_texts: dict[tuple[str, ...], dict[str, str]] = {}
@@ -357,7 +357,7 @@ def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
     renewed = sum(request.outcome == "renewed" for _, request in requests)
     for name, request in requests[: renewed + _MOST_LINES]:
         if request.outcome == "renewed":
-            yield f"{would}renewed {request.enclave} for the key {request.key_sha256}"
+            yield f"{would_be}renewed {request.enclave} for the key {request.key_sha256}"
         else:
             enclave = request.enclave or f"a request of {name}"
             yield f"{enclave}: {request.outcome.replace('_', ' ')}: {request.why}"
@@ -874,19 +874,19 @@ def _groups(compared_fleet: ComparedFleet, robots: Sequence[str]) -> list[_Group
     status, places = compared_fleet.status, _robot_positions(compared_fleet.status.names)
     robots_by_texts: dict[tuple[str, ...], list[RobotStatus]] = {}
     current: list[RobotStatus] = []
-    whats: dict[str, str] = {}
+    clauses_by_robot: dict[str, str] = {}
     for robot in sorted(status.robots, key=lambda robot: places[robot.robot]):
         if robots or robot.state != "current" or robot.notes or robot.problems:
             clauses = (*_expiry_clauses(robot, compared_fleet.at), *_summary(robot, status.stage))
             what = _CLOCK.sub("", _without_robot_name("; ".join(clauses), robot.robot))
-            whats[robot.robot] = what
+            clauses_by_robot[robot.robot] = what
             row = (robot.state.value, robot.to_do, *_DURATION.split(what))
             robots_by_texts.setdefault((*row, robot.robot if robots else ""), []).append(robot)
         else:
             current.append(robot)
     groups = []
     for (state, to_do, *_), group in robots_by_texts.items():
-        what = _joined_durations({robot.robot: whats[robot.robot] for robot in group})
+        what = _joined_durations({robot.robot: clauses_by_robot[robot.robot] for robot in group})
         groups.append(_Group(group, state, to_do, what))
     return [*groups, _Group(current, "current", "", "")] if current else groups
 

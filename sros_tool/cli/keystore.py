@@ -344,8 +344,8 @@ def _next_step_hints(result: Creation, as_json: bool) -> Iterator[str]:
     from sros_tool.keystore.layout import FLEET
 
     if len(result.created) > MAX_NAMES and not (as_json or result.dry_run):
-        whose = "--robot NAME" if (result.root / FLEET).exists() else "ENCLAVE..."
-        yield f"to send them: `sros distribute_key {quote(str(result.root))} {whose} FOLDER`"
+        selection = "--robot NAME" if (result.root / FLEET).exists() else "ENCLAVE..."
+        yield f"to send them: `sros distribute_key {quote(str(result.root))} {selection} FOLDER`"
     published = "" if as_json or result.dry_run else publish_command(result.root)
     if published and (result.changed or result.completed):
         yield f"robots that fetch get the change by {published}"

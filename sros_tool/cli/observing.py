@@ -426,8 +426,8 @@ def generate_policy(
         )
         if not learned.profiles:
             print_notes(learned.notes)
-            unsaid = "No right can be proposed for the denials in the logs."
-            echo(unsaid if denied else "The logs report no denial.", err=True)
+            no_proposal = "No right can be proposed for the denials in the logs."
+            echo(no_proposal if denied else "The logs report no denial.", err=True)
         return _propose(learned.flat() if flat else learned, lines, file, accept, dry_run, as_json)
     if accept:
         raise UsageError("--accept is for --from-log only")

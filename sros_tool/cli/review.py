@@ -442,10 +442,10 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
         case (ChosenFindings() as chosen) | DroppedRequirements(chosen=chosen) if (
             step.status or step.allowed
         ):
-            singly = ((finding,) for finding in chosen.shown)
+            one_per_group = ((finding,) for finding in chosen.shown)
             return [
                 f"{_finding_line(finding)}{others and f' ({others})'}"
-                for (finding, *_), others in folded_findings(singly, step.fleet)
+                for (finding, *_), others in folded_findings(one_per_group, step.fleet)
             ]
     return []
 
@@ -514,14 +514,14 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
     parts = [f"## Review: {plain(verdict)}{out}"]
     parts += [bounded_list(map(code, result.left_out), 6000, printed)] if count else []
     parts += [sides, bounded_list(lines, 12_000, printed)]
-    room = _MOST - sum(map(len, parts))
+    characters_left = _MOST - sum(map(len, parts))
     for step in _sorted_by_weight(result):
         detail = result.with_shown_paths(_detail(result, step, request))
-        if detail and len(detail) > room:
+        if detail and len(detail) > characters_left:
             detail = f"### {_TITLES[step.kind]}: too long for a comment"
         if detail:
             parts.append(detail)
-            room -= len(detail) + 2
+            characters_left -= len(detail) + 2
     return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
 
 

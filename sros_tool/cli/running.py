@@ -376,8 +376,8 @@ def run(
     print_notes(
         [*secured.notes, *(() if policy else other_node_notes(keystore, name, words, now=now()))]
     )
-    names_it = enclave_argument(command) == name or _is_demo(command)
-    if not names_it:
+    names_enclave = enclave_argument(command) == name or _is_demo(command)
+    if not names_enclave:
         print_notes(secured.enclave_notes)
     sys.stdout.flush()
     sys.stderr.flush()

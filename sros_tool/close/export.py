@@ -30,8 +30,10 @@ def enclaves_without_origin(robot: LocalRobot) -> list[str]:
 def remove_enclaves(robot: LocalRobot) -> list[FileChange]:
     """Remove from the export enclaves that the keystore revoked, or of other machines."""
     keystore = OpenedKeystore(robot.keystore)
-    orphans = [name for name in enclaves_without_origin(robot) if revocation_of(keystore, name)]
-    removed = dict.fromkeys(orphans, "its enclave was revoked")
+    revoked_enclaves = [
+        name for name in enclaves_without_origin(robot) if revocation_of(keystore, name)
+    ]
+    removed = dict.fromkeys(revoked_enclaves, "its enclave was revoked")
     for name in robot.not_here.intersection(list_enclaves(robot.export)):
         if any((enclave_path(robot.keystore, name) / file).exists() for file in KEY_FILES):
             removed[name] = "its enclave belongs to another machine"

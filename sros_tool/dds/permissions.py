@@ -427,12 +427,12 @@ def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
 
     ``names`` are all enclaves; a pair is reported if one of the two is in ``new``.
     """
-    fresh = set(new)
+    new_names = set(new)
     # Of two names that are mistaken, one has all parts of the other.
-    parts = {part for name in fresh for part in name.strip("/").split("/")}
+    parts = {part for name in new_names for part in name.strip("/").split("/")}
     if len(parts) <= _FEW_PARTS:
-        names = fresh.union(name for name in names if any(part in name for part in parts))
-    pairs = [pair for pair in mistaken_names(names) if not fresh.isdisjoint(pair)]
+        names = new_names.union(name for name in names if any(part in name for part in parts))
+    pairs = [pair for pair in mistaken_names(names) if not new_names.isdisjoint(pair)]
     if pairs:
         yield Note(
             "portable.enclave-names",

@@ -278,15 +278,15 @@ def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Co
         rule.data_protection_kind,
     )
     unauthenticated = domain.allow_unauthenticated_participants
-    bare = all(kind is ProtectionKind.NONE for kind in kinds)
+    is_unprotected = all(kind is ProtectionKind.NONE for kind in kinds)
     uncontrolled = not (rule.enable_read_access_control or rule.enable_write_access_control)
     holding = {
         Condition.ONE_CA: not template.separate_authorities,
         Condition.SHARED_SUBJECTS: not template.unique_subject,
         Condition.OPEN_DEFAULT: template.default_permissions == EVERYTHING,
         Condition.IN_CLEAR: not any(kind in _ENCRYPTING for kind in kinds),
-        Condition.UNSIGNED: bare,
-        Condition.UNAUTHENTICATED: unauthenticated and bare and uncontrolled,
+        Condition.UNSIGNED: is_unprotected,
+        Condition.UNAUTHENTICATED: unauthenticated and is_unprotected and uncontrolled,
         Condition.UNAUTHENTICATED_SEE: unauthenticated and not rule.enable_discovery_protection,
         Condition.UNCONTROLLED: uncontrolled,
         Condition.OPEN_JOIN: not domain.enable_join_access_control,
@@ -386,8 +386,8 @@ def _rmw_here(environment: Mapping[str, str]) -> str:
 def _types_not_heard(node: HandNode, environment: Mapping[str, str]) -> str:
     """Return which nodes a secured node will not hear, judging by the ROS of this shell."""
     rmw = _rmw_here(environment)
-    is_deaf = node.backend == CYCLONE and vendor_of(rmw) not in (None, Vendor.CYCLONE)
-    if not is_deaf or environment.get(ENABLE) != "true":
+    differs_in_vendor = node.backend == CYCLONE and vendor_of(rmw) not in (None, Vendor.CYCLONE)
+    if not differs_in_vendor or environment.get(ENABLE) != "true":
         return ""
     lacks = built_without_security(rmw, environment)
     but = "was built without security here" if lacks else "needs --backend rclpy"
@@ -403,8 +403,8 @@ def run_by_hand(node: HandNode, say: Callable[[str], None]) -> int:
         SrosError: The environment demands security, and the enclave cannot be loaded.
     """
     say(f"{security_of(node, os.environ)} (stop with Ctrl-C)")
-    if deaf := _types_not_heard(node, os.environ):
-        say(deaf)
+    if not_heard := _types_not_heard(node, os.environ):
+        say(not_heard)
     events, writing = os.pipe()
     module = f"sros_tool.demo.{_MODULES[node.backend]}_node"
     command = [sys.executable, "-P", "-m", module, node.role.value, "--period", "1"]

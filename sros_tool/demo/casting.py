@@ -387,9 +387,11 @@ def _best_cast(
         if guests:
             cast["guest"] = guests[0]
         nested = [(g, a) for g, a in permutations(rights, 2) if _is_below(g, a)]
-        lent = next(((g, a) for g, a in nested if a in talkers and g not in talkers), None)
-        if lent and not set(lent) & set(pair):
-            cast["guest"], cast["admin"] = lent
+        guest_and_admin = next(
+            ((g, a) for g, a in nested if a in talkers and g not in talkers), None
+        )
+        if guest_and_admin and not set(guest_and_admin) & set(pair):
+            cast["guest"], cast["admin"] = guest_and_admin
         talking_listeners = talkers & listeners
         score = len(cast) + (cast.get("guest") not in talkers) - len(talking_listeners & set(pair))
         score += 10 * (cast["listener"] in without_list)

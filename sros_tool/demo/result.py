@@ -815,8 +815,8 @@ def _left_out_clauses(result: DemoResult) -> Iterator[str]:
     skipped = [row for row in result.rows if row.observed is RowStatus.SKIPPED]
     if applicable := sum(1 for row in skipped if row.applies):
         yield f"{applicable} skipped"
-    if strange := len(skipped) - applicable:
-        yield f"{strange} that {'does' if strange == 1 else 'do'} not apply to this keystore"
+    if others := len(skipped) - applicable:
+        yield f"{others} that {'does' if others == 1 else 'do'} not apply to this keystore"
     if result.left_out:
         yield f"{result.left_out} left out with --only"
     for scenario in result.scenarios:

@@ -331,12 +331,12 @@ class Audit:
         lines = {name: f"{name}: every process: {why}" for name, why in self.refused.items()}
         lines = dict(sorted(lines.items()))
         lines |= {str(right): str(right) for right in self.denied if not right.new_enclave}
-        homeless: dict[tuple[str, ...], list[DeniedRight]] = {}
+        rights_without_enclave: dict[tuple[str, ...], list[DeniedRight]] = {}
         for right in self.denied:
             if right.new_enclave:
-                homeless.setdefault(right.nodes, []).append(right)
-        names = Counter(_base_name(node) for nodes in homeless for node in nodes)
-        for nodes, rights in homeless.items():
+                rights_without_enclave.setdefault(right.nodes, []).append(right)
+        names = Counter(_base_name(node) for nodes in rights_without_enclave for node in nodes)
+        for nodes, rights in rights_without_enclave.items():
             name = _base_name(nodes[0])
             meant = [unseen for unseen in self.unseen if _base_name(unseen.node) == name]
             hint = ""
@@ -382,12 +382,12 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
     denied: list[DeniedRight] = []
     refused: dict[str, str] = {}
     judged: list[ObservedNode] = []
-    unclear, divided, homeless = [], [], []
+    unclear, divided, without_enclave = [], [], []
     for nodes in processes.values():
         names = ", ".join(sorted(node.fqn for node in nodes))
         candidates, together = _enclaves_of(nodes, enclaves.nodes)
         if not candidates:
-            homeless += nodes
+            without_enclave += nodes
             continue
         observed_nodes |= {
             enclave_node
@@ -409,8 +409,8 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
             if answers[name].refused:
                 refused[name] = answers[name].refused
         judged += (replace(node, enclaves=tuple(chosen)) for node in nodes)
-    if homeless:
-        for node in enclave_per_node(make_observation(homeless)).observation.nodes:
+    if without_enclave:
+        for node in enclave_per_node(make_observation(without_enclave)).observation.nodes:
             judged.append(node)
             denied += _without_enclave(node, enclaves.what)
     if divided:
@@ -458,7 +458,7 @@ def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
     active = {node.fqn for node in observation.nodes if is_tool(node) and not _only_observes(node)}
     silent = {(expand("~", ns, name), is_tool_name(name)) for _, ns, name in observation.silent}
     tools |= {name for name, tool in silent if tool}
-    mute = {name for name, tool in silent if not tool}
+    silent_nodes = {name for name, tool in silent if not tool}
     strays = {endpoint.topic for _, endpoint in observation.strays}
     notes = [
         (
@@ -466,7 +466,11 @@ def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
             f"{counted(len(active), 'node')} with a tool's name",
             active,
         ),
-        (_note("silent", _SILENT, mute), f"{counted(len(mute), 'node')} without endpoint", mute),
+        (
+            _note("silent", _SILENT, silent_nodes),
+            f"{counted(len(silent_nodes), 'node')} without endpoint",
+            silent_nodes,
+        ),
         (_note("stray", _STRAYS, strays), f"{counted(len(strays), 'topic')} of no node", strays),
     ]
     return [(note, words if counts else "") for note, words, counts in notes if note]

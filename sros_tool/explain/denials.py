@@ -51,7 +51,7 @@ from sros_tool.runtime.vendor_log import (
     REMOTE_ENDPOINT,
     SECURITY_DIRECTORY,
     denied_topic,
-    labelled_line,
+    labeled_line,
     log_lines,
     plain_text,
 )
@@ -98,14 +98,14 @@ class MissingRights:
 
 
 def read_denials(text: str) -> tuple[Denial, ...]:
-    """Return the denied topics in a log without colours, each topic once for each process.
+    """Return the denied topics in a log without colors, each topic once for each process.
 
     The labels that ros2 launch, journald or Docker Compose put before lines distinguish the
     processes in a log; the enclave named by one process is not used for another one.
     """
     processes: dict[str, list[tuple[int, str]]] = {}
     for number, line in enumerate(log_lines(text), 1):
-        process, rest = labelled_line(line)
+        process, rest = labeled_line(line)
         processes.setdefault(process, []).append((number, rest))
     denials = {denial: None for item in processes.items() for denial in _denials_of(*item)}
     known = {replace(denial, direction="") for denial in denials if denial.direction}
@@ -290,7 +290,7 @@ def as_learned(
     Raises:
         UsageError: The log does not name the enclave of a denial, and ``enclave`` is "".
     """
-    profiles, other_nodes, wholes = [], dict[str, str](), dict[str, str]()
+    profiles, other_nodes, parts_by_profile = [], dict[str, str](), dict[str, str]()
     for path, rights in sorted(_rights_by_enclave(missing_rights, enclave).items()):
         present = _profiles(policy, path)
         for profile, denied in sorted(_rights_by_profile(rights, node, present).items()):
@@ -304,7 +304,7 @@ def as_learned(
                 common.included_rights(parts, *profile) if common else frozenset[NodeRight]()
             )
             if parts:
-                wholes[_full_name(profile)] = ", ".join(parts)
+                parts_by_profile[_full_name(profile)] = ", ".join(parts)
             groups = groups_of(denied - node_rights, *profile)
             profiles.append(LearnedProfile(path, *profile, denied | node_rights, parts, groups))
     elsewhere = {
@@ -316,7 +316,7 @@ def as_learned(
         Note(name, text.format("; ".join(f"{who}: {reason}" for who, reason in reasons.items())))
         for name, text, reasons in (
             ("log.other-node", _OTHER, other_nodes),
-            ("log.common-part", _WHOLE, wholes),
+            ("log.common-part", _WHOLE, parts_by_profile),
             ("log.other-enclave", _ELSEWHERE, elsewhere),
         )
         if reasons

@@ -1,7 +1,7 @@
 """Explain security messages in a log, and examine the enclaves that the log names.
 
 The log may mix lines of several processes, with labels of ros2 launch, journald or Docker Compose,
-and may contain colours and tracebacks.
+and may contain colors and tracebacks.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from sros_tool.runtime.vendor_log import (
     LINE_DOMAIN,
     SECURITY_DIRECTORY,
     denied_topic,
-    labelled_line,
+    labeled_line,
     log_lines,
     matching_text,
     plain_refusal,
@@ -337,7 +337,7 @@ def _log_hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
     following = deque(lines)
     while following:
         number, line = following.popleft()
-        process, rest = labelled_line(line)
+        process, rest = labeled_line(line)
         if named := SECURITY_DIRECTORY.search(line):
             enclaves[process] = named["enclave"] or "/"
             if enclaves[process] == "/":
@@ -362,7 +362,7 @@ def _rejoined_message(process: str, line: str, rest: str, following: str) -> str
     """
     if not UNKNOWN.pattern.search(rest):  # first, because it is fast
         return ""
-    other, end = labelled_line(following)
+    other, end = labeled_line(following)
     if other not in ("", process) or matching_text(line) or matching_text(following):
         return ""
     if denied_topic(line) or denied_topic(following) or SECURITY_DIRECTORY.search(following):
@@ -411,7 +411,7 @@ def _lines_naming(
     """Map pairs of process and topic to the numbers and texts of lines that name the topic."""
     lines_of = defaultdict[tuple[str, str], list[tuple[int, str]]](list)
     for number, line in enumerate(lines, 1):
-        process, text = labelled_line(line)
+        process, text = labeled_line(line)
         words = (word for pattern in _WORDS for word in pattern.findall(text))
         for topic in topics.intersection(words):
             lines_of[process, topic].append((number, text))
@@ -453,7 +453,7 @@ def _dropped_message_findings(
     ``own_name`` is the enclave of the process that wrote the log, "" if unknown.  Its rules for its
     router are its own rights: where these drop a message, the process itself lacks a right.
     """
-    numbered = ((n, *labelled_line(line[:_LONGEST])) for n, line in enumerate(lines, 1))
+    numbered = ((n, *labeled_line(line[:_LONGEST])) for n, line in enumerate(lines, 1))
     groups: dict[tuple[str, str, bool, str], list[DroppedMessage]] = {}
     dropped = [*dropped_messages(numbered)]
     routers = keystore.zenoh_routers if keystore and dropped else frozenset[str]()

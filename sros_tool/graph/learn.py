@@ -1021,7 +1021,7 @@ def _put_in_front(profile: LearnedProfile, element: PlacedElement, text: EditedT
 
 
 def _put_inside(profile: LearnedProfile, element: PlacedElement, text: EditedText) -> str:
-    """Return the XML of a profile's content, indented like its neighbours."""
+    """Return the XML of a profile's content, indented like its neighbors."""
     include = f"{_prefix(text) or 'xi'}:include"
     outer = text.indent_of(element)
     if outer is None:

@@ -173,7 +173,7 @@ class Confirmation:
 
     ``files`` maps paths to the SHA-256 of the files.  ``certificates`` maps the paths of
     certificate and CA files to the SHA-256 of each certificate (DER) in the file, in order; without
-    an entry, an earlier certificate in that file cannot be recognised.  ``dds`` is the DDS of the
+    an entry, an earlier certificate in that file cannot be recognized.  ``dds`` is the DDS of the
     robot; ``restart`` are the enclaves whose processes still have earlier files. Both are None if
     the confirmation does not state them.
 

@@ -493,7 +493,7 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
     if message.tag != der.SEQUENCE or content_type.content != _SIGNED_DATA:
         raise ValueError("not SignedData")
     fields = der.children(signed_data.content)
-    bags = _optional(fields, 3, der.CONTEXT_0)
+    certificate_sets = _optional(fields, 3, der.CONTEXT_0)
     lists = _optional(fields, 3, der.CONTEXT_1)
     if [value.tag for value in fields] != [der.INTEGER, der.SET, der.SEQUENCE, der.SET]:
         raise ValueError("not the fields of SignedData")
@@ -507,9 +507,13 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
         raise ValueError("several contents, or none")
     if content is None:
         (content,) = inside
-    for unused in (value for bag in lists for value in der.split_all(bag.content)):
+    for unused in (value for crl_set in lists for value in der.split_all(crl_set.content)):
         tolerant.check_list(unused)  # OpenSSL reads it, and does not use it
-    embedded = [value for bag in bags for value in der.split_all(bag.content)]
+    embedded = [
+        value
+        for certificate_set in certificate_sets
+        for value in der.split_all(certificate_set.content)
+    ]
     listed = [_digest_of(child) for child in der.children(digests.content)]
     if None in listed:
         raise ValueError("unknown digest")

@@ -152,12 +152,12 @@ class Worlds:
             DocumentError: there are too many wildcards to decide it.
         """
         known: dict[World, Verdict] = {}
-        for world, first in self._first_alike.items():
-            if first is world:
+        for world, representative in self._first_alike.items():
+            if representative is world:
                 known[world] = decide(requirement, world, limit)
-            elif witness := known[first].witness:
+            elif witness := known[representative].witness:
                 _confirm(requirement, witness, world)
-            yield world, known[first]
+            yield world, known[representative]
 
 
 def decide(requirement: Requirement, world: World, limit: SearchLimit | None = None) -> Verdict:

@@ -1116,10 +1116,10 @@ def _reached_with_hops(edges: _Edges, start: str) -> dict[str, Hop]:
     reached: dict[str, Hop] = {}
     row = [start]
     for enclave_here in row:
-        for neighbour, hop in edges.get(enclave_here, {}).items():
-            if neighbour not in reached and neighbour != start:
-                reached[neighbour] = hop
-                row.append(neighbour)
+        for neighbor, hop in edges.get(enclave_here, {}).items():
+            if neighbor not in reached and neighbor != start:
+                reached[neighbor] = hop
+                row.append(neighbor)
     return reached
 
 

@@ -233,14 +233,14 @@ def _access_of_source(path: Path, source: RightsSource) -> AccessSource:
             )
     if source.kind == "zenoh":
         (document,) = source.configurations.values()
-        lone = {LONE: _zenoh_file(path, document)}
+        zenoh_files_here = {LONE: _zenoh_file(path, document)}
         # Enclaves that its rules do not name get nothing by it.
         return replace(
             side,
             zenoh=source.rights,
             key_domains=source.key_domains,
             enforcers=source.enforcers,
-            zenoh_files=lone,
+            zenoh_files=zenoh_files_here,
             scope=None,
         )
     if source.kind == "enclave":

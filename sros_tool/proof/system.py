@@ -418,7 +418,12 @@ def _keystore_system(
         for rule in parse_governance(document).domain_access_rules
     }
     grants = {name: document.grants for name, document in source.documents.items()}
-    granted = {rule.domains for held in grants.values() for grant in held for rule in grant.rules}
+    granted = {
+        rule.domains
+        for grants_of_enclave in grants.values()
+        for grant in grants_of_enclave
+        for rule in grant.rules
+    }
     domains = (domain,) if domain is not None else DomainSet.one_of_each_kind(listed, granted)
     domains = domains or (0,)
     if len(domains) > _MOST_DOMAINS:
@@ -428,7 +433,10 @@ def _keystore_system(
             "Name one with --domain.",
         )
     subjects = {name: enclave.subject for name, enclave in loaded.items() if enclave.subject}
-    granting = {name: [grant.subject for grant in held] for name, held in grants.items()}
+    granting = {
+        name: [grant.subject for grant in grants_of_enclave]
+        for name, grants_of_enclave in grants.items()
+    }
     moments = {name: (at, *_later_moments(name, grants.get(name, ()), at)) for name in names}
     worlds = []
     for vendor, number in product(TESTED, domains):

@@ -517,8 +517,10 @@ def _untested_notes(before: Shipped, after: Shipped) -> Iterator[Finding]:
     for shipped in dict.fromkeys((before, after)):
         if not shipped.tested:
             same_vendor = before.vendor is after.vendor
-            blind = ", so sros sees no difference between the two releases" if same_vendor else ""
-            text = f"{shipped}{blind}"
+            consequence = (
+                ", so sros sees no difference between the two releases" if same_vendor else ""
+            )
+            text = f"{shipped}{consequence}"
             yield NOT_MEASURED.found(f"ROS 2 {shipped.distribution.title}", text)
 
 

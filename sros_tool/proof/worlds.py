@@ -135,7 +135,7 @@ class Side:
         self._wild: dict[Automaton, list[str]] = defaultdict(list)
         self._any: list[str] = []
         self._found: dict[str, Sequence[str]] = {}
-        self._met: dict[Automaton, frozenset[str]] = {}
+        self._users_by_automaton: dict[Automaton, frozenset[str]] = {}
         for enclave, names in of.items():
             around = names.around()
             if around is None:
@@ -209,9 +209,11 @@ class Side:
             return sorted(self.of)
         enclaves = set(self._any)
         for own_automaton in automata:
-            if own_automaton not in self._met:
-                self._met[own_automaton] = self._users_by_wildcard(own_automaton, limit)
-            enclaves.update(self._met[own_automaton])
+            if own_automaton not in self._users_by_automaton:
+                self._users_by_automaton[own_automaton] = self._users_by_wildcard(
+                    own_automaton, limit
+                )
+            enclaves.update(self._users_by_automaton[own_automaton])
         return sorted(enclaves)
 
     def _users_by_wildcard(self, own_automaton: Automaton, limit: SearchLimit) -> frozenset[str]:

@@ -503,7 +503,7 @@ class _Draft:
 
     def _edges(self, differing_parts: Set[Edge | str]) -> Iterator[Edge]:
         """Yield the rights to draw: of drawn units, and of enclaves that belong to no unit."""
-        texts_of_others = self._other_units_text()
+        count_text = self._other_units_text()
         for edge in self._picture.edges:
             unit = self._of.get(edge.enclave)
             if unit is not None and not self._is_drawn(unit):
@@ -513,7 +513,7 @@ class _Draft:
             def word(named: int, at: int, edge: Edge = edge, unit: int | None = unit) -> str:
                 if unit is None or not self._is_counted(unit, named):
                     return self._label(named, at)
-                return texts_of_others(edge, unit, named, at)
+                return count_text(edge, unit, named, at)
 
             shown = name.fill(word)
             if shown != edge.name and (edge.kind, shown) not in self._names:
@@ -560,8 +560,8 @@ class _Draft:
             ):
                 return self._label(other_unit, position)
             ends = f"{self._word(all_of[0], position)}…{self._word(all_of[-1], position)}"
-            kin = family == self._units[unit].family
-            return f"{{{counted(len(named), 'other') if kin else len(named)} of {ends}}}"
+            is_same_family = family == self._units[unit].family
+            return f"{{{counted(len(named), 'other') if is_same_family else len(named)} of {ends}}}"
 
         return several
 

@@ -316,18 +316,20 @@ def _row(rows: Iterable[tuple[str, str]]) -> str:
     """Return one row of the legend as SVG, from pairs of symbol (SVG) and text."""
     x, cells = 0, []
     for drawn, text in rows:
-        room = 68 if "M20 -4h40" in drawn else (48 if "h40" in drawn else (20 if drawn else 0))
-        room = 42 if "<rect" in drawn else room
+        symbol_width = (
+            68 if "M20 -4h40" in drawn else (48 if "h40" in drawn else (20 if drawn else 0))
+        )
+        symbol_width = 42 if "<rect" in drawn else symbol_width
         cells.append(
             f'<g transform="translate({x} 0)">{drawn}'
-            f'<text class="small" x="{room}" y="0">{escape(text)}</text></g>'
+            f'<text class="small" x="{symbol_width}" y="0">{escape(text)}</text></g>'
         )
-        x += room + round(6.2 * len(text)) + 26
+        x += symbol_width + round(6.2 * len(text)) + 26
     return "".join(cells)
 
 
 _DOT_STYLES = {"encrypt": "solid", "sign": "dashed", "none": "dotted", "unknown": "solid"}
-_COLOURS = {
+_COLORS = {
     OverlaySide.BOTH: "#5d7590",
     OverlaySide.FIRST: "#a34a00",
     OverlaySide.SECOND: "#176b3a",
@@ -378,7 +380,7 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
         text = _entities(_link_label(picture, link))
         lines.append(f'  {_node_id(link.source)} {arrow}|"{text}"| {_node_id(link.target)}')
         red = link.violates or link.qualifier is not ALLOW
-        color = _DENIED if red else _COLOURS[link.mark]
+        color = _DENIED if red else _COLORS[link.mark]
         styles[color].append(number)
     lines += [
         f"  linkStyle {','.join(map(str, links))} stroke:{color}"
@@ -527,7 +529,7 @@ def _dot_edge(picture: Picture, link: Link) -> str:
     denied = link.qualifier is not ALLOW
     attributes = [
         f"label={_quoted(_link_label(picture, link))}",
-        f'color="{_DENIED if denied or link.violates else _COLOURS[link.mark]}"',
+        f'color="{_DENIED if denied or link.violates else _COLORS[link.mark]}"',
         f"style={_DOT_STYLES[link.level.value]}",
     ]
     attributes += ["arrowhead=tee"] if denied else []

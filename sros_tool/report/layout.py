@@ -3,8 +3,8 @@
 SVG and the page use the same scene; Graphviz and Mermaid use its cards, but place them themselves.
 Lengths are in pixels at normal text size; x grows to the right and y downwards.
 
-It is a layered layout with three layers, after Sugiyama: each column is ordered by the barycentres
-of the neighbours, and each card is placed as near to its neighbours as the other cards allow (with
+It is a layered layout with three layers, after Sugiyama: each column is ordered by the barycenters
+of the neighbors, and each card is placed as near to its neighbors as the other cards allow (with
 the pool-adjacent-violators algorithm).  The same input always gives the same layout.
 """
 
@@ -190,7 +190,7 @@ def scenes_of(
 
     With few enclaves, the first scene leaves out the rights that every node needs, and the second
     one has everything.  With many enclaves, the first scene has the groups and the links between
-    them, and each group has another scene with its neighbours.
+    them, and each group has another scene with its neighbors.
 
     Args:
         picture: the picture.
@@ -366,7 +366,7 @@ class _Draft:
     def _cards(self) -> Iterable[Card]:
         sides = {end for key in self._ties for end in key[:2] if end[0] in "sl"}
         sides |= {f"{'s' if SENDS[right] else 'l'}{node}" for node, right in self._looking}
-        # The scene of a group has all enclaves of the group, but only neighbours with links.
+        # The scene of a group has all enclaves of the group, but only neighbors with links.
         inner = {node for node in self._members if not node.startswith(":")}
         idle = (inner or set(self._members)) - {side[1:] for side in sides}
         sides |= {f"s{node}" for node in idle}
@@ -574,7 +574,7 @@ def stacked_cards(
 ) -> dict[str, Card]:
     """Return the cards with their y, by id, ordered by column and y.
 
-    Cards of names are in odd columns; ``lines`` are pairs of ids in neighbouring columns.
+    Cards of names are in odd columns; ``lines`` are pairs of ids in neighboring columns.
     """
     by_id = {card.id: card for card in cards}
     items: list[list[ColumnItem]] = [[] for _ in range(columns)]
@@ -631,8 +631,8 @@ def _tops(
     for number in sorted(range(len(columns)), key=lambda number: abs(number - tallest)):
         wanted_middles = {}
         for item in columns[number] if number != tallest else ():
-            centres = [tops[end] + height[end] / 2 for end in near[item.id] if end in tops]
-            wanted_middles[item.id] = sum(centres) / len(centres) if centres else extent[tallest]
+            centers = [tops[end] + height[end] / 2 for end in near[item.id] if end in tops]
+            wanted_middles[item.id] = sum(centers) / len(centers) if centers else extent[tallest]
         lead = 0 if number % 2 else _LEAD
         tops |= place_column(columns[number], wanted_middles, _GAP, _TOP, lead)
     return tops
@@ -668,7 +668,7 @@ def order_columns(
 ) -> list[list[ColumnItem]]:
     """Return the items of all columns in an order with few crossings of lines.
 
-    ``lines`` are pairs of ids of items in neighbouring columns.  The result is the order with the
+    ``lines`` are pairs of ids of items in neighboring columns.  The result is the order with the
     fewest crossings of all sweeps.
     """
     near: dict[str, list[str]] = {item.id: [] for column in columns for item in column}
@@ -680,7 +680,7 @@ def order_columns(
     inner, outer = range(1, len(columns), 2), range(0, len(columns), 2)
     for sweep in range(_SWEEPS):
         for moved in (*inner, *(outer if sweep % 2 else reversed(outer))):
-            current[moved] = _sort_by_barycentre(current[moved], near, _relative_positions(current))
+            current[moved] = _sort_by_barycenter(current[moved], near, _relative_positions(current))
         crossings = _crossings(current, lines)
         if crossings < fewest:
             best, fewest = [list(column) for column in current], crossings
@@ -696,12 +696,12 @@ def _relative_positions(columns: Sequence[Sequence[ColumnItem]]) -> dict[str, fl
     }
 
 
-def _sort_by_barycentre(
+def _sort_by_barycenter(
     column: Sequence[ColumnItem], near: Mapping[str, Sequence[str]], places: Mapping[str, float]
 ) -> list[ColumnItem]:
-    centre = {
+    center = {
         item.id: (
-            sum(places[neighbour] for neighbour in near[item.id]) / len(near[item.id])
+            sum(places[neighbor] for neighbor in near[item.id]) / len(near[item.id])
             if near[item.id]
             else places[item.id]
         )
@@ -709,15 +709,15 @@ def _sort_by_barycentre(
     }
     groups: dict[str, list[float]] = {}
     for item in column:
-        groups.setdefault(item.group, []).append(centre[item.id])
+        groups.setdefault(item.group, []).append(center[item.id])
     middle = {group: sum(positions) / len(positions) for group, positions in groups.items()}
     return sorted(
-        column, key=lambda item: (middle[item.group], item.group, centre[item.id], item.id)
+        column, key=lambda item: (middle[item.group], item.group, center[item.id], item.id)
     )
 
 
 def _crossings(columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[str, str]]) -> int:
-    """Return the number of line crossings between neighbouring columns."""
+    """Return the number of line crossings between neighboring columns."""
     side = {item.id: number for number, column in enumerate(columns) for item in column}
     place = {item.id: n for column in columns for n, item in enumerate(column)}
     total = 0

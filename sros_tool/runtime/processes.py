@@ -1,10 +1,10 @@
 """The running processes that use ROS 2, DDS or Zenoh, as /proc shows them, and their files.
 
-A process is recognised by the libraries that it has mapped, by ``--ros-args``, or by its program.
+A process is recognized by the libraries that it has mapped, by ``--ros-args``, or by its program.
 A process itself chooses the texts that /proc shows of it (command, environment, mapped files), also
 after its start: so every text is bounded, and read through a handle of the process's folder, which
 never becomes that of another process.  A process that links its DDS statically and has no arguments
-of ROS is not recognised; a process that cannot be examined is reported.
+of ROS is not recognized; a process that cannot be examined is reported.
 
 The paths that a process names can mean other files to this process, if it has its own root
 directory or mounts, as in a container.  So paths are resolved below the root directory of the

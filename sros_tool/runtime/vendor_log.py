@@ -80,7 +80,7 @@ def log_lines(text: str) -> list[str]:
     return [line.removesuffix("\r") for line in text.split("\n")]
 
 
-def labelled_line(line: str) -> tuple[str, str]:
+def labeled_line(line: str) -> tuple[str, str]:
     """Return the process that the label of a line names, and the text after it.
 
     A line without a label gives ("", line).

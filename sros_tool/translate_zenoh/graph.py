@@ -283,19 +283,19 @@ def shared_nodes(announced: Mapping[str, AnnouncedNodes]) -> Iterator[SharedNode
         yield SharedNodes(enclaves_of_nodes, (), _full_names(nodes))
     in_order, groups = sorted(owners), list(wide.items())
     nearby = _with_the_same_beginning([nodes for nodes, _ in groups])
-    told: dict[str, set[str]] = {}
+    already_named: dict[str, set[str]] = {}
     for number, (nodes_of_group, group) in enumerate(groups):
         other_owners = {
             owner: None
             for node in _included_nodes(nodes_of_group, in_order)
             for owner in owners[node]
-            if owner not in group and owner not in told.get(group[0], ())
+            if owner not in group and owner not in already_named.get(group[0], ())
         }
         for nodes_of_other, other in (groups[later] for later in sorted(nearby.get(number, ()))):
             if _have_common(nodes_of_group, nodes_of_other):
                 other_owners |= dict.fromkeys(other)
         for other_enclave in other_owners:
-            told.setdefault(other_enclave, set()).update(group)
+            already_named.setdefault(other_enclave, set()).update(group)
         if other_owners or (len(group) > 1 and _have_common(nodes_of_group, nodes_of_group)):
             yield SharedNodes(
                 tuple(group), tuple(other_owners), _full_names(nodes_of_group.allowed)

@@ -1,4 +1,4 @@
-"""What only a terminal gets: progress that leaves nothing behind, and colours."""
+"""What only a terminal gets: progress that leaves nothing behind, and colors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sros_tool.cli import common as showing
 from sros_tool.cli import main
 from sros_tool.files import policies_dir
 from sros_tool.parallel import map_slices, tick
-from sros_tool.terminal import Coloured, echo, echo_document
+from sros_tool.terminal import Colored, echo, echo_document
 from tests.support.harness import sros
 
 ERASE = "\r\x1b[K"
@@ -126,23 +126,23 @@ def test_a_pipe_gets_no_progress(capfd: pytest.CaptureFixture[str]) -> None:
     assert capfd.readouterr() == ("", "")
 
 
-def run(*words: object, no_colour: str = "") -> str:
+def run(*words: object, no_color: str = "") -> str:
     def work() -> None:
-        os.environ["NO_COLOR"] = no_colour
+        os.environ["NO_COLOR"] = no_color
         main([str(word) for word in words])
 
     return on_terminal(work)
 
 
-def test_colours_are_for_terminals_and_can_be_turned_off(keystore: Path) -> None:
+def test_colors_are_for_terminals_and_can_be_turned_off(keystore: Path) -> None:
     (keystore / "enclaves/a/key.pem").chmod(0o644)
-    for words, coloured in (
+    for words, colored in (
         (("check", keystore), f"{ESCAPE}31m{ESCAPE}1merror"),
         (("verify", keystore), f"{ESCAPE}31m{ESCAPE}1merror"),
         (("explain", keystore, "/b", "publish", "/nope"), f"{ESCAPE}31m{ESCAPE}1mno{ESCAPE}0m:"),
     ):
-        assert coloured in run(*words)
-        assert ESCAPE not in run(*words, no_colour="1")
+        assert colored in run(*words)
+        assert ESCAPE not in run(*words, no_color="1")
         ended = sros(*words)
         assert ESCAPE not in ended.out + ended.err
 
@@ -155,6 +155,6 @@ def test_a_document_is_exact_but_on_a_terminal(capsysbinary: pytest.CaptureFixtu
     assert on_terminal(lambda: echo_document(document)) == "export A='\\x1b]0;x\\x07\\xff'\r\n"
 
 
-def test_a_name_cannot_colour_itself() -> None:
-    said = on_terminal(lambda: echo("/a", Coloured("no"), f"{ESCAPE}32myes\nforged"))
+def test_a_name_cannot_color_itself() -> None:
+    said = on_terminal(lambda: echo("/a", Colored("no"), f"{ESCAPE}32myes\nforged"))
     assert said == f"/a{ESCAPE}31m{ESCAPE}1mno{ESCAPE}0m\\x1b[32myes\\x0aforged\r\n"

@@ -18,7 +18,7 @@ LOGS = Path(__file__).with_name("denial_logs")
 
 
 def log(name: str) -> str:
-    """A real log of a process that was refused, colours and all."""
+    """A real log of a process that was refused, colors and all."""
     return plain_text((LOGS / name).read_text())
 
 

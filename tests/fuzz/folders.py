@@ -92,7 +92,7 @@ WRITING = (
     "zenoh {ks} --off",
     "merge_policy {root}/policy.xml {root}/shipped.xml",
 )
-NEIGHBOURS = {
+NEIGHBORS = {
     "list_enclaves {ks}",
     "list_enclaves {ks} --json",
     "inspect {ks}",
@@ -229,7 +229,7 @@ class Folders:
             path.startswith("ks/enclaves/a/") and "odd name" not in what
             for path, what, _ in trial.changes
         )
-        if own and trial.line in NEIGHBOURS and "/b/c" not in ended.out and not trial.moment:
+        if own and trial.line in NEIGHBORS and "/b/c" not in ended.out and not trial.moment:
             raise UnexpectedError(f"/b/c is not shown: {ended.out} {ended.err}")
 
 

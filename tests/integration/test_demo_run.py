@@ -265,7 +265,7 @@ import time; time.sleep(600)
 
 
 def test_a_denial_as_rclpy_over_fast_dds_shows_it(tmp_path: Path) -> None:
-    """The exception misleads; what Fast DDS prints on stdout, in colour, is what counts."""
+    """The exception misleads; what Fast DDS prints on stdout, in color, is what counts."""
 
     class FastDds(Backend):
         def command(

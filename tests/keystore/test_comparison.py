@@ -248,7 +248,7 @@ def test_values_of_settings() -> None:
         {"values": [("permissions.validity", "soon")]},
         {"values": [("certificates.unique_subject", "perhaps")]},
         {"rules": [NamedValues("topic", "~/private", (("data", "NONE"),))]},
-        {"rules": [NamedValues("topic", "/a", (("colour", "NONE"),))]},
+        {"rules": [NamedValues("topic", "/a", (("color", "NONE"),))]},
         {"dropped": [("topic", "/nobody")]},
     ],
     ids=str,

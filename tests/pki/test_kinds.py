@@ -1,4 +1,4 @@
-"""A file is recognised for what it is, as OpenSSL writes it in each of its forms."""
+"""A file is recognized for what it is, as OpenSSL writes it in each of its forms."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _openssl(folder: Path, words: str) -> bytes:
 
 
 @pytest.mark.parametrize("kind", some([*_MADE], 8))
-def test_what_openssl_writes_is_recognised(folder: Path, kind: str) -> None:
+def test_what_openssl_writes_is_recognized(folder: Path, kind: str) -> None:
     assert kind.strip() in kind_of(_openssl(folder, _MADE[kind]))
 
 
@@ -81,7 +81,7 @@ def test_what_openssl_writes_is_recognised(folder: Path, kind: str) -> None:
         (b"0\x03\x02\x01", ""),
     ],
 )
-def test_other_files_are_recognised_by_how_they_begin(data: bytes, kind: str) -> None:
+def test_other_files_are_recognized_by_how_they_begin(data: bytes, kind: str) -> None:
     assert kind in kind_of(data)
     assert bool(kind) == bool(kind_of(data))
 

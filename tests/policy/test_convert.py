@@ -103,7 +103,7 @@ def _signed_by_sros(policy: Policy, window: Window) -> Topics:
 @pytest.mark.parametrize(
     ("name", "text"), some([*policies(EARLIER)], 12), ids=lambda value: str(value)[:30]
 )
-def test_an_earlier_policy_is_recognised_and_keeps_its_rights(
+def test_an_earlier_policy_is_recognized_and_keeps_its_rights(
     name: str, text: str, tmp_path: Path, any_time: Window
 ) -> None:
     old, new = _files(tmp_path, text), tmp_path / "new.xml"

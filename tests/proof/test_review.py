@@ -652,7 +652,7 @@ address = "10.0.0.2"
 namespace = "/n2"
 """
 _HOSTS = """{"_meta": {"hostvars": {"r1": {"ansible_host": "10.0.0.1"}}},
- "all": {"children": ["far"], "vars": {"colour": "red"}}, "far": {"hosts": ["r1"]}}
+ "all": {"children": ["far"], "vars": {"color": "red"}}, "far": {"hosts": ["r1"]}}
 """
 
 

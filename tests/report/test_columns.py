@@ -20,7 +20,7 @@ def test_items_keep_order_distance_and_the_top(
 ) -> None:
     drawn.sort(key=lambda item: item[1])
     column = [ColumnItem(str(n), height, group) for n, (height, group, _) in enumerate(drawn)]
-    wanted = {str(n): float(centre) for n, (_, _, centre) in enumerate(drawn)}
+    wanted = {str(n): float(center) for n, (_, _, center) in enumerate(drawn)}
     tops = place_column(column, wanted, gap=10, top=30, lead=24)
     for before, after in pairwise(column):
         room = 10 + (24 if before.group != after.group else 0)

@@ -170,12 +170,12 @@ def test_equal_units_may_name_one_of_another_kind(tmp_path: Path) -> None:
 
 
 def test_robots_of_a_fleet_whose_namespaces_have_other_names(tmp_path: Path) -> None:
-    colours = {"r1": "red", "r2": "green", "r3": "blue"}
+    colors = {"r1": "red", "r2": "green", "r3": "blue"}
     enclaves = {
-        f"/{name}/base": group("topics", "publish", f"/{colour}/odom", f"/{name}/state")
-        for name, colour in colours.items()
+        f"/{name}/base": group("topics", "publish", f"/{color}/odom", f"/{name}/state")
+        for name, color in colors.items()
     }
-    robots = {f"/{name}/base": Robot(name, f"/{colour}") for name, colour in colours.items()}
+    robots = {f"/{name}/base": Robot(name, f"/{color}") for name, color in colors.items()}
     folding = Folding.of(picture_of(tmp_path, enclaves), robots)
     assert {name for _, _, name in drawn(folding)} == {"/{red…blue}/odom", "/{r1…r3}/state"}
     assert folding.names["topics", "/{red…blue}/odom"] == ("/red/odom", "/green/odom", "/blue/odom")

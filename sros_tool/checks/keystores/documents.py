@@ -286,8 +286,10 @@ def _form_findings(grant: Grant, name: str, file: str) -> Iterator[Finding]:
     if any(not topic.strip() for criterion in criteria for topic in criterion.topics):
         yield EMPTY_TOPIC.found(name, "a <topic> in a rule is empty", file)
     topics = sorted({topic for criterion in criteria for topic in criterion.topics})
-    if odd := [topic for topic in topics if "[^" in topic or "[:" in topic]:
-        yield CHARACTER_CLASS.found(name, f"a rule names {names_text([*map(repr, odd)])}", file)
+    if with_character_class := [topic for topic in topics if "[^" in topic or "[:" in topic]:
+        yield CHARACTER_CLASS.found(
+            name, f"a rule names {names_text([*map(repr, with_character_class)])}", file
+        )
     if blank := [topic.strip() for topic in topics if topic != topic.strip() != ""]:
         yield BLANKS.found(name, f"there are spaces or line ends around {names_text(blank)}", file)
 

@@ -422,7 +422,7 @@ def plain(document: bytes) -> bytes:
 
 
 def _plain_file(enclave: CheckedEnclave, path: Path) -> bytes:
-    """Return a file's normalised content for comparison, or b"" if it cannot be read."""
+    """Return a file's normalized content for comparison, or b"" if it cannot be read."""
     try:
         return plain(enclave.keystore.opened.read(path, "file"))
     except SrosError:

@@ -468,13 +468,15 @@ def with_start_finding(
         ]
         if not denials or None in denials:
             continue
-        worst = max(filter(None, denials), key=lambda denial: len(denial.text))
+        longest_denial = max(filter(None, denials), key=lambda denial: len(denial.text))
         where = f"on domain {domain}, " if len(evaluation.by_domain) > 1 else ""
         if len(running) < len(made):
             titles = evaluation.titles([participant.vendor for participant in running])
             where += f"on {' and '.join(titles)} "
-        finding = NO_NODE.found(enclave.name, f"{where}{worst}", enclave.file(PERMISSIONS_FILE))
-        return [*(known for known in known_findings if not worst.explains(known)), finding]
+        finding = NO_NODE.found(
+            enclave.name, f"{where}{longest_denial}", enclave.file(PERMISSIONS_FILE)
+        )
+        return [*(known for known in known_findings if not longest_denial.explains(known)), finding]
     return [*known_findings]
 
 

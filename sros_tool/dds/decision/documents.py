@@ -137,8 +137,10 @@ def _are_plain_domains(domains: DomainSet) -> bool:
 
 def _are_plain(texts: Iterable[str]) -> bool:
     joined = f"|{'|'.join(texts)}|"
-    odd = "| " in joined or " |" in joined or any(character in joined for character in _MARKUP)
-    return joined.isascii() and joined.isprintable() and not odd
+    has_special_characters = (
+        "| " in joined or " |" in joined or any(character in joined for character in _MARKUP)
+    )
+    return joined.isascii() and joined.isprintable() and not has_special_characters
 
 
 _MARKUP = '&<>"'

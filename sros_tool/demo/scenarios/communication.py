@@ -211,7 +211,7 @@ def _rows_of(kind: _Interface, pair_meaning: str) -> tuple[Row, ...]:
     """Return the rows of a service or action; ``pair_meaning`` explains the secured pair."""
     client, server = kind.pair(secured=True)
     open_client, open_server = kind.pair(secured=False)
-    posing = kind.party("client as a server", kind.server_role, Identity(OWN, "client"))
+    client_as_server = kind.party("client as a server", kind.server_role, Identity(OWN, "client"))
     calling = kind.party("server as a client", kind.client_role, Identity(OWN, "server"))
     may_not = "its permissions allow it to {}, not to {}"
     return (
@@ -243,7 +243,7 @@ def _rows_of(kind: _Interface, pair_meaning: str) -> tuple[Row, ...]:
         _refused_process_row(
             f"client that poses as the {kind.server}",
             may_not.format(kind.asks, kind.answers),
-            posing,
+            client_as_server,
             server,
         ),
         _refused_process_row(

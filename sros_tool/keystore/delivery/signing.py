@@ -606,15 +606,15 @@ def _earlier_rights(
 ) -> SignedRights:
     """Return the rights in an enclave's current permissions, after verifying their signature."""
     subject = text_of(present_certificate.subject)
-    old = change.keystore.signed_grant(name, subject)
-    old.signed.verify(change.permissions.certificate)
-    if old.grant is None:
+    earlier = change.keystore.signed_grant(name, subject)
+    earlier.signed.verify(change.permissions.certificate)
+    if earlier.grant is None:
         raise PkiError(
             f"the permissions of enclave {name} have no grant for {subject}",
             "These permissions belong to another certificate.",
             "State the rights with -p POLICY_FILE.",
         )
-    return change.recorded.rights_to_sign(name, old.digest, old.grant)
+    return change.recorded.rights_to_sign(name, earlier.digest, earlier.grant)
 
 
 def _answer_files(keystore: OpenedKeystore, issued: Issued, zenoh: KeptZenoh) -> dict[str, bytes]:
