@@ -39,7 +39,7 @@ ROUTERS = "/{robot}/router"
 """Default path of the enclave of each robot's Zenoh router."""
 _MAX_NAME = 64
 """Longest name of a robot or group in characters: longer ones fit into no enclave's name."""
-__MAX_NAMESPACE = 245
+_MAX_NAMESPACE = 245
 """Longest ROS namespace (rmw: RMW_NAMESPACE_MAX_LENGTH)."""
 _MAX_HOST = 253
 """Longest host name (RFC 1035)."""
@@ -184,8 +184,8 @@ def name_problem(name: str) -> str:
 
 def namespace_problem(namespace: str) -> str:
     """Return why ``namespace`` is not an absolute ROS namespace, as a sentence; "" if it is."""
-    if len(namespace) > __MAX_NAMESPACE:
-        return f"It has {len(namespace)} characters, more than {__MAX_NAMESPACE}."
+    if len(namespace) > _MAX_NAMESPACE:
+        return f"It has {len(namespace)} characters, more than {_MAX_NAMESPACE}."
     if namespace == "/":
         return ""
     first, *parts = namespace.split("/")

@@ -59,6 +59,7 @@ POLICIES = {
     "moved.xml": policy_text({"/a": f'{_WILD}</profile><profile ns="/" node="m">{publish("/x")}'}),
     "wild.xml": policy_text({"/a": _WILD, "/b": publish("/x")}),
     "quiet.xml": policy_text({"/a": publish("/x"), "/quiet": ""}),
+    "silent.xml": policy_text({"/a": "", "/b": publish("/x")}),
     "large.xml": policy_text({"/a": publish(*(f"/{'n' * 60}/x{i}" for i in range(900)))}),
     "equal.xml": policy_text(
         {f"/r{n}": publish(*(f"/r{n}/{e}" for e in ("xyq" if n == 4 else "xyz"))) for n in range(5)}
@@ -333,6 +334,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("--no-new-access policy.xml policy.xml"),
         Case("--no-new-access policy.xml wild.xml", 1),
         Case("--no-new-access guarded.xml moved.xml", 1),
+        Case("--no-new-access denied.xml silent.xml"),
         Case("--no-new-access ks wild.xml", 1),
         Case("--no-new-access protected.xml policy.xml", 1),
         Case("--no-new-access policy.xml protected.xml"),
