@@ -95,7 +95,7 @@ _TRUST_FILES = tuple(
     for file in CONFIRMED_FILES
     if file not in (CERTIFICATE_FILE, PERMISSIONS_FILE, GOVERNANCE_FILE)
 )
-"""Files of an enclave that are not its own documents."""
+"""Files of an enclave that decide whom it trusts: CAs and revocation list."""
 _REPLACED_LIST = "replaced.crl.pem"
 _REPLACED_FOR = timedelta(days=30)
 """How long the agent sends a revocation list that a release replaced by a list that revokes

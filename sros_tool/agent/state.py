@@ -44,10 +44,10 @@ class AgentState:
     verified documents begin to be valid then.  ``due`` are the enclaves whose processes were not
     yet seen with the installed files, since the start ``boot`` of the machine (see `boot_id`); of
     those in ``unseen``, no process was seen.  ``list_due`` are the enclaves whose processes may
-    lack the revocation list.  ``files`` maps enclaves to two digests of their files at the end of
-    the last round, as text, of all files and of all but its own documents: other files, whoever
-    wrote them, make a restart due.  ``fetched`` and
-    ``sent`` tell when the source and the inbox were last reached.  ``repaired`` is a sentence on
+    lack the revocation list.  ``files`` maps enclaves to two digests at the end of the last
+    round, as text: of all files, and of the files that decide whom the enclave trusts.  A change of
+    a digest, whoever wrote the files, makes a restart due.  ``fetched`` and
+    ``sent`` are when the source and the inbox were last reached.  ``repaired`` is a sentence on
     files that were not those of the release and were replaced, at ``repaired_at``.
     """
 

@@ -762,7 +762,8 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         ):
             text += f"; {waiting} more have it, but may run processes that started before it"
         if (until := status.revoked_until) and until > compared_fleet.at:
-            text += f"; robots need it until {until:%Y-%m-%d}, when what it revokes has expired"
+            text += f"; robots need it until {until:%Y-%m-%d}, when "
+            text += "the revoked certificates have expired"
         yield text
     yield from _expiry_facts(compared_fleet)
     if status.unassigned:

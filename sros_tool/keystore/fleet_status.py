@@ -381,10 +381,10 @@ class PublishedMetadata:
     """Absolute path of the publishing folder; null if it is not known."""
     expires: datetime | None
     """The first expiry of the published metadata, in UTC: from then on, robots refuse it, and get
-    no new files. Null if a release of sros published last that did not record it."""
+    no new files. Null if an earlier release of sros published last, which did not record it."""
     root_expires: datetime | None = None
-    """Expiry of the root metadata, in UTC: to renew it needs the root key. Null if a release of
-    sros published last that did not record it."""
+    """Expiry of the root metadata, in UTC: to renew it needs the root key. Null if an earlier
+    release of sros published last, which did not record it."""
     accepted: bool | None = None
     """Whether robots still accept it; null if that is not known, because ``expires`` is null."""
 
@@ -778,7 +778,7 @@ class _KeystoreRecords:
         published = read_published(keystore)
         self._published = published.robots
         self.published = {name: robot.release.number for name, robot in published.robots.items()}
-        """Robots with the numbers of their releases that were published last."""
+        """By robot, the number of the release that was published last."""
         self.publication = (
             PublishedMetadata(published.folder, published.until, published.root_until)
             if published.robots

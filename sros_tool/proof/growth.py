@@ -1192,7 +1192,7 @@ def _enclaves_of_nodes(side: AccessSource) -> defaultdict[tuple[str, str], dict[
 
 
 def undenied_name(denied: Right, stated: Rules) -> str | None:
-    """Return a name that ``denied``, no action, denies and ``stated`` neither denies nor allows."""
+    """Return a name of the denial ``denied``, not of an action, that ``stated`` has no rule for."""
     if stated.cover(denied):
         return None
     allowed = stated.overlapping(denied._replace(qualifier=ALLOW))

@@ -162,7 +162,7 @@ class UnitText:
         return first + "".join(value + part for value, part in zip(named, rest, strict=True))
 
     def with_only_unit(self, unit: int | None, word: Callable[[int, int], str]) -> UnitText:
-        """Return the text with only ``unit`` as a unit; the names of others become plain text."""
+        """Return the text split only at the name of ``unit``; other units become plain text."""
         parts, named = [self.parts[0]], []
         for named_unit, part in zip(self.named, self.parts[1:], strict=True):
             if named_unit[0] == unit:

@@ -353,7 +353,10 @@ def test_until_when_a_revocation_is_needed(field: Field) -> None:
     until = certificate.not_valid_after_utc
     assert field.status()["revoked_until"] == iso(until), "of the last one, not of the first"
     said = field.run("fleet", "status", "ks", status=1).out
-    assert f"; robots need it until {until:%Y-%m-%d}, when what it revokes has expired\n" in said
+    assert (
+        f"; robots need it until {until:%Y-%m-%d}, when the revoked certificates have expired\n"
+        in said
+    )
     (field.root / "ledger.jsonl").unlink()
     assert field.status()["revoked_until"] is None, "nobody knows"
 
