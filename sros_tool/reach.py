@@ -363,7 +363,7 @@ def _writers_and_readers(
 def _accesses(
     rights: Iterable[Right], domains: DomainSet | None, ignored: Collection[str]
 ) -> Iterator[tuple[str, list[_Access]]]:
-    """Yield each direction with the accesses of an enclave that rights in some domains give."""
+    """Yield pairs of a direction and accesses, by enclave, for rights in the same domains."""
     denied: dict[tuple[str, str], set[str]] = defaultdict(set)
     allowed: dict[tuple[str, str], set[str]] = defaultdict(set)
     for right in rights:

@@ -124,9 +124,10 @@ _MOST_SIMILAR = 5  # findings that differ in further robots; more become one
 
 
 def _kinds(group: tuple[Finding, ...], fleet: Fleet) -> _Kinds:
-    """Map each robot that a finding names to two keys, which equal findings of other robots share.
+    """Map each robot that a finding names to two keys by which such findings are merged.
 
-    The first key keeps the names of all other robots in the finding, the second one has none.
+    The first key is equal for findings that differ only in this robot; the second one also for
+    findings that differ in the other robots that they name.
     """
     first, *more = group
     named = () if more else named_robots(fleet, first.subject, first.text)

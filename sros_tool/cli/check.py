@@ -494,7 +494,10 @@ def _circumstances(
     fleet_file: Path | None = None,
     paths: Sequence[Path] = (),
 ) -> Circumstances:
-    """Return the options; the fleet is from --fleet, or from the only keystore."""
+    """Return moment, domain, policies and fleet that the options of a check name.
+
+    Without --fleet, the fleet of the only keystore counts, if there are policies.
+    """
     from sros_tool.checks.targets import Circumstances
     from sros_tool.cli.common import local_zone
     from sros_tool.keystore.layout import is_keystore

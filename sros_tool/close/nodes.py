@@ -84,8 +84,8 @@ class ObservedNodes:
     def expected(self, now: Observation | None = None) -> Observation:
         """Return the nodes of enclaves in the policy, with the names that they should have.
 
-        Where the policy allows a renamed node an endpoint under several names, the name counts that
-        the node has ``now``.
+        If the policy allows several names for an endpoint of a renamed node, the result has the
+        name that the node uses ``now``.
         """
         names, nodes = {enclave.path for enclave in self.policy.enclaves}, []
         for node in self.in_their_enclaves():
@@ -105,8 +105,8 @@ class ObservedNodes:
     def renamed(self) -> Mapping[str, tuple[str, str]]:
         """Map the old full names of renamed nodes to the namespace and name in the policy.
 
-        A node was renamed if it alone of its enclave has no profile any more, and one profile of
-        that enclave alone is for a node that was not observed.
+        A node counts as renamed if it is the only node of its enclave without a profile, and the
+        enclave has only one profile of a node that was not observed.
         """
         _, without_profile = self.divide_by_profile(self.as_observed)
         known = {node_name(node) for node in self.as_observed}

@@ -116,7 +116,7 @@ class PictureSource:
         )
 
     def moved_to_homes(self, homes: Mapping[str, str]) -> PictureSource:
-        """Return a copy with rights and nodes moved from enclaves to their ``homes``."""
+        """Return a copy with rights and nodes moved from enclaves to others, as ``homes`` says."""
         nodes: dict[str, set[str]] = defaultdict(set)
         for path, names in self.nodes.items():
             nodes[homes.get(path, path)].update(names)

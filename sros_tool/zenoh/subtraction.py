@@ -405,7 +405,7 @@ class _Letters:
                 places += self._following(place)
 
     def _following(self, place: _Place) -> Iterable[_Place]:
-        """Keep the names of a place if one expression matches them; else return smaller places."""
+        """Return the parts of a place to search next; none if its names are decided all at once."""
         read, wide, denied, _ = place
         self.effort -= sum(map(len, denied)) + len(denied) * len(wide) + len(read)
         if self.effort < 0:

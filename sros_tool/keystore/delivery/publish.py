@@ -848,7 +848,7 @@ class _Run:
     # ── their releases ─────────────────────────────────────────────────────────────────────
 
     def release(self, changed_robots: Sequence[_Changed], change: KeystoreChange) -> None:
-        """Make and write the archives of new releases, which nothing names yet.
+        """Write the archives of new releases; no metadata names them yet.
 
         ``changed_robots`` are the robots that seemed changed before the keystore was locked.
         """

@@ -71,9 +71,9 @@ def check_count(value: object, maximum: int = MOST_NUMBER) -> int:
 
 
 class Evaluated(NamedTuple):
-    """Files of a robot that were evaluated without a problem, and for how long that holds.
+    """For how long the files of a robot, in which no problem was found, need no new evaluation.
 
-    ``files`` is a digest of their list without revocation lists, and of the version of sros.
+    ``files`` is a digest of the files, except revocation lists, and of the version of sros.
     """
 
     files: str
