@@ -22,14 +22,14 @@ _NAMES = ("title", "product", "tested")
 _RELEASES = re.compile(r" \((?:Fast DDS|Cyclone|\d)[^)]*\)(?=\.$)")
 """The releases at the end of a sentence, which the page names for themselves."""
 
-_HEAD = re.compile(r".*?\n## What holds where\n", re.DOTALL)
+_HEAD = re.compile(r".*?\n## DDS and rules of each distribution\n", re.DOTALL)
 """The part of the page that is written by hand."""
 
 
 def distributions_page() -> str:
     """Return the page as Markdown, with its hand-written part as it is."""
     written = _HEAD.match((CHECKOUT / "docs" / "distributions.md").read_text("utf-8"))
-    assert written, "docs/distributions.md has no part '## What holds where'"
+    assert written, "docs/distributions.md has no part '## DDS and rules of each distribution'"
     shipped = table_text(
         *("distribution", "supported until", "default DDS", "other DDS", "rmw_zenoh", "nodes"),
         rows=_shipped(),

@@ -713,7 +713,7 @@ def _restart_from(value: Any, label: str) -> tuple[str, ...]:
         DocumentError: the value is not a list of such names.
     """
     if not isinstance(value, list):
-        raise _invalid_confirmation_error(label, "its restart or crl_restart is not a list")
+        raise _invalid_confirmation_error(label, '"restart" or "crl_restart" is not a list')
     return tuple(sorted({_enclave_from(name, label) for name in value}))
 
 
@@ -736,19 +736,19 @@ def _enclave_from(name: Any, label: str) -> str:
 
 def _sequence_from(value: Any, label: str) -> int:
     if type(value) is not int or not 1 <= value <= _MOST_NUMBER:
-        raise _invalid_confirmation_error(label, "its sequence is not a positive number")
+        raise _invalid_confirmation_error(label, '"sequence" is not a positive number')
     return value
 
 
 def _release_from(value: Any, label: str) -> int:
     if type(value) is not int or not 0 <= value <= _MOST_NUMBER:
-        raise _invalid_confirmation_error(label, "its release is not a number")
+        raise _invalid_confirmation_error(label, '"release" is not a number')
     return value
 
 
 def _expiry_from(value: Any, label: str) -> dict[str, EnclaveExpiry]:
     if not isinstance(value, dict):
-        raise _invalid_confirmation_error(label, "its expiry is not an object")
+        raise _invalid_confirmation_error(label, '"expiry" is not an object')
     expiry = {}
     for name, times in value.items():
         if not isinstance(times, dict) or times.keys() != set(EnclaveExpiry._fields):
@@ -765,7 +765,7 @@ def _expiry_from(value: Any, label: str) -> dict[str, EnclaveExpiry]:
 
 def _running_from(value: Any, label: str) -> dict[str, RunningFiles]:
     if not isinstance(value, dict):
-        raise _invalid_confirmation_error(label, "its running is not an object")
+        raise _invalid_confirmation_error(label, '"running" is not an object')
     for state in value.values():
         if state not in tuple(RunningFiles):
             raise _invalid_confirmation_error(
@@ -814,7 +814,7 @@ def _crl_from(value: Any, label: str) -> str:
 
 def _boot_from(value: Any, label: str) -> str:
     if not _is_digest(value):
-        raise _invalid_confirmation_error(label, "its boot is not a SHA-256 digest")
+        raise _invalid_confirmation_error(label, '"boot" is not a SHA-256 digest')
     return str(value)
 
 
@@ -840,7 +840,7 @@ def _dds_from(value: Any, label: str) -> RobotDds:
     """
     if not isinstance(value, dict) or value.keys() != set(RobotDds._fields):
         raise _invalid_confirmation_error(
-            label, 'the keys of its dds are not "libraries" and "unseen"'
+            label, 'the keys of "dds" are not "libraries" and "unseen"'
         )
     listed_libraries, unseen = value["libraries"], value["unseen"]
     if type(unseen) is not int or not 0 <= unseen <= _MOST_UNSEEN:

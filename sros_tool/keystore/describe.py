@@ -968,9 +968,9 @@ class HistoryStatus(StrEnum):
     """The state of an issued certificate or document."""
 
     CURRENT = "current"
-    """The keystore has it, and it has not expired."""
+    """The certificate or document is in the keystore, and has not expired."""
     SUPERSEDED = "superseded"
-    """No longer in the keystore, but neither revoked nor expired: DDS still accepts it."""
+    """The keystore has another one now; DDS still accepts this one (not revoked, not expired)."""
     REPLACED = "replaced"
     """Earlier settings of the keystore, which DDS does not read."""
     REVOKED = "revoked"

@@ -49,9 +49,9 @@ def blocks(data: bytes) -> Iterator[Block]:
         PkiError: a block is damaged, so OpenSSL does not read what follows; or its first line ends
             with a byte beyond ASCII, which OpenSSL drops on some processors only.
     """
-    if alone := _ALONE.fullmatch(data):
-        label = alone[1].decode("ascii")
-        yield Block(label, b"", _decoded(alone[2], label))
+    if single := _ALONE.fullmatch(data):
+        label = single[1].decode("ascii")
+        yield Block(label, b"", _decoded(single[2], label))
         return
     pieces = iter(_PIECE.findall(data))
     start = True  # a byte order mark is dropped here, and behind each block
