@@ -1148,11 +1148,28 @@ def _new_nodes(before: AccessSource, after: AccessSource) -> Iterator[NewNode]:
         had = had if earlier else [*profile_rights(path, profile)]
         known = Rules(right._replace(enclave=path) for right in had)
         allowed = (right for right in new_rights.get(path, ()) if right.qualifier is ALLOW)
-        if gained := [right for right in allowed if not known.cover(right)]:
+        gained = [right for right in allowed if not known.cover(right)]
+        gained += _rights_without_denial(had, path, Rules(new_rights.get(path, ())))
+        if gained:
             full = f"/{'/'.join(node)}".replace("//", "/")
             moved_from = min(earlier - new_enclaves[node].keys(), default="")
             place = after.shown_source(profile.source)
             yield NewNode(full, path, moved_from, min(gained, key=order), place)
+
+
+def _rights_without_denial(had: Iterable[Right], path: str, stated: Rules) -> Iterator[Right]:
+    """Yield denied rights of the enclaves of a node that its new enclave ``path`` allows.
+
+    What another one of its enclaves allowed is not new.
+    """
+    rights = set(had)
+    enclaves, known = {right.enclave for right in rights}, Rules(rights)
+    for denial in sorted(right for right in rights if right.qualifier is DENY):
+        kept = stated.cover(denial._replace(enclave=path))
+        if kept or any(known.allow(enclave, denial.right, denial.name) for enclave in enclaves):
+            continue
+        right = denial._replace(enclave=path, qualifier=ALLOW)
+        yield from (right,) if stated.cover(right) else stated.overlapping(right)
 
 
 # ── denials ────────────────────────────────────────────────────────────────────────────────

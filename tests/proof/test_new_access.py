@@ -119,6 +119,36 @@ def test_a_node_that_gets_the_rights_of_another_enclave(
     assert ended.status == bool(lines) and ("1 node is new in an" in ended.err) == bool(lines)
 
 
+@pytest.mark.parametrize(
+    ("deny_in_mux", "others_deny", "found"), [("", "", 1), ("", "/secret", 1), ("/secret", "", 0)]
+)
+def test_a_node_that_loses_a_denial_in_another_enclave(
+    tmp_path: Path, deny_in_mux: str, others_deny: str, found: int
+) -> None:
+    """Its process may use the name then, though the ALLOW of both enclaves is the same."""
+
+    def node(name: str, denied: str) -> str:
+        deny = publish(denied).replace("ALLOW", "DENY") if denied else ""
+        return f'<profile ns="/" node="{name}">{publish("/*")}{deny}</profile>'
+
+    def write(file: str, web: str, mux: str) -> None:
+        enclaves = (("/web", web), ("/mux", mux))
+        text = "".join(
+            f'<enclave path="{p}"><profiles>{n}</profiles></enclave>' for p, n in enclaves
+        )
+        (tmp_path / file).write_text(
+            f'<policy version="0.2.0"><enclaves>{text}</enclaves></policy>'
+        )
+
+    stays, mux = node("stays", others_deny), node("mux", deny_in_mux)
+    write("base.xml", node("moves", "/secret") + stays, mux)
+    write("head.xml", stays, mux + node("moves", ""))
+    ended = sros("diff_policy", "--no-new-access", "base.xml", "head.xml", cwd=tmp_path)
+    assert ended.status == (found or not others_deny), ended.out
+    line = "node /moves moves from enclave /web to /mux, and may publish topic /secret there"
+    assert (line in ended.out) == bool(found)
+
+
 @pytest.mark.parametrize("part", range(8 if LONG else 1))
 def test_random_pairs_against_single_questions(tmp_path: Path, part: int) -> None:
     """Policies, keystores, fleets and Zenoh files: what is new is found, and nothing else."""
