@@ -127,10 +127,10 @@ def close(
     something is found, is left to do by hand, or does not hold; 2 if it could not be done.
     """
     from sros_tool.close.apply import apply as apply_security
+    from sros_tool.close.apply import undo as open_again
     from sros_tool.close.preparation import prepare
     from sros_tool.close.proof import prove as prove_closed
     from sros_tool.close.robot import LocalRobot, Shell
-    from sros_tool.close.undo import undo as open_again
 
     if sum((apply, prove, undo)) > 1:
         raise UsageError("--apply, --proof and --undo exclude each other", "", "Choose one.")
@@ -182,7 +182,7 @@ def close(
 
 def _show(robot: LocalRobot, closed: CloseState) -> None:
     """Print on one screen who may do what, how processes are restarted, and what looks wrong."""
-    from sros_tool.close.access import access_lines
+    from sros_tool.close.rights import access_lines
     from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.policy.document import read_policy
     from sros_tool.reach import unguarded

@@ -628,7 +628,7 @@ def _requirements_forbidding(answer: Answer) -> Sequence[Requirement]:
     robot = folder_of_closed_robot(root) if root else None
     if not (robot and change and change.document) or answer.enclave.has_placeholders:
         return ()
-    from sros_tool.close.requirements import requirements_broken_by
+    from sros_tool.close.rights import requirements_broken_by
 
     return requirements_broken_by(robot, change.document, moment_of(None))
 

@@ -1,14 +1,38 @@
-"""Restart the systemd units of a robot with security."""
+"""Apply the security of a robot to its systemd units, and undo it."""
 
 from __future__ import annotations
 
-from sros_tool.close.drop_ins import DROP_IN, SYSTEMD, drop_ins_of, restart_units
+import os
+import shlex
+import subprocess
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
+from itertools import chain
+from pathlib import Path
+
+from sros_tool.close.nodes import ObservedNodes
+from sros_tool.close.processes import ClosedProcess, ObservedProcesses, process_text
 from sros_tool.close.proof import proofs_of
 from sros_tool.close.robot import LocalRobot
-from sros_tool.close.state import CloseState, current_state
+from sros_tool.close.start_files import DROP_IN, drop_in_heading
+from sros_tool.close.state import (
+    CloseState,
+    RunningRobot,
+    current_state,
+    keystore_text,
+    secured_process,
+)
+from sros_tool.errors import SrosError, UnavailableError
+from sros_tool.files import remove_file
+from sros_tool.names import expand
+from sros_tool.policy.model import Policy
+from sros_tool.runtime.environment import node_argument
+from sros_tool.runtime.processes import Process, program_of
 from sros_tool.runtime.units import unit_changes, write_units
 from sros_tool.values import FileChange
 from sros_tool.xml import read_bytes
+
+_SYSTEMD = Path("/etc/systemd/system")
 
 _RESTART_SECONDS = 30.0
 """How long processes that sros restarted may take until they run in their enclaves."""
@@ -23,17 +47,17 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
     observed = prepared.observed
     paths = [f"{unit}.d/{DROP_IN}" for unit in sorted(observed.units)]
     files = {path: read_bytes(robot.start / "units" / path, "unit").decode() for path in paths}
-    drop_ins_of(robot, observed)
-    changes = unit_changes(SYSTEMD, files, force=True)
+    _drop_ins_of(robot, observed)
+    changes = unit_changes(_SYSTEMD, files, force=True)
     for path, action in changes.items():
-        robot.shell.say(f"{'would ' if dry_run else ''}{action} {SYSTEMD / path}")
+        robot.shell.say(f"{'would ' if dry_run else ''}{action} {_SYSTEMD / path}")
     if not dry_run:
-        write_units(SYSTEMD, files, changes)
+        write_units(_SYSTEMD, files, changes)
     secured = prepared.secured
     unsecured = [process for process in observed.processes if not secured.get(process.enclave)]
     open_units = observed._replace(processes=unsecured).units
-    restart_units(robot, observed, open_units, changed=bool(changes), dry_run=dry_run)
-    done = [FileChange(action, str(SYSTEMD / path)) for path, action in changes.items()]
+    _restart_units(robot, observed, open_units, changed=bool(changes), dry_run=dry_run)
+    done = [FileChange(action, str(_SYSTEMD / path)) for path, action in changes.items()]
     by_hand = dry_run or prepared.pending_by_hand
     proofs = () if by_hand else proofs_of(robot, prepared, _RESTART_SECONDS)
     total = [*prepared.changes, *done]
@@ -41,3 +65,189 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
         return prepared._replace(changes=total)
     now = current_state(robot, robot.read_policy())
     return prepared._replace(proofs=proofs, changes=total, secured=now.secured, new=now.new)
+
+
+def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
+    """Remove the drop-ins of this folder, restart their units, and say what to do by hand."""
+    running = RunningRobot(robot)
+    observed = running.with_later_processes(robot.processes)
+    drop_ins = _drop_ins_of(robot, observed)
+    for path in drop_ins:
+        robot.shell.say(f"{'would remove' if dry_run else 'removed'} {path}")
+        if not dry_run:
+            remove_file(path)
+    units = {path.parent.name.removesuffix(".d") for path in drop_ins}
+    # Without a drop-in, a unit is not open yet if an earlier --undo was killed before the restart.
+    units |= {process.unit for process in observed.processes if not running.is_open(process)} - {""}
+    _restart_units(robot, observed, units, dry_run=dry_run)
+    changes = [FileChange("remove", str(path)) for path in drop_ins]
+    policy = _readable_policy(robot)
+    state = current_state(robot, policy)._replace(dry_run=dry_run, changes=changes)
+    now = RunningRobot(robot)
+    observed = observed.within(policy) if policy else observed
+    _say_how_to_start(now, observed)
+    problems = [
+        *_commands_to_open(now, observed),
+        *(() if dry_run else _secured_units(now, observed)),
+        *_secured_guests(now, observed),
+        *_unknown_processes(now),
+    ]
+    return state._replace(problems=problems)
+
+
+def _readable_policy(robot: LocalRobot) -> Policy | None:
+    """Return the policy; None, with its error shown, if it cannot be read."""
+    try:
+        return robot.read_policy()
+    except SrosError as error:  # a broken file must not keep the robot closed
+        robot.shell.say(f"{error}")
+        return None
+
+
+def _secured_processes(running: RunningRobot) -> Mapping[str, Process]:
+    """Map enclaves to a process that runs in them, best of a user who can read their files."""
+    by_user = sorted(
+        running.secured_everywhere, key=lambda secured: running.may_use_files(secured.process)
+    )
+    return {enclave.name: process for process, enclave in by_user}
+
+
+def _processes_by_hand(robot: LocalRobot, observed: ObservedProcesses) -> list[ClosedProcess]:
+    return [*chain.from_iterable(observed.commands_by_hand(robot.folder).values())]
+
+
+def _commands_to_open(running: RunningRobot, observed: ObservedProcesses) -> Iterator[str]:
+    """Yield how to restart the processes open that run in enclaves and that no unit starts."""
+    robot, secured = running.robot, _secured_processes(running)
+    by_hand = _processes_by_hand(robot, observed)
+    closed = [process for process in by_hand if process.enclave in secured]
+    counts = Counter(process.enclave for process in closed)
+    commands = []
+    for process in closed:
+        now = secured[process.enclave]
+        is_alone = counts[process.enclave] == 1 and not process.launch
+        if is_alone and not process.container and running.may_use_files(now):
+            commands.append(secured_process(now, process.enclave).open_command(robot.domain))
+        else:
+            commands.append(process.open_command(robot.domain))
+    for command in dict.fromkeys(commands):
+        yield f"restart it open: {command}"
+
+
+def _secured_units(running: RunningRobot, observed: ObservedProcesses) -> Iterator[str]:
+    """Yield the processes of units that run in enclaves though their units were restarted."""
+    secured = _secured_processes(running)
+    for process in observed.processes:
+        if process.unit and process.enclave in secured:
+            yield (
+                f"{secured[process.enclave].label} still runs in {process.enclave}: stop it if "
+                f"{process.unit} did not start it; otherwise take sros out of the unit"
+            )
+
+
+def _say_how_to_start(running: RunningRobot, observed: ObservedProcesses) -> None:
+    """Show how to start, without security, processes that do not run or have another command."""
+    robot, secured, nodes = running.robot, _secured_processes(running), ObservedNodes(running.robot)
+    known = running.with_later_processes(robot.processes)
+    commands = {tuple(process.command) for process in known.processes}
+    others = [
+        process for command, process in running.open_processes.items() if command not in commands
+    ]
+    for process in _processes_by_hand(robot, observed):
+        if process.enclave in secured or tuple(process.command) in running.open_processes:
+            continue
+        names, old = nodes.names_in(process.enclave)
+        under = f", under its old name {old}" if old else ""
+        state = "does not run; "
+        if like := [other.label for other in others if _is_like(other, process, names)]:
+            state = f"runs open by another command ({like[0]}); if that is another program, "
+        command = process.open_command(robot.domain)
+        robot.shell.say(f"{process.enclave} {state}start it open{under}: {command}")
+
+
+def _secured_guests(running: RunningRobot, observed: ObservedProcesses) -> Iterator[str]:
+    """Yield processes that run in an enclave of the export in which none was observed."""
+    secured = _secured_processes(running)
+    for name in sorted(secured.keys() - {process.enclave for process in observed.processes}):
+        guest = secured[name]
+        how = f"restart it open: {process_text(guest)}"
+        if not running.may_use_files(guest):
+            how = f"it is {guest.label} of user {guest.user}, who cannot read its files"
+        yield f"{name} runs in an enclave, too; {how}"
+
+
+def _unknown_processes(running: RunningRobot) -> Iterator[str]:
+    """Yield processes that may run secured, although sros did not start them from this folder."""
+    pids = {process.pid for process, _ in running.secured_everywhere}
+    for other in running.in_domain:
+        if (enclave := other.enclave) and other.pid not in pids and not other.is_daemon:
+            why = f" ({enclave.problem})" if enclave.problem else ""
+            yield (
+                f"{other.label} runs secured with the files of '{keystore_text(enclave)}'{why}, "
+                "which are not known as those of this folder; open processes do not hear it"
+            )
+    for unseen in running.processes.unseen:
+        if unseen.speaks:
+            yield f"{unseen.label} speaks ROS 2, and cannot be looked at: {unseen.why}"
+    if running.processes.hidden or any(not unseen.speaks for unseen in running.processes.unseen):
+        running.robot.shell.say(
+            "some processes cannot be looked at: to be sure of them, ask as root"
+        )
+
+
+def _is_like(process: Process, observed: ClosedProcess, nodes: Collection[str]) -> bool:
+    """Return whether a process may be an observed one that was started with another command.
+
+    ``nodes`` are the full names of the observed process's nodes.
+    """
+    if named := node_argument(process.program[1]):
+        return expand("~", *named) in nodes
+    return program_of(process.program[1]) == program_of(tuple(observed.command))
+
+
+def _drop_ins_of(robot: LocalRobot, observed: ObservedProcesses) -> list[Path]:
+    """Return the drop-ins of this folder; raise `SrosError` at one of another folder."""
+    drop_ins = [
+        path
+        for path in sorted(_SYSTEMD.glob(f"*.d/{DROP_IN}"))
+        if read_bytes(path, "unit").startswith(drop_in_heading(robot).encode())
+    ]
+    for unit in sorted(observed.units):
+        path = _SYSTEMD / f"{unit}.d/{DROP_IN}"
+        if path not in drop_ins and os.path.lexists(path):
+            raise SrosError(
+                f"'{path}' is not the drop-in of this folder",
+                "Its first line names another folder, or was changed. Nothing was changed.",
+                "Use the folder that it names, spelled as there, or remove the drop-in.",
+            )
+    return drop_ins
+
+
+def _restart_units(
+    robot: LocalRobot,
+    observed: ObservedProcesses,
+    units: set[str],
+    *,
+    changed: bool = False,
+    dry_run: bool,
+) -> None:
+    """Let systemd read its units again if some are restarted or changed.  Raises `SrosError`.
+
+    Units whose processes ended by themselves are restarted only if they run.
+    """
+    idle = {process.unit for process in observed.processes if not process.pid}
+    verbs = {"restart": units - idle, "try-restart": units & idle}
+    restarts = [[verb, *sorted(names)] for verb, names in verbs.items() if names]
+    for words in [["daemon-reload"], *restarts] if units or changed else []:
+        command = ["systemctl", *words]
+        robot.shell.say(f"{'would run:' if dry_run else '+'} {shlex.join(command)}")
+        try:
+            ended = 0 if dry_run else subprocess.run(command, check=False).returncode
+        except OSError as error:
+            raise UnavailableError(f"systemctl cannot be run: {error.strerror}") from error
+        if ended:
+            raise SrosError(
+                f"`{shlex.join(command)}` ended with {ended}",
+                "Secured and open processes do not hear each other.",
+                "Fix it and run --apply again, or go back with --undo.",
+            )

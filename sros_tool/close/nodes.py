@@ -8,12 +8,12 @@ from dataclasses import replace
 from functools import cached_property
 from itertools import chain
 
-from sros_tool.close.endpoints import node_name
 from sros_tool.close.robot import OBSERVER, LocalRobot
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.explain.audit import DeniedRight, audit, audited_enclaves
 from sros_tool.graph.learn import stable_name
 from sros_tool.graph.observation import (
+    PUBLISH,
     Endpoint,
     Observation,
     ObservedNode,
@@ -21,7 +21,7 @@ from sros_tool.graph.observation import (
     observation_from_json,
 )
 from sros_tool.keystore.participant import JoinContext
-from sros_tool.names import expand, is_expression
+from sros_tool.names import expand, is_expression, right_to_use
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
 from sros_tool.policy.patterns import overlap
@@ -236,3 +236,14 @@ def _possible_endpoints(
         moved = expand(fqn.removeprefix(near), ns, name)
         return endpoint, endpoint._replace(topic=prefix + moved)
     return (endpoint,)
+
+
+def ros_use(endpoint: Endpoint) -> tuple[str, str]:
+    """Return the right that an endpoint needs, and its ROS name, or its DDS topic without one."""
+    right, name = right_to_use(endpoint.topic, writes=endpoint.direction == PUBLISH)
+    return right or endpoint.direction, name
+
+
+def node_name(node: ObservedNode) -> str:
+    """Return the full name of a node, with ``*`` for the part that changes with every start."""
+    return f"{node.ns.rstrip('/')}/{stable_name(node.name)}"

@@ -1,25 +1,57 @@
-"""Prepare everything that a robot needs to run closed, without closing it."""
+"""Prepare everything that a robot needs to run closed, without closing it.
+
+The steps are command lines of sros.  What keeps the robot from running closed is shown with what to
+do.
+"""
 
 from __future__ import annotations
 
+import os
 import shlex
-from collections.abc import Sequence
+import stat
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from sros_tool.checks.requirements import VIOLATED
-from sros_tool.close.export import remove_enclaves
 from sros_tool.close.nodes import ObservedNodes
-from sros_tool.close.problems import problems_of, shared_node_problems, shared_program_problems
-from sros_tool.close.processes import ObservedProcesses
-from sros_tool.close.robot import LocalRobot
+from sros_tool.close.processes import ROUTER, ClosedProcess, ObservedProcesses, run_words
+from sros_tool.close.robot import MOST_NAMES, OBSERVER, TEMPLATE, LocalRobot
 from sros_tool.close.start_files import write_start_files
 from sros_tool.close.state import CloseState, CloseStep, current_state
-from sros_tool.close.steps import CommandStep, steps
-from sros_tool.close.watch import watch
+from sros_tool.close.watch import check_watchable, watch
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.files import replace_file
+from sros_tool.folders import Folder
+from sros_tool.keystore.layout import KEY_FILES, enclave_folder, enclave_path, list_enclaves
+from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.keystore.selection import revocation_of
+from sros_tool.policy.document import read_policy
+from sros_tool.runtime.environment import RMW_ZENOH, node_argument
+from sros_tool.runtime.processes import launch_verb
 from sros_tool.runtime.rmw import RMW, built_without_security, rmw_implementations
+from sros_tool.runtime.variables import ENCLAVE
+from sros_tool.values import FileChange
+from sros_tool.wording import counted, enumerated, first_few
+
+
+class CommandStep(NamedTuple):
+    """The words of a command line of sros, what it makes, and where its output goes."""
+
+    words: Sequence[str]
+    made: Path | None = None
+    into: Path | None = None
+    guards: bool = False
+    """Whether the later steps are left out if this step finds something."""
+    signs: bool = False
+    """Whether the step changes rights, and says which on standard error."""
+
+    @property
+    def command(self) -> str:
+        """The command line that does the same."""
+        redirected = f" > {shlex.quote(str(self.into))}" if self.into else ""
+        return f"sros {shlex.join(self.words)}{redirected}"
 
 
 def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: bool) -> CloseState:
@@ -47,9 +79,9 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     if robot.export.exists() and robot.observation_file.exists():
         with suppress(SrosError):  # the steps say what is wrong
             denied_before = _denied_access(robot)
-    steps, problems, is_stopped = _do_steps(robot, duration, partial=partial, dry_run=dry_run)
-    changes = [] if dry_run or is_stopped else remove_enclaves(robot)
-    state = current_state(robot, robot.read_policy())._replace(steps=steps, dry_run=dry_run)
+    done, problems, is_stopped = _do_steps(robot, duration, partial=partial, dry_run=dry_run)
+    changes = [] if dry_run or is_stopped else _remove_enclaves(robot)
+    state = current_state(robot, robot.read_policy())._replace(steps=done, dry_run=dry_run)
     if dry_run or is_stopped:
         return state._replace(problems=problems)
     if robot.observed:
@@ -61,7 +93,7 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     changes = [*write_start_files(robot, state), *changes]
     denied = _denied_access(robot)
     newly_denied = [right for right in denied if right not in denied_before]
-    problems += problems_of(robot, state, partial=partial)
+    problems += _problems_of(robot, state, partial=partial)
     if not state.secured:
         _warn_of_rmw(robot, state.observed)
     return state._replace(
@@ -95,10 +127,41 @@ def _do_steps(
             is_stopped = step.guards and state == "findings"
         done.append(CloseStep(step.command, state))
         if step.into == robot.observation_file and not dry_run:
-            shared = [*shared_program_problems(robot)]
-            shared += [] if partial else shared_node_problems(robot)
+            shared = [*_shared_program_problems(robot)]
+            shared += [] if partial else _shared_node_problems(robot)
             problems, is_stopped = [*problems, *shared], bool(shared)
     return done, problems, is_stopped
+
+
+def steps(robot: LocalRobot, duration: str | None) -> Iterator[CommandStep]:
+    """Yield the steps; with a ``duration``, the robot is watched even if it was before.
+
+    The enclaves to export are known when the steps before are done.
+    """
+    policy, keystore, needed = str(robot.policy), str(robot.keystore), str(robot.requirements)
+    domain = ("--domain", str(robot.domain))
+    learn = ["generate_policy", policy, "--enclave-per-node", *domain]
+    learn += ["--watch", duration] if duration else []
+    learn += ["--dry-run"] if robot.policy.exists() else []  # it may have been edited
+    only_errors = ("--fail-on", "error")
+    policies, created = ("-p", policy, str(robot.observer)), ("--template", TEMPLATE)
+    on_zenoh = robot.shell.environment.get(RMW) == RMW_ZENOH
+    watched = robot.policy.exists() and not duration
+    yield CommandStep(
+        (*learn, "--json"), robot.processes_file if watched else None, robot.observation_file
+    )
+    yield CommandStep(("check", policy, "--suggest"), robot.requirements, robot.requirements)
+    yield CommandStep(
+        ("check", policy, "--requirements", needed, *created, *only_errors), guards=True
+    )
+    yield CommandStep(("create_keystore", keystore, *created, *domain), robot.keystore)
+    yield CommandStep(("generate_artifacts", "-k", keystore, *policies), signs=True)
+    if on_zenoh:
+        yield CommandStep(("zenoh", keystore))
+    exported = *_enclaves_to_export(robot), str(robot.export)
+    yield CommandStep(("distribute_key", keystore, *exported, "--force"))
+    yield CommandStep(("check", policy, keystore, "--policy", policy, *only_errors))
+    yield CommandStep(("view", policy, *created, "-o", str(robot.page), "--force"))
 
 
 def _do(robot: LocalRobot, step: CommandStep) -> tuple[str, list[str]]:
@@ -107,9 +170,12 @@ def _do(robot: LocalRobot, step: CommandStep) -> tuple[str, list[str]]:
     Raises:
         SrosError: the robot cannot be watched.
     """
-    if step.into == robot.observation_file:
-        return "done", watch(robot, step)
+    watches = step.into == robot.observation_file
+    if watches:
+        check_watchable(robot)
     robot.shell.say(f"+ {step.command}")
+    if watches:
+        return "done", watch(robot, step.words)
     status, output, messages = robot.shell.run(step.words, bool(step.into))
     if status or (step.guards and output):
         robot.shell.say_lines("" if step.into else f"{output}{messages}")
@@ -137,3 +203,164 @@ def _warn_of_rmw(robot: LocalRobot, observed: ObservedProcesses) -> None:
                 "with it. Before you stop the robot, find an RMW that enforces security: "
                 "sros doctor"
             )
+
+
+def _enclaves_to_export(robot: LocalRobot) -> Sequence[str]:
+    """Return the words that select the enclaves of this machine."""
+    if not robot.not_here:
+        return ("--all",)
+    names = {OBSERVER} | robot.keystore_enclaves() | robot.policy_enclaves()
+    return sorted(names - robot.not_here)
+
+
+def _enclaves_without_origin(robot: LocalRobot) -> list[str]:
+    """Return the enclaves of the export that the keystore does not have any more."""
+    return sorted({*list_enclaves(robot.export)} - {*list_enclaves(robot.keystore)})
+
+
+def _remove_enclaves(robot: LocalRobot) -> list[FileChange]:
+    """Remove from the export enclaves that the keystore revoked, or of other machines."""
+    keystore = OpenedKeystore(robot.keystore)
+    revoked_enclaves = [
+        name for name in _enclaves_without_origin(robot) if revocation_of(keystore, name)
+    ]
+    removed = dict.fromkeys(revoked_enclaves, "its enclave was revoked")
+    for name in robot.not_here.intersection(list_enclaves(robot.export)):
+        if any((enclave_path(robot.keystore, name) / file).exists() for file in KEY_FILES):
+            removed[name] = "its enclave belongs to another machine"
+    with Folder(robot.export) as export:
+        for inside in map(enclave_folder, removed):
+            for entry in (f"{inside}/{name}" for name in export.names(inside)):
+                if not stat.S_ISDIR(export.mode(entry)):
+                    export.unlink(entry)
+        for inside in sorted(map(enclave_folder, removed), reverse=True):  # inner ones first
+            if not export.names(inside):
+                export.rmdir(inside)
+    paths = {str(enclave_path(robot.export, name)): why for name, why in removed.items()}
+    for path, why in paths.items():
+        robot.shell.say(f"removed {path}: {why}")
+    return [FileChange("remove", path) for path in paths]
+
+
+def _problems_of(robot: LocalRobot, state: CloseState, *, partial: bool) -> Iterator[str]:
+    """Yield what keeps the robot from running closed, with what to do."""
+    yield from _keystore_problems(robot)
+    for name in sorted(robot.not_here & state.secured.keys()):
+        yield f"{name} belongs to another machine, and a process runs in it here: stop it"
+    for name in _enclaves_without_origin(robot):
+        remove = f"rm -r {shlex.quote(str(enclave_path(robot.export, name)))}"
+        yield f"the export has {name}, which the keystore neither has nor revoked: {remove}"
+    yield from _user_problems(robot, state.observed)
+    yield from _launch_problems(robot, state.observed)
+    if not partial:
+        yield from _unknown_process_problems(robot, state)
+
+
+def _keystore_problems(robot: LocalRobot) -> Iterator[str]:
+    """Yield the enclaves of the keystore that the policy does not have."""
+    known = {OBSERVER, ROUTER, *robot.not_here, *robot.policy_enclaves()}
+    for name in list_enclaves(robot.keystore):
+        if name not in known:
+            revoke = f"sros revoke {shlex.quote(str(robot.keystore))} {name}"
+            yield (
+                f"the policy does not have {name}, and the keystore does: if nothing needs it "
+                f"any more, {revoke}; if it belongs to another machine, such as a laptop, "
+                f"{robot.close_command} --elsewhere {name}; if it belongs to this machine, sros "
+                f"merge_policy {shlex.quote(str(robot.policy))} ITS_POLICY --in-place"
+            )
+
+
+def _user_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[str]:
+    """Yield the users of processes who cannot read their enclaves."""
+    owner, export = robot.export.stat().st_uid, robot.export.absolute()
+    for user in sorted({process.user for process in observed.processes}):
+        closed = [path for path in export.parents if not _may_enter(user, path.stat())]
+        if closed and user:
+            yield f"user {user}, who runs processes, cannot enter '{closed[-1]}'"
+        if user != owner:
+            yield (
+                f"processes run as user {user}, and only user {owner} can read the enclaves: "
+                f"chown -R {user} {shlex.quote(str(robot.export))}"
+            )
+
+
+def _launch_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[str]:
+    """Yield the processes that `ros2 launch` would not start in their enclaves."""
+    for process in observed.processes:
+        command = process.command
+        if process.launch and not (node_argument(command) or launch_verb(command)):
+            words = run_words(robot.export.absolute(), process.enclave, process.rmw)
+            prefix = f"prefix='{' '.join(words)}'"
+            yield (
+                f"the process of {process.enclave} has no name= in its launch file, and would "
+                f"not start: give it one, or {prefix}"
+            )
+
+
+def _unknown_process_problems(robot: LocalRobot, state: CloseState) -> Iterator[str]:
+    """Yield the processes without known nodes, and the nodes without a known process."""
+    observed, close = state.observed, robot.close_command
+    silent = "they would not be heard any more (accept: --partial)"
+    if observed.unknown:
+        named = first_few(observed.unknown, MOST_NAMES)
+        opened = f"go back by {close} --undo, and " if state.secured else ""
+        yield (
+            f"sros saw no node of {counted(len(observed.unknown), 'process', 'processes')}: "
+            f"{named}; {opened}watch again while they run: {close} --for 1m; "
+            f"otherwise {silent}"
+        )
+    here = {process.enclave: process.pid for process in observed.processes}
+    if twice := sorted(here.keys() & {*observed.elsewhere}):
+        yield (
+            f"nodes of {twice[0]} are in process {here[twice[0]]} and in another one that "
+            "sros does not see: if another robot is in this ROS domain, switch it off, or "
+            "give it a domain of its own, remove the rights that it added to "
+            f"'{robot.policy}', and watch again: {close} --for 1m"
+        )
+    if only_there := [name for name in observed.elsewhere if name not in twice]:
+        named = first_few(only_there, MOST_NAMES)
+        options = " ".join(f"--elsewhere {name}" for name in only_there)
+        yield (
+            f"sros knows no process of this machine for nodes of {named}; if they run on "
+            f"another machine: {close} {options}; otherwise {silent}"
+        )
+
+
+def _shared_program_problems(robot: LocalRobot) -> Iterator[str]:
+    """Yield a text for each program whose processes would all run in one enclave."""
+    observed = robot.processes.within(read_policy(robot.policy))
+    by_program: dict[tuple[str, ...], list[ClosedProcess]] = {}
+    for process in observed.processes:
+        names = sorted({process.enclave, *process.shares})
+        by_program.setdefault(tuple(names), []).append(process)
+    for enclaves, processes in by_program.items():
+        if len(enclaves) > 1 and sum(not process.chooses for process in processes) > 1:
+            yield (
+                f"{shlex.join(processes[0].command)} starts the processes of "
+                f"{enumerated(enclaves)}, and all of them would run in one enclave; nothing "
+                f"was signed; in '{robot.policy}', move their profiles into one of these "
+                "enclaves, which then has the rights of all, and remove the other "
+                "enclaves; or let the program start each process with the method spawn after "
+                f"setting {ENCLAVE} in os.environ, and watch again: "
+                f"{robot.close_command} --for 1m"
+            )
+
+
+def _shared_node_problems(robot: LocalRobot) -> Iterator[str]:
+    """Yield a text for processes with nodes of the same name, which would share an enclave."""
+    by_enclave: dict[str, list[ClosedProcess]] = {}
+    for process in robot.processes.processes:
+        by_enclave.setdefault(process.enclave, []).append(process)
+    for enclave, twins in by_enclave.items():
+        if len({twin.pid for twin in twins}) > 1:
+            commands = [f"process {twin.pid} ({shlex.join(twin.command)})" for twin in twins]
+            yield (
+                f"{enumerated(commands)} call themselves {enclave}, and the enclave of this "
+                "name would have the rights of all; nothing was signed; if one is not of the "
+                f"robot, stop it, remove '{robot.policy}', and watch again: {robot.close_command} "
+                "--for 1m; if all are, accept it: --partial"
+            )
+
+
+def _may_enter(user: int, folder: os.stat_result) -> bool:
+    return bool(folder.st_mode & (stat.S_IXUSR if folder.st_uid == user else 0o011))

@@ -3,24 +3,51 @@
 from __future__ import annotations
 
 import json
+import shlex
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 from sros_tool.checks.keystores.issued import STALE
-from sros_tool.close.nodes import ObservedNodes
-from sros_tool.close.process_proof import CLAIM, proof_of_processes, why_missing
-from sros_tool.close.robot import MOST_NAMES, LocalRobot
-from sros_tool.close.running import RunningRobot
-from sros_tool.close.state import SILENCE, CloseState, Proof, current_state
-from sros_tool.close.talk_proof import proof_of_talk
+from sros_tool.checks.kind import NOTE
+from sros_tool.checks.processes import PROCESS_NOT_SEEN, process_findings
+from sros_tool.close.nodes import ObservedNodes, node_name, ros_use
+from sros_tool.close.processes import ObservedProcesses
+from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot
+from sros_tool.close.state import (
+    SILENCE,
+    TALK,
+    CloseState,
+    Proof,
+    RunningRobot,
+    current_state,
+    keystore_text,
+)
 from sros_tool.errors import UnavailableError
-from sros_tool.graph.observation import Observation
+from sros_tool.explain.audit import DeniedRight
+from sros_tool.graph.learn import is_tool, stable_name
+from sros_tool.graph.observation import (
+    PUBLISH,
+    SUBSCRIBE,
+    Endpoint,
+    Observation,
+    ObservedNode,
+    observation_from_json,
+)
 from sros_tool.keystore.layout import list_enclaves
+from sros_tool.names import expand, is_expression
+from sros_tool.runtime.environment import ROS_ARGS, named_enclave
 from sros_tool.runtime.processes import ProcessTable
-from sros_tool.wording import counted, first_few
+from sros_tool.runtime.variables import ENCLAVE
+from sros_tool.wording import counted, enumerated, first_few
+
+_STARTED = "every process was started in its enclave"
 
 _START_SECONDS = 3.0
 """How long processes that were restarted by hand may take until they run in their enclaves."""
+
+_TRIES = 3
 
 
 def prove(robot: LocalRobot) -> CloseState:
@@ -53,24 +80,24 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     """Wait until each process runs in its enclave, and prove that the robot is closed."""
     expected = {process.enclave for process in state.observed.processes} | {*state.new}
     if not expected:
-        return [Proof(CLAIM, False, "no process of the robot is known")]
+        return [Proof(_STARTED, False, "no process of the robot is known")]
     running = _wait_for(robot, expected, patience)
     missing = sorted(expected - running.current_enclaves)
     running_now = {enclave.name for _, enclave in running.secured}
     needed = {*missing}.difference(robot.without) | running_now.intersection(missing)
     if needed or expected == {*missing}:
         observed = state.observed.with_current_pids(running.processes)
-        return [Proof(CLAIM, False, why_missing(running, sorted(needed) or missing, observed))]
+        return [Proof(_STARTED, False, _why_missing(running, sorted(needed) or missing, observed))]
     nodes, not_here = ObservedNodes(robot), robot.not_here
     # A laptop may be away; a computer whose nodes were seen has to be seen again.
     may_be_away = not_here - {node.enclaves[0] for node in nodes.compared(()).nodes}
     away = {*missing} | may_be_away | not_here.intersection(robot.without)
-    proof = proof_of_processes(running, len(expected) - len(missing))
+    proof = _proof_of_processes(running, len(expected) - len(missing))
     absence = "not seen" if running.processes.unseen or running.processes.hidden else "not running"
     for label, names in ((absence, missing), ("of other machines", sorted(not_here))):
         if names:
             proof = proof._replace(reason=f"{proof.reason}; {label}: {', '.join(names)}")
-    talk = proof_of_talk(running, nodes, away)
+    talk = _proof_of_talk(running, nodes, away)
     if talk.fails and (present := sorted(not_here - away)):
         options = " ".join(f"--without {name}" for name in present)
         talk = talk._replace(reason=f"{talk.reason}; if they may be away, add {options}")
@@ -130,3 +157,269 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
         return Proof(SILENCE, None, "nor does the observer in its enclave see the robot now")
     number = counted(len(before.nodes), "node")
     return Proof(SILENCE, True, f"the observer that saw {number} before sees none")
+
+
+def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
+    """Look for processes that are open, or that something is wrong with."""
+    robot = running.robot
+    robot.shell.say(
+        f'$ eval "$(sros env {shlex.quote(str(robot.export))} {OBSERVER})"; sros check runtime'
+    )
+    # This shell starts no node.
+    here = {**robot.shell.environment, **robot.variables(OBSERVER), ENCLAVE: ""}
+    near = tuple(running.in_domain)
+    others = [process for process in running.processes.processes if process not in near]
+    examined, now = replace(running.processes, processes=near), robot.shell.now()
+    findings = [
+        finding
+        for finding in process_findings(here, examined, now=now, zone=robot.shell.zone)
+        if finding.severity > NOTE
+    ]
+    closed = {tuple(process.command): process.enclave for process in robot.processes.processes}
+    other_remedies = {
+        process.label: f"Stop it: another process runs in {closed[process.program[1]]}."
+        for process in near
+        if not process.asks_for_security
+        and closed.get(process.program[1]) in running.current_enclaves
+    }
+    for finding in findings:
+        remedy = other_remedies.get(finding.subject, finding.remedy)
+        robot.shell.say(f"{finding.subject}: {finding.text}. {remedy}")
+    wrong = [finding for finding in findings if finding.id != PROCESS_NOT_SEEN.id]
+    if findings:
+        first = (wrong or findings)[0]
+        return Proof(_STARTED, False if wrong else None, f"{first.subject}: {first.text}")
+    known_pids = {process.pid for process, _ in running.secured}
+    guests = [
+        f"; {process.label} runs in {process.enclave.name} with the files of "
+        f"'{keystore_text(process.enclave)}'"
+        for process in near
+        if process.enclave and process.pid not in known_pids and not process.is_daemon
+    ]
+    guests += [
+        f"; {process.label} runs open in domain {process.domain}"
+        for process in others
+        if not (process.enclave or process.network or process.is_daemon)
+    ]
+    summary = f"{counted(number, 'enclave')}, and no open process in domain {robot.domain}"
+    return Proof(_STARTED, True, f"{summary}{''.join(guests)}")
+
+
+def _why_missing(running: RunningRobot, missing: Sequence[str], observed: ObservedProcesses) -> str:
+    """Return which enclaves have no process, or an open one, and what the others lack."""
+    robot = running.robot
+    wrong = {
+        enclave.name: (process, running.why_not_current(process, enclave))
+        for process, enclave in running.secured
+        if enclave.name in missing
+    }
+    are_open = {process.enclave: process.pid for process in observed.processes if process.pid}
+    absent = [name for name in missing if name not in wrong]
+    others = {name: f"stop process {pid}, which is open" for name, pid in are_open.items()}
+    others |= {
+        enclave.name: f"{process.label} has the files of '{keystore_text(enclave)}'"
+        for process in running.in_domain
+        if (enclave := process.enclave)
+    }
+    named = ", ".join(f"{name} ({others[name]})" if name in others else name for name in absent)
+    reasons = [
+        f"no secured process of {named}; start it as {robot.commands_file} says; "
+        f"if it ended: sros explain {shlex.quote(str(robot.export))} --log ITS_LOG"
+    ] * bool(absent)
+    if may_end := [name for name in absent if name not in {*are_open, *robot.without}]:
+        options = " ".join(f"--without {name}" for name in may_end)
+        reasons.append(f"if it does not always run, add {options}")
+    if absent and (in_others := running.in_other_domains()):
+        reasons.append(in_others)
+    for why in dict.fromkeys(why for _, why in wrong.values()):
+        named = ", ".join(
+            f"{name} (process {wrong[name][0].pid})"
+            for name in missing
+            if name in wrong and wrong[name][1] == why
+        )
+        reasons.append(f"{why} the processes of {named}; restart them")
+    return "; ".join(reasons)
+
+
+def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection[str]) -> Proof:
+    """Compare what an observer in an enclave sees now with what was seen before.
+
+    Processes of the enclaves ``away`` do not run; ``running`` are the processes of the other
+    enclaves at the beginning of the proof.
+    """
+    words = ["audit", str(running.robot.rights_source), "--keystore", str(running.robot.export)]
+    words += ["--enclave", OBSERVER, "--domain", str(running.robot.domain), "--json"]
+    words += ["--partial"] * bool(away)
+    for _ in range(_TRIES):  # nodes may still be starting
+        try:
+            status, audited = running.robot.shell.read_json(words)
+        except UnavailableError as error:
+            return Proof(TALK, None, f"{error}{_renamed_text(nodes, None, fails=False)}")
+        now = observation_from_json(audited)
+        denied = nodes.denied_rights(nodes.expected(now))
+        differences = {
+            **_differences_of_audit(running, audited, away),
+            "gone": _lost_endpoints(nodes.compared(away, now), now, denied),
+            "left alone": _abandoned_names(
+                nodes.compared(away, now), nodes.expected(now), nodes.moved_endpoints(now), denied
+            ),
+            "not judged": audited["unjudged"],
+            "not done": ["the ROS graph kept changing"] if status else [],
+        }
+        reason = next(
+            (f"{why}: {first_few(names, 3)}" for why, names in differences.items() if names), ""
+        )
+        if not reason:
+            summary = _comparison_text(nodes, now, away, denied)
+            return Proof(TALK, True, f"{summary}{_renamed_text(nodes, now, fails=False)}")
+    return Proof(TALK, False, f"{reason}{_renamed_text(nodes, now, fails=True)}")
+
+
+def _differences_of_audit(
+    running: RunningRobot, audited: Mapping[str, Any], away: Collection[str]
+) -> Mapping[str, Sequence[str]]:
+    """Return what the observer's audit finds: denied rights, refused enclaves, unseen nodes."""
+    ended = _ended_since(running)
+    unseen = [node for node in audited["unseen"] if node["enclave"] not in away]
+    return {
+        "denied": [
+            f"{right['enclave']} {right['right']} {right['name']}: {right['reason']}"
+            for right in audited["denied"]
+        ],
+        "refused": [refused["enclave"] for refused in audited["refused"]],
+        "ended while the proof ran": [
+            f"{node['node'] or node['enclave']} ({ended[node['enclave']]}; start it again, "
+            f"or, if it does not always run, add --without {node['enclave']})"
+            for node in unseen
+            if node["enclave"] in ended
+        ],
+        "not seen": [_unseen_text(running, node["node"], node["enclave"]) for node in unseen],
+    }
+
+
+def _comparison_text(
+    nodes: ObservedNodes, now: Observation, away: Collection[str], denied: Sequence[DeniedRight]
+) -> str:
+    """Return what was compared, what the policy denies now, and which nodes are new, as text."""
+    before = nodes.compared(away)
+    number = counted(len(before.nodes), "node")
+    text = f"{number} with {before.endpoint_count} endpoints as before"
+    text += f", without {', '.join(sorted(away))}" if away else ""
+    if denied:
+        text += f", but for {counted(len(denied), 'right')} that the policy denies now: "
+        text += ", ".join(f"{right.right.enclave} {right.right.describe()}" for right in denied)
+    known = {*map(node_name, before.nodes)}
+    _, without_profile = nodes.divide_by_profile(now.nodes)
+    new = sorted(
+        f"{node_name(node)} in {' or '.join(node.enclaves) or 'no enclave'}"
+        for node in without_profile
+        if node_name(node) not in known and not is_tool(node)
+    )
+    return text + (f"; new, without a profile: {first_few(new, MOST_NAMES)}" if new else "")
+
+
+def _renamed_text(nodes: ObservedNodes, now: Observation | None, *, fails: bool) -> str:
+    """Return which nodes were compared under new names, and which ones not at all, as text."""
+    renamed, text = nodes.renamed, ""
+    if renamed:
+        names = [f"{old} as {expand('~', *renamed[old])}" for old in sorted(renamed)]
+        text = f"; compared under a new name: {first_few(names, MOST_NAMES)}"
+        pairs = nodes.moved_endpoints(now)
+        topics = sorted({(ros_use(old)[1], ros_use(new)[1]) for old, new in pairs})
+        private = tuple(f"{name}/" for name in renamed)
+        if moved := [f"{old} as {new}" for old, new in topics if not old.startswith(private)]:
+            text += f", with {enumerated(moved)} (a name that does not move: write it absolute)"
+        if fails:
+            text += " (if it is another node, remove what it does not use from its profile)"
+    _, without_profile = nodes.divide_by_profile(nodes.as_observed)
+    not_compared = {
+        node_name(node) for node in without_profile if not is_tool(node)
+    } - renamed.keys()
+    if not_compared and not fails:
+        close = nodes.robot.close_command
+        text += (
+            "; not compared, as the policy has no profile for them any more: "
+            f"{first_few(sorted(not_compared), MOST_NAMES)} (if they have new names, they are "
+            f"compared once the open robot was watched again: {close} --undo, {close} --for 1m)"
+        )
+    return text
+
+
+def _ended_since(running: RunningRobot) -> dict[str, str]:
+    """Map enclaves to their processes that were ``running`` and have ended."""
+    pids = {process.pid for process in RunningRobot(running.robot).processes.processes}
+    return {
+        enclave.name: process.label
+        for process, enclave in running.secured
+        if process.pid not in pids
+    }
+
+
+def _unseen_text(running: RunningRobot, node: str, enclave: str) -> str:
+    """Return a node that an enclave has a profile for, and what to do if it does not exist."""
+    for process, running_in in running.secured:
+        if (
+            running_in.name == enclave
+            and process.is_zenoh
+            and named_enclave(process.command) != enclave
+        ):
+            return (
+                f"{node or f'any node in {enclave}'} (start {process.label} with `{ROS_ARGS} "
+                f"--enclave {enclave}` at its end: on Zenoh, others do not see it otherwise)"
+            )
+    if not node or is_expression(node):
+        return f"any node in {enclave}"
+    return f"{node} (if it is gone for good, remove its profile from '{running.robot.policy}')"
+
+
+def _lost_endpoints(
+    before: Observation, now: Observation, denied: Iterable[DeniedRight]
+) -> list[str]:
+    """Return the endpoints, as text, that nodes had before and lack now, unless ``denied``."""
+    expected = {*_endpoints_of(before.nodes)} - _denied_endpoints(denied)
+    lost: dict[str, list[str]] = {}
+    gone = expected - {*_endpoints_of(now.nodes)}
+    for node, right, name in sorted({(node, *ros_use(endpoint)) for node, endpoint in gone}):
+        lost.setdefault(f"{node} {right}", []).append(name)
+    return [f"{uses} {first_few(names, MOST_NAMES)}" for uses, names in lost.items()]
+
+
+def _abandoned_names(
+    before: Observation,
+    expected: Observation,
+    moved: Collection[tuple[Endpoint, Endpoint]],
+    denied: Iterable[DeniedRight],
+) -> list[str]:
+    """Return clauses on names that nodes still use, though all peers ``moved`` to another name.
+
+    ``before`` are the nodes to compare, a part of the nodes ``expected`` now; ``denied`` endpoints
+    are left out.
+    """
+    refused = _denied_endpoints(denied)
+    robot_nodes = [node for node in expected.nodes if not is_tool(node)]
+    kept = {endpoint for _, endpoint in {*_endpoints_of(robot_nodes)} - refused}
+    used = {*_endpoints_of(node for node in before.nodes if not is_tool(node))} - refused
+    other = {PUBLISH: SUBSCRIBE, SUBSCRIBE: PUBLISH}
+    new_names = {
+        old._replace(direction=other[old.direction]): ros_use(new)[1]
+        for old, new in moved
+        if old not in kept
+    }
+    alone = {(node, *ros_use(end), new_names[end]) for node, end in used if end in new_names}
+    return [
+        f"{node} {right} {name}, which is {new} now" for node, right, name, new in sorted(alone)
+    ]
+
+
+def _denied_endpoints(denied: Iterable[DeniedRight]) -> set[tuple[str, Endpoint]]:
+    """Return the denied endpoints, with the names of their nodes."""
+    return {
+        (node, endpoint) for right in denied for node in right.nodes for endpoint in right.endpoints
+    }
+
+
+def _endpoints_of(nodes: Iterable[ObservedNode]) -> Iterator[tuple[str, Endpoint]]:
+    """Yield node name and endpoint, with ``*`` for the parts that change with every start."""
+    for node in nodes:
+        for topic, way in node.endpoints:
+            yield node_name(node), Endpoint(topic.replace(node.name, stable_name(node.name)), way)

@@ -6,12 +6,7 @@ import shlex
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from sros_tool.close.drop_ins import DROP_IN, drop_in_heading
-from sros_tool.close.processes import (
-    COMPOSE_FILE,
-    ClosedProcess,
-    launch_words,
-)
+from sros_tool.close.processes import COMPOSE_FILE, ClosedProcess, launch_words
 from sros_tool.close.robot import LocalRobot
 from sros_tool.close.state import CloseState
 from sros_tool.files import remove_file
@@ -27,6 +22,8 @@ from sros_tool.runtime.units import unit_changes, unit_instance, unit_words, wri
 from sros_tool.runtime.variables import KEYSTORE
 from sros_tool.values import FileChange
 from sros_tool.xml import read_bytes
+
+DROP_IN = "sros-close.conf"
 
 
 def write_start_files(robot: LocalRobot, state: CloseState) -> list[FileChange]:
@@ -78,6 +75,11 @@ def write_start_files(robot: LocalRobot, state: CloseState) -> list[FileChange]:
         remove_file(path)
         robot.shell.say(f"removed {path}: it was for an enclave without a known process")
     return [*written, *(FileChange("remove", str(path)) for path in unneeded)]
+
+
+def drop_in_heading(robot: LocalRobot) -> str:
+    """Return the first line of each drop-in that is made for this folder."""
+    return f"# Made by `sros close {robot.folder.absolute()}`; undone by its --undo.\n"
 
 
 def _command_lines(robot: LocalRobot, state: CloseState) -> list[str]:

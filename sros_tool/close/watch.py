@@ -15,12 +15,10 @@ from sros_tool.close.assignment import (
     process_ids_of_cyclone,
     with_command_of_unit,
 )
-from sros_tool.close.endpoints import node_name
-from sros_tool.close.nodes import ObservedNodes
+from sros_tool.close.nodes import ObservedNodes, node_name
 from sros_tool.close.processes import ObservedProcesses
 from sros_tool.close.robot import MOST_NAMES, LocalRobot
-from sros_tool.close.running import RunningRobot
-from sros_tool.close.steps import CommandStep
+from sros_tool.close.state import RunningRobot
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.explain.explanation import likely_meaning
 from sros_tool.files import policies_dir, remove_file, replace_file
@@ -48,31 +46,7 @@ _StartedProcesses = dict[tuple[str, ...], tuple[Process, ProcessOrigin]]
 """Processes by their commands, with what started them."""
 
 
-def watch(robot: LocalRobot, step: CommandStep) -> list[str]:
-    """Watch the robot by a step, and write its nodes and processes into the folder.
-
-    Return, as sentences, which nodes have no enclave, and which of the observed rights an earlier
-    policy lacks.
-
-    Raises:
-        SrosError: the robot cannot be watched.
-    """
-    _check_open(robot)
-    robot.shell.say(f"+ {step.command}")
-    started: _StartedProcesses = {}
-    with _looking(robot, started):
-        status, output, _ = robot.shell.run(step.words, True)
-    if status:
-        others = RunningRobot(robot).in_other_domains()
-        raise UnavailableError(
-            f"there is no robot to close: no node was observed in domain {robot.domain}",
-            f"{others}." if others else "",
-            f"{'Otherwise start' if others else 'Start'} the robot open, and run this again.",
-        )
-    return _remember(robot, output, started)
-
-
-def _check_open(robot: LocalRobot) -> None:
+def check_watchable(robot: LocalRobot) -> None:
     """Raise `SrosError` if the robot cannot be watched as an open one."""
     robot.shell.check_open()
     rmw = robot.shell.environment.get(RMW)
@@ -91,6 +65,28 @@ def _check_open(robot: LocalRobot) -> None:
                 "",
                 f"Run `export {RMW}={RMW_ZENOH}`, and this command again.",
             )
+
+
+def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
+    """Watch the robot by a verb, and write its nodes and processes into the folder.
+
+    Return, as sentences, which nodes have no enclave, and which of the observed rights an earlier
+    policy lacks.
+
+    Raises:
+        SrosError: no node was observed.
+    """
+    started: _StartedProcesses = {}
+    with _looking(robot, started):
+        status, output, _ = robot.shell.run(words, True)
+    if status:
+        others = RunningRobot(robot).in_other_domains()
+        raise UnavailableError(
+            f"there is no robot to close: no node was observed in domain {robot.domain}",
+            f"{others}." if others else "",
+            f"{'Otherwise start' if others else 'Start'} the robot open, and run this again.",
+        )
+    return _remember(robot, output, started)
 
 
 @contextmanager

@@ -17,20 +17,11 @@ import pytest
 import yaml
 
 from sros_tool.cli import close
-from sros_tool.close import (
-    apply,
-    assignment,
-    drop_ins,
-    nodes,
-    proof,
-    running,
-    talk_proof,
-    watch,
-)
+from sros_tool.close import apply, assignment, nodes, proof, state, watch
 from sros_tool.close.assignment import with_command_of_unit
+from sros_tool.close.preparation import steps
 from sros_tool.close.processes import ClosedProcess, ObservedProcesses
 from sros_tool.close.robot import LocalRobot, Shell
-from sros_tool.close.steps import steps
 from sros_tool.explain.audit import audit
 from sros_tool.graph import observe
 from sros_tool.keystore.layout import list_enclaves
@@ -50,8 +41,8 @@ from sros_tool.runtime.processes import (
 )
 from sros_tool.values import as_plain
 from tests.cli.test_json import Seen
-from tests.close.test_origins import made_up
 from tests.graph.fake_graph import Beside, graph
+from tests.runtime.test_origins import made_up
 from tests.support.harness import Ended, snapshot, sros
 from tests.support.long_form import some, sometimes
 
@@ -171,7 +162,7 @@ class Robot:
 def find_origins(
     monkeypatch: pytest.MonkeyPatch, process_origin: Callable[[int], ProcessOrigin]
 ) -> None:
-    for module in (assignment, running, watch):
+    for module in (assignment, state, watch):
         monkeypatch.setattr(module, "process_origin", process_origin)
 
 
@@ -189,11 +180,10 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
             robot.units.get(units.get(pid, ""), ""), "/opt", robot.launch, robot.container
         ),
     )
-    for module in (apply, drop_ins):
-        monkeypatch.setattr(module, "SYSTEMD", tmp_path / "systemd")
+    monkeypatch.setattr(apply, "_SYSTEMD", tmp_path / "systemd")
     monkeypatch.setattr(apply, "_RESTART_SECONDS", 0.1)
     monkeypatch.setattr(proof, "_START_SECONDS", 0.1)
-    monkeypatch.setattr(talk_proof, "_TRIES", 1)
+    monkeypatch.setattr(proof, "_TRIES", 1)
     for name in ("ROS_DOMAIN_ID", "RMW_IMPLEMENTATION", "ROS_SECURITY_ENABLE"):
         monkeypatch.delenv(name, raising=False)
     (tmp_path / "systemd").mkdir()
@@ -740,7 +730,7 @@ def test_a_watch_that_is_interrupted_keeps_nodes_and_processes_of_one_time(
     assert [file.read_bytes() for file in files] == before
 
 
-@pytest.mark.parametrize("function", some(["write_units", "restart_units"], 1))
+@pytest.mark.parametrize("function", some(["write_units", "_restart_units"], 1))
 def test_applying_that_is_interrupted_goes_on_or_back(
     robot: Robot, monkeypatch: pytest.MonkeyPatch, function: str
 ) -> None:

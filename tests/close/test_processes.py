@@ -7,18 +7,11 @@ import subprocess
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
-from sros_tool.close import (
-    talk_proof,
-    watch,
-)
 from sros_tool.close.processes import ClosedProcess, ObservedProcesses
 from sros_tool.policy.model import Policy
 from sros_tool.runtime.processes import (
     Process,
-    ProcessEnclave,
     ProcessOrigin,
     RunningProcesses,
     UnseenProcess,
@@ -82,20 +75,3 @@ def test_commands_name_the_rmw_and_on_zenoh_the_enclave() -> None:
     assert talker.open_command(7) == in_domain
     observed = ObservedProcesses(7, [talker])
     assert observed.command_of_new(Path("export"), "/horn") == f"{run.format('/horn')} COMMAND"
-    variables = {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}
-    process = Process(1, ("python3", "talk"), variables, datetime.now(UTC))
-    now: Any = SimpleNamespace(secured=[(process, ProcessEnclave("/export", "/talker"))])
-    unseen = talk_proof.unseen_text(now, "/talker", "/talker")
-    assert "start process 1 (talk) with `--ros-args --enclave /talker` at its end" in unseen
-
-
-def test_variables_that_a_command_does_not_set_are_named() -> None:
-    variables = {"HOME": "/", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp", "GAIN": "2"}
-    talker = Process(1, ("talk",), variables, datetime.now(UTC))
-    closed = ClosedProcess.from_process(talker, "/talker", ProcessOrigin("", "/opt"), "program")
-    shown: list[str] = []
-    shell = SimpleNamespace(environment={"HOME": "/root"}, say=shown.append)
-    robot: Any = SimpleNamespace(shell=shell, commands_file="commands.txt")
-    now: Any = SimpleNamespace(processes=RunningProcesses((talker,)))
-    watch._say_variables(robot, ObservedProcesses(0, [closed]), now)
-    assert len(shown) == 1 and shown[0].endswith("its command in commands.txt does not set: GAIN")

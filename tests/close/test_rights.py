@@ -1,10 +1,10 @@
-"""Who may do what, as `sros close` shows it."""
+"""Who may do what by the policy of a closed robot, as `sros close` shows it."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from sros_tool.close.access import access_lines
+from sros_tool.close.rights import access_lines
 from sros_tool.policy.document import read_policy
 from tests.support.harness import policy_text, publish, subscribe
 

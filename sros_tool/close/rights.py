@@ -1,15 +1,24 @@
-"""Who may do what by the policy of a robot, as lines for people."""
+"""The rights of a closed robot: who may do what, and the requirements that more rights break."""
 
 from __future__ import annotations
 
+from datetime import datetime
 from pathlib import Path
 
-from sros_tool.close.robot import MOST_NAMES
+from sros_tool.close.robot import MOST_NAMES, REQUIREMENTS, TEMPLATE
+from sros_tool.errors import SrosError
 from sros_tool.files import policies_dir
 from sros_tool.graph.learn import common_parts
+from sros_tool.keystore.layout import CLOSED_POLICY
+from sros_tool.keystore.template import load_template
 from sros_tool.names import is_expression
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.merge import merge_into
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy
 from sros_tool.policy.rights import Right, Rules, policy_rights
+from sros_tool.proof.findings import decide_all
+from sros_tool.proof.requirements import Requirement, read_requirements
+from sros_tool.proof.system import policy_system
 from sros_tool.wording import counted, first_few
 
 _NODE_PARTS = ("common/node.xml", "common/rclcpp_node.xml", "common/rclpy_node.xml")
@@ -64,3 +73,28 @@ def access_lines(policy: Policy, folder: Path) -> list[str]:
     ]
     more = len(lines) - _MOST_LINES
     return [*lines[:_MOST_LINES], *([f"and {counted(more, 'more name')}"] if more > 0 else [])]
+
+
+def requirements_broken_by(robot: Path, addition: str, moment: datetime) -> list[Requirement]:
+    """Return the requirements in the folder of a closed robot that more rights would break.
+
+    ``addition`` is the policy document with these rights.  None if the folder has no requirements,
+    or the policy with the addition cannot be decided.
+    """
+    file, path = robot / REQUIREMENTS, robot / CLOSED_POLICY
+    if not file.exists():
+        return []
+    try:
+        needed, template = read_requirements(file), load_template(TEMPLATE)
+        merged = merge_into(path, read_policy(path, addition.encode())).document
+
+        def broken_requirements(policy: Policy) -> dict[Requirement, None]:
+            decided = decide_all(needed, policy_system(policy, moment=moment, template=template))
+            return dict.fromkeys(violation.requirement for violation in decided.violations)
+
+        if after := broken_requirements(read_policy(path, merged)):
+            before = broken_requirements(read_policy(path))
+            return [requirement for requirement in after if requirement not in before]
+    except SrosError:
+        pass
+    return []
