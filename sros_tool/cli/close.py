@@ -142,8 +142,8 @@ def close(
         raise UsageError(
             "--elsewhere changes the export",
             "",
-            f"Run `sros close {shlex.quote(str(folder))} --elsewhere {elsewhere[0]}` first: it is "
-            "remembered.",
+            f"Run `sros close {shlex.quote(str(folder))} --elsewhere {elsewhere[0]}` first; the "
+            "folder remembers it.",
         )
     shell = Shell(_run, lambda line: echo(line, err=True), os.environ, now, local_zone(os.environ))
     robot = LocalRobot(folder, domain_of(domain_text), shell, without, elsewhere)

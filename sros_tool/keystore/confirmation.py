@@ -648,7 +648,7 @@ def _message_from(value: Any, label: str) -> LastMessage:
     sequence = _sequence_from(value["sequence"], label)
     boots, alternated = value.get("boots", []), value.get("alternated")
     if not isinstance(boots, list) or not all(map(_is_digest, boots)):
-        raise _invalid_confirmation_error(label, "the boots of its message are not SHA-256 digests")
+        raise _invalid_confirmation_error(label, '"boots" of its message are not SHA-256 digests')
     return LastMessage(
         sequence,
         value["sha256"],

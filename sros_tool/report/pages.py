@@ -267,7 +267,7 @@ def _demo_head(result: Json, made: str) -> str:
         (
             ("good" if good == len(rows) else "") if result["as_expected"] else "error",
             f"{good} of {len(rows)}",
-            "attempts ended as they should",
+            "attempts ended as expected",
         ),
         ("", str(sum(bool(row.get("defence_removed")) for row in rows)), "with a defence removed"),
         ("warning" if opened else "", str(opened), "known to be open"),
@@ -283,7 +283,7 @@ def _demo_head(result: Json, made: str) -> str:
     )
     why = f"Why {result['backend']}: {result['why']}" if result["why"] else ""
     return (
-        f"<header><h1>sros demo: {good} of {len(rows)} attempts ended as they should</h1>"
+        f"<header><h1>sros demo: {good} of {len(rows)} attempts ended as expected</h1>"
         f"<p>On a real middleware: {', '.join(facts)}. {_sentence(made)}</p>"
         f'<ul class="tiles">{shown}</ul><p class="soft">{_sentence(why)}</p></header>'
     )
@@ -339,7 +339,7 @@ def _demo_scenario(scenario: Json, *, is_only: bool) -> str:
     is_good = good == len(rows) and not not_tried
     kind = ("good" if is_good and rows else "") if scenario["as_expected"] else "error"
     summary = f'<h2>{escape(scenario["title"])}</h2> <span class="chip {kind}">{good} of '
-    summary += f"{len(rows)} as they should</span>"
+    summary += f"{len(rows)} as expected</span>"
     summary += f' <span class="chip warning">{opened} open</span>' if opened else ""
     is_open = " open" if (is_only and len(rows) <= _MOST_OPEN_ROWS) or not is_good else ""
     parts = [f'<section><details class="scenario"{is_open}><summary>{summary}</summary>']

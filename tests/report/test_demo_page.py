@@ -69,10 +69,10 @@ def test_what_was_not_tried_is_said_and_nothing_of_it_is_green() -> None:
     for scenario in page.cssselect("details.scenario"):
         assert "open" in scenario.attrib
         (summary,) = scenario.cssselect("summary")[:1]
-        assert summary.text_content() == "every way in 1 of 2 as they should"
+        assert summary.text_content() == "every way in 1 of 2 as expected"
         assert not summary.cssselect(".good")
     tiles = {tile.text_content(): tile.get("class", "") for tile in page.cssselect("li.tile")}
-    assert "good" not in tiles["1 of 2 attempts ended as they should"]
+    assert "good" not in tiles["1 of 2 attempts ended as expected"]
     assert {"1 skipped", "3 left out", "4 not tried, but needed for a proof"} <= set(tiles)
     text = page.text_content()
     assert f"Not tried, and needed for a proof: a; {HOSTILE[0]}." in text
@@ -127,9 +127,9 @@ def test_scenarios_are_folded_unless_something_needs_a_look() -> None:
         for scenario in page.cssselect("details.scenario")
     ]
     assert summaries == [
-        (False, ["1 of 1 as they should"]),
-        (False, ["2 of 2 as they should", "1 open"]),
-        (True, ["1 of 2 as they should"]),
+        (False, ["1 of 1 as expected"]),
+        (False, ["2 of 2 as expected", "1 open"]),
+        (True, ["1 of 2 as expected"]),
     ]
 
 
