@@ -12,7 +12,7 @@ from sros_tool.dds.decision.grants import other_fitting_enclaves
 from sros_tool.dds.decision.vendors import CYCLONE_DDS, TESTED
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
-from sros_tool.errors import KeystoreError, Note
+from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.explain.answer import Question, about_action, ask
 from sros_tool.explain.asking import taken_for_action
 from sros_tool.faults import REFUSE_STRANGERS
@@ -359,9 +359,12 @@ def _fitting_holders(source: RightsSource, enclave: str) -> list[str]:
         if name != enclave and parts <= {*name.split("/")}
     }
     file = enclave_path(source.path, enclave) / CERTIFICATE_FILE
-    if not granted or not file.exists():
+    if not granted:
         return []
-    certificate = load_certificate(read_bytes(file, "certificate"), f"'{file}'")
+    try:
+        certificate = load_certificate(read_bytes(file, "certificate"), f"'{file}'")
+    except SrosError:  # no process can run with it
+        return []
     certified = {enclave: subject_text(certificate.subject)}
     fitting = (other_fitting_enclaves(v.traits, certified, granted) for v in CYCLONE_DDS)
     return sorted({holder for of in fitting for holder in of.get(enclave, ())})

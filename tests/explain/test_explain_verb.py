@@ -599,6 +599,9 @@ def test_permissions_of_another_enclave_that_fit_are_said(tmp_path: Path) -> Non
             assert ("with the permissions of /robot/mux, which are not" in single.err) is fits
         reach = explain(keystore, "--reach", "/mux").ok().err
         assert ("can also use the permissions of /robot/mux" in reach) is (template == "sros2")
+        (keystore / "enclaves/mux/cert.pem").write_text("broken")
+        reach = explain(keystore, "--reach", "/mux").ok().err
+        assert "the permissions of /robot/mux" not in reach  # no process can run as /mux
 
 
 def test_a_name_that_is_an_action_is_asked_about_as_one_of_everybody(fibonacci: Path) -> None:
