@@ -391,7 +391,7 @@ def _has_one_name(state: os.stat_result) -> bool:
 
 
 def make_folders(path: Path) -> list[Path]:
-    """Make the folder at ``path`` and those above it; return those that were missing, inner first.
+    """Make the folder at ``path`` and its parents; return the folders that were made, inner first.
 
     Raises:
         OSError: one of them cannot be made; nothing is left of the others.

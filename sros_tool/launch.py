@@ -161,7 +161,7 @@ class SecuredOption:
         )
 
     def prestart(self, args: Namespace) -> None:
-        """Raise `RuntimeError` if a prefix of the command line would replace that of sros."""
+        """Raise `RuntimeError` if a prefix of the command line would replace the prefix of sros."""
         if args.secured and (args.launch_prefix or args.launch_prefix_filter):
             raise RuntimeError("--secured cannot be used with --launch-prefix.")
 

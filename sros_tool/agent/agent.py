@@ -102,7 +102,7 @@ _REPLACED_FOR = timedelta(days=30)
 less.
 """
 _REPAIRED_FOR = timedelta(days=1)
-"""How long the agent reports that it replaced files which were not those of the release."""
+"""How long the agent reports that it replaced files which differed from the release."""
 _BRING_KEY = (
     " A release has no keys: bring the key as for the first time, with `sros distribute_key "
     "KEYSTORE --robot {} DIR --force` in the keystore."
@@ -523,7 +523,7 @@ class _Round:
         ]
 
     def _look_after(self, restarted: Sequence[str], names: Iterable[str]) -> EnclaveProcesses:
-        """Examine the processes until those of restarted units have loaded their new files."""
+        """Examine the processes until the processes of restarted units have loaded new files."""
         end = time.monotonic() + self._machine.patience
         while True:
             processes = self._look(names)

@@ -127,4 +127,4 @@ ALL = (
     *(OPENS, CLOSES, REFUSED, ACCEPTED, NO_NODE, BUFFERS, ZENOH, VULNERABILITIES),
     *(NOT_MEASURED, DIFFER, DISTRIBUTION_REFUSES),
 )
-"""All kinds of this module, those of an update first."""
+"""All kinds of this module, the kinds about an update first."""

@@ -188,7 +188,7 @@ advisories_option = click.option(
 
 
 def advisories_of(file: Path | None) -> tuple[Advisory, ...] | None:
-    """Return the advisories of sros with those of --advisories; None without the option.
+    """Return the shipped advisories and the advisories in a file; None without --advisories.
 
     Prints a note on versions in the file that cannot be read.
     """

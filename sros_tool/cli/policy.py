@@ -182,7 +182,7 @@ def merge_policy(
 
 _MOST_ADDED = 20
 _MOST_OF_ENCLAVE = 2
-"""Numbers of rights that a merge lists: up to the first all of them, else so many per enclave."""
+"""A merge lists all rights up to the first number, else so many rights of each enclave."""
 
 
 def _print_added(merged: Merged) -> None:

@@ -41,7 +41,7 @@ def assign(
     process_ids: Mapping[str, int] | None = None,
     origins: Mapping[int, ProcessOrigin] | None = None,
 ) -> ObservedProcesses:
-    """Return the enclave of each process, by the nodes that the graph shows of it.
+    """Return the enclave of each process, by the nodes of the process in the graph.
 
     Processes of other domains or networks are left out.  ``process_ids`` maps participants of
     Cyclone DDS to the process ids that they state; ``origins`` has what started each process, and

@@ -102,7 +102,7 @@ def _provenance(enclave: LoadedEnclave, recorded: str) -> Provenance | None:
 
 
 def _has_rules_of_policy(enclave: LoadedEnclave) -> bool:
-    """Return whether the rules of the grant that DDS reads are those of the policy."""
+    """Return whether the grant that DDS reads has the rules that the policy states."""
     from sros_tool.translate import permissions_for
 
     assert enclave.policy
@@ -237,7 +237,7 @@ def _is_rotating(keystore: Path) -> bool:
 
 
 def _is_latest(keystore: Path, enclave: str) -> bool:
-    """Return whether an enclave's permissions are those that were signed last, by the ledger."""
+    """Return whether an enclave has the permissions that, by the ledger, were signed last."""
     from sros_tool.keystore.reader import OpenedKeystore
 
     try:

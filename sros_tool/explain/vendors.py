@@ -698,7 +698,7 @@ class VendorOfKeystore(NamedTuple):
         return tuple(o for o in self._with_holders(outcomes) if o.enclave in asked)
 
     def _with_holders(self, outcomes: Sequence[VendorOutcome]) -> tuple[VendorOutcome, ...]:
-        """Return denials with the allowed enclaves whose permissions the denied ones can use."""
+        """Return outcomes, in which a denial names allowed enclaves whose permissions also fit."""
         certified = {o.enclave: o.subject for o in outcomes if o.subject and not o.allowed}
         granted = {o.enclave: [o.granted] for o in outcomes if o.granted and o.allowed}
         vendors = {self.vendor, *(self.stated(o.enclave) or self.vendor for o in outcomes)}

@@ -600,7 +600,7 @@ class ZenohEvaluator:
             return False
 
     def unsigned_files(self, *zenoh_files: ZenohFile) -> tuple[str, ...]:
-        """Return those of the files, and of the routers' files, that no permissions CA signed."""
+        """Return the files, and the files of the routers, that no permissions CA has signed."""
         return tuple(
             f"{file.enclave}/{file.file}"
             for file in dict.fromkeys((*zenoh_files, *self.routers.values()))

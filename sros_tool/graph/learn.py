@@ -330,7 +330,7 @@ def is_tool(node: ObservedNode) -> bool:
 
 
 def is_tool_name(name: str) -> bool:
-    """Return whether a node's name is that of a tool that observes the robot."""
+    """Return whether a node has the name of a tool that observes the robot."""
     return _TOOLS.match(name) is not None
 
 

@@ -211,7 +211,7 @@ class EnclaveDomains(NamedTuple):
 def with_routers_of_robots(
     network: ZenohNetwork, before: Fleet | None, fleet: Fleet, gone_enclaves: Collection[str] = ()
 ) -> ZenohNetwork:
-    """Return a Zenoh network with the routers of a fleet's robots, in place of those of ``before``.
+    """Return a network in which the routers of a fleet replace the routers of the fleet ``before``.
 
     Where a router listens stays as it is.  Routers whose enclaves are in ``gone_enclaves`` are left
     out.

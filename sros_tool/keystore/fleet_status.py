@@ -960,7 +960,7 @@ class _KeystoreRecords:
         return tuple(sorted(name for name in names if not has_enclave(self._root, name)))
 
     def short_lived(self, first: Mapping[str, _Expiring]) -> tuple[str, ...]:
-        """Return those enclaves of ``first``, the files that expire first, that are short-lived."""
+        """Return the short-lived enclaves of which a file is in ``first``: it expires first."""
         names = {file.enclave for file in first.values() if file.enclave}
         template = self._keystore.template
         return tuple(sorted(name for name in names if template.longest_validity(name) is not None))

@@ -1,4 +1,4 @@
-"""The Zenoh configurations of a keystore: those that exist, their faults, and those it needs.
+"""The Zenoh configurations of a keystore: existing files, their faults, and files that it needs.
 
 Zenoh itself verifies nothing, so each configuration must be identical to the document in the
 signed message next to it, and state the rights of the enclave's signed permissions.

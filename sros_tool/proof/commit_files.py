@@ -362,7 +362,7 @@ def _make_folders(folder: Folder, path: str) -> None:
 
 ATTRIBUTES_FILE = ".gitattributes"
 _CONVERTING = ("working-tree-encoding", "ident", "export-subst")
-"""Attributes by which git puts other content than that of the commit into a checkout or archive."""
+"""Attributes by which git changes the content of files in a checkout or archive."""
 
 
 _MOST_PATTERNS = 100

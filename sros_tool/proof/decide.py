@@ -351,7 +351,7 @@ def _witness_against_must(requirement: Must, world: World, limit: SearchLimit) -
 
 
 def _is_on_other_domain(world: World, enclave: str, limit: SearchLimit) -> bool:
-    """Return whether an enclave has rights in other ROS domains, and none in that of ``world``."""
+    """Return whether an enclave has rights, but none in the ROS domain of ``world``."""
 
     def has_rights(world: World) -> bool:
         sides = (_own_topics(world, enclave, writes) for writes in (True, False))

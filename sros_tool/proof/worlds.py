@@ -127,7 +127,7 @@ def shortest(names: Iterable[str]) -> str | None:
 
 
 class Side:
-    """An index of the topics that all enclaves may write, or of those that they may read."""
+    """An index of the topics that enclaves may write, or an index of the topics they may read."""
 
     def __init__(self, of: Mapping[str, NameSet]) -> None:
         self.of = of
@@ -273,7 +273,7 @@ Confirm = Callable[[str, bool, str], bool]
 
 
 class Written(NamedTuple):
-    """The topics that an enclave may write, and those of them that are stated exactly.
+    """The topics that an enclave may write; ``exact`` are the topics stated without wildcards.
 
     ``around`` is what `NameSet.around` returns for them.
     """

@@ -106,7 +106,7 @@ _COMPARED = re.compile(
     r"|transport/link/tls/(?:enable_mtls|verify_name_on_connect|close_link_on_expiration)"
     r"|transport/shared_memory/enabled|scouting/(?:multicast|gossip)/enabled"
 )
-"""Paths of settings that are compared: those of `_OPEN`, of endpoints and of access control."""
+"""Paths of the compared settings: `_OPEN`, endpoints and access control."""
 _HARMLESS = re.compile(
     r"metadata(?:/.*)?|timestamping/.*|queries_default_timeout|open/.*|stats/.*"
     r"|transport/unicast/.*|transport/link/[tr]x/.*|transport/link/tls/so_(?:snd|rcv)buf"

@@ -391,7 +391,7 @@ class _Draft:
         return name_order(self._units[unit].name)
 
     def _unit_names(self, units: Iterable[int]) -> tuple[str, ...]:
-        """Return the names of equal units, also of those that were not read in full."""
+        """Return the names of equal units, also of units that were not read in full."""
         names = [self._units[unit].name for unit in units]
         unread = (self._unread.get(name, ()) for name in names)
         return tuple(sorted([*names, *chain.from_iterable(unread)], key=name_order))
@@ -713,7 +713,7 @@ def name_order(name: str) -> tuple[object, ...]:
 
 
 def _robots(paths: Iterable[str], robots: Mapping[str, Robot]) -> Iterator[DrawnUnit]:
-    """Yield the robots of a fleet, with those of their enclaves that are in ``paths``."""
+    """Yield the robots of a fleet, each with its enclaves that are in ``paths``."""
     enclaves: dict[str, list[str]] = defaultdict(list)
     named = {}
     for path in paths:

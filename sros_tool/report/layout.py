@@ -619,7 +619,7 @@ def linked_cards(cards: Mapping[str, Card], links: Sequence[Link]) -> tuple[Link
 def _tops(
     columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[str, str]]
 ) -> dict[str, float]:
-    """Map cards to their y, for the tallest column without gaps, the others aligned with it."""
+    """Map cards to their y: the tallest column has no gaps, other columns are aligned with it."""
     extent = [_extent(column) for column in columns]
     tallest = max(range(len(columns)), key=lambda number: (extent[number], number % 2 == 1))
     tops: dict[str, float] = {}

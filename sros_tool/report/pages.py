@@ -141,7 +141,7 @@ def _page_data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> d
 
 
 def _enclave_json(enclave: PicturedEnclave) -> dict[str, Any]:
-    """Return an enclave as JSON; of its rights, only those to names with wildcards."""
+    """Return an enclave as JSON, with only its rights to names with wildcards."""
     wild = [
         _with_denial_flag(as_plain(statement))
         for statement in enclave.statements

@@ -42,7 +42,7 @@ class SampledKeystore(NamedTuple):
     left_out: frozenset[int] = frozenset()
 
     def rights(self, rights: Collection[Right]) -> frozenset[Right]:
-        """Return the rights without those to names of units that are not read."""
+        """Return the rights, except rights to names of units that are not read."""
         if not self.left_out:
             return frozenset(rights)
         return frozenset(

@@ -121,8 +121,7 @@ _MOST_COMPARED = 64
 _MOST_WILD = 32
 """Maximum number of denied chunks with wildcards at one position of an expression."""
 _MOST_KINDS = 1024
-"""Maximum number of sets into which these denied chunks divide all chunks, by which of them
-match."""
+"""Maximum number of kinds of chunks; the same denied chunks match all chunks of a kind."""
 
 
 def _check_number(number: int, maximum: int = _MOST_STEPS) -> None:
@@ -512,7 +511,7 @@ def _joined_expressions(expressions: set[Chunks]) -> set[Chunks]:
 
 
 class _Beginnings:
-    """An index of beginnings of expressions, to find those with which an expression begins."""
+    """An index of texts, to find the texts with which an expression begins."""
 
     def __init__(self, beginnings: Iterable[Chunks]) -> None:
         self._by_first: dict[Chunks, list[Chunks]] = {}

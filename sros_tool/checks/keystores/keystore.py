@@ -250,7 +250,7 @@ def _enclave_findings(
 
 
 def with_joined_findings(findings: Sequence[Finding]) -> list[Finding]:
-    """Return findings; those that a shared file or a keystore setting causes are joined."""
+    """Return findings; findings that a shared file or a keystore setting causes are joined."""
     together: dict[tuple[object, ...], list[Finding]] = {}
     for finding in findings:
         joined = finding.accepted or finding.id in _OF_THE_KEYSTORE
@@ -394,7 +394,7 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: OpenedKeystore) -
 
 
 def _with_cause_of_expiry(findings: Sequence[Finding], root: Path) -> list[Finding]:
-    """Return the findings; those on certificates and permissions that expire soon get a cause."""
+    """Return the findings, with a cause for all certificates and permissions that expire soon."""
     soon = [f for f in findings if f.kind is EXPIRES_SOON and not f.accepted and not f.cause]
     if not soon:
         return list(findings)

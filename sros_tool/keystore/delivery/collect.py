@@ -426,7 +426,7 @@ def _unknown_file_notes(inbox: Path, fleet: Fleet) -> Iterator[Note]:
 
 
 def _older_message_notes(inbox: Path, messages: Iterable[_ReceivedMessage]) -> Iterator[Note]:
-    """Yield a note on messages that are older than the last ones of their robots."""
+    """Yield a note on messages that are older than the last known messages of their robots."""
     robots = [message.robot.name for message in messages if message.outcome == "older"]
     if robots:
         messages_text = "an older message" if len(robots) == 1 else "older messages"

@@ -163,7 +163,7 @@ class Roots:
         return signer.public_key.keyid in self.last.roles[role].keyids
 
     def check_signer(self, role: str, signer: CryptoSigner, path: Path) -> None:
-        """Raise `KeystoreError` unless the key of ``signer``, at ``path``, is that of ``role``."""
+        """Raise `KeystoreError` unless ``signer``, read from ``path``, has the key of ``role``."""
         if not self.has_key(role, signer):
             raise KeystoreError(
                 f"'{path}' is not the {role} key with which this keystore publishes",

@@ -525,7 +525,7 @@ def _check_name(keystore: OpenedKeystore, name: str, renew: bool) -> None:
 def _check_key(
     request: SigningRequest, known_keys: KnownKeys, present_certificate: x509.Certificate | None
 ) -> None:
-    """Raise `KeystoreError` if the key of a request was revoked, or is that of another enclave.
+    """Raise `KeystoreError` if the key of a request was revoked, or another enclave has it.
 
     An enclave that already shares its key with another enclave is renewed, with a note.
     """

@@ -479,7 +479,7 @@ class KeystoreChange:
 
     @property
     def is_guess(self) -> bool:
-        """Whether certificates are placeholders for those of a CA service, as in a dry run."""
+        """Whether certificates are placeholders, as in a dry run with a CA service."""
         return self.dry_run and bool(self._entries_of_ca_service())
 
     @property
