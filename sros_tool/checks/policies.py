@@ -691,7 +691,7 @@ def _common_folder(profile: Profile) -> str:
 
 
 def _is_not_shipped(folder: str) -> bool:
-    """Return whether the ``node.xml`` in a folder, or one of its parts, differs from the shipped."""
+    """Return whether the ``node.xml`` in a folder, or one of its parts, is not the shipped one."""
     shipped = policies_dir() / COMMON
     parts = (shipped / "node.xml", *(shipped / "node").iterdir())
     with suppress(OSError):

@@ -393,11 +393,11 @@ class LastMessage(NamedTuple):
     sha256: str
     """SHA-256 of the message."""
     enclave: str
-    """The enclave whose key signed it."""
+    """The enclave whose key signed the message."""
     boots: tuple[str, ...] = ()
-    """The starts of the computer that messages were from, the last one first."""
+    """Ids of the starts of the computer that sent messages, the last start first."""
     alternated: datetime | None = None
-    """When a message was last from an earlier start than the message before it."""
+    """When a message last came from an earlier start than the message before it."""
 
     def successor(self, boot: str | None, now: datetime) -> tuple[tuple[str, ...], datetime | None]:
         """Return the values of ``boots`` and ``alternated`` for a message from the start ``boot``.

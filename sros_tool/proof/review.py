@@ -523,7 +523,7 @@ class _Review:
                     used for pattern, used in patterns.items() if may_match(pattern, relative)
                 )
                 if attribute := next(matching, ""):
-                    text = f"can be another file in a checkout or archive, by {attribute} in {path}"
+                    text = f"git may change it in a checkout or archive ({attribute} in {path})"
                     lines.append((text, file))
         return (_FOUND, Facts(tuple(lines))) if lines else None
 
