@@ -6,7 +6,7 @@ import os
 import shlex
 import subprocess
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from itertools import chain
 from pathlib import Path
 
@@ -44,7 +44,24 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
     Proves that the robot is closed, if nothing is left to do by hand.
     """
     robot.shell.check_open()
-    observed = prepared.observed
+    observed, secured = prepared.observed, prepared.secured
+    changes = _write_drop_ins(robot, observed, dry_run=dry_run)
+    unsecured = [process for process in observed.processes if not secured.get(process.enclave)]
+    open_units = observed._replace(processes=unsecured).units
+    _restart_units(robot, observed, open_units, changed=bool(changes), dry_run=dry_run)
+    state = prepared._replace(changes=[*prepared.changes, *changes])
+    by_hand = dry_run or prepared.pending_by_hand
+    proofs = () if by_hand else proofs_of(robot, prepared, _RESTART_SECONDS)
+    if not proofs:
+        return state
+    running = current_state(robot, robot.read_policy())
+    return state._replace(proofs=proofs, secured=running.secured, new=running.new)
+
+
+def _write_drop_ins(
+    robot: LocalRobot, observed: ObservedProcesses, *, dry_run: bool
+) -> list[FileChange]:
+    """Write the drop-ins of the units, show it, and return what changes.  Raises `SrosError`."""
     paths = [f"{unit}.d/{DROP_IN}" for unit in sorted(observed.units)]
     files = {path: read_bytes(robot.start / "units" / path, "unit").decode() for path in paths}
     _drop_ins_of(robot, observed)
@@ -53,18 +70,7 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
         robot.shell.say(f"{'would ' if dry_run else ''}{action} {_SYSTEMD / path}")
     if not dry_run:
         write_units(_SYSTEMD, files, changes)
-    secured = prepared.secured
-    unsecured = [process for process in observed.processes if not secured.get(process.enclave)]
-    open_units = observed._replace(processes=unsecured).units
-    _restart_units(robot, observed, open_units, changed=bool(changes), dry_run=dry_run)
-    done = [FileChange(action, str(_SYSTEMD / path)) for path, action in changes.items()]
-    by_hand = dry_run or prepared.pending_by_hand
-    proofs = () if by_hand else proofs_of(robot, prepared, _RESTART_SECONDS)
-    total = [*prepared.changes, *done]
-    if not proofs:
-        return prepared._replace(changes=total)
-    now = current_state(robot, robot.read_policy())
-    return prepared._replace(proofs=proofs, changes=total, secured=now.secured, new=now.new)
+    return [FileChange(action, str(_SYSTEMD / path)) for path, action in changes.items()]
 
 
 def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
@@ -83,14 +89,15 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     changes = [FileChange("remove", str(path)) for path in drop_ins]
     policy = _readable_policy(robot)
     state = current_state(robot, policy)._replace(dry_run=dry_run, changes=changes)
-    now = RunningRobot(robot)
-    observed = observed.within(policy) if policy else observed
-    _say_how_to_start(now, observed)
+    remaining = _RemainingProcesses(
+        RunningRobot(robot), observed.within(policy) if policy else observed
+    )
+    remaining.say_how_to_start()
     problems = [
-        *_commands_to_open(now, observed),
-        *(() if dry_run else _secured_units(now, observed)),
-        *_secured_guests(now, observed),
-        *_unknown_processes(now),
+        *remaining.commands_to_open(),
+        *(() if dry_run else remaining.secured_units()),
+        *remaining.secured_guests(),
+        *remaining.unknown_processes(),
     ]
     return state._replace(problems=problems)
 
@@ -104,95 +111,97 @@ def _readable_policy(robot: LocalRobot) -> Policy | None:
         return None
 
 
-def _secured_processes(running: RunningRobot) -> Mapping[str, Process]:
-    """Map enclaves to a process that runs in them, best of a user who can read their files."""
-    by_user = sorted(
-        running.secured_everywhere, key=lambda secured: running.may_use_files(secured.process)
-    )
-    return {enclave.name: process for process, enclave in by_user}
+class _RemainingProcesses:
+    """The processes after the units were restarted: what is left to open by hand.
 
+    ``observed`` are the processes that the robot has, and ``running`` the processes of the machine.
+    """
 
-def _processes_by_hand(robot: LocalRobot, observed: ObservedProcesses) -> list[ClosedProcess]:
-    return [*chain.from_iterable(observed.commands_by_hand(robot.folder).values())]
-
-
-def _commands_to_open(running: RunningRobot, observed: ObservedProcesses) -> Iterator[str]:
-    """Yield how to restart the processes open that run in enclaves and that no unit starts."""
-    robot, secured = running.robot, _secured_processes(running)
-    by_hand = _processes_by_hand(robot, observed)
-    closed = [process for process in by_hand if process.enclave in secured]
-    counts = Counter(process.enclave for process in closed)
-    commands = []
-    for process in closed:
-        now = secured[process.enclave]
-        is_alone = counts[process.enclave] == 1 and not process.launch
-        if is_alone and not process.container and running.may_use_files(now):
-            commands.append(secured_process(now, process.enclave).open_command(robot.domain))
-        else:
-            commands.append(process.open_command(robot.domain))
-    for command in dict.fromkeys(commands):
-        yield f"restart it open: {command}"
-
-
-def _secured_units(running: RunningRobot, observed: ObservedProcesses) -> Iterator[str]:
-    """Yield the processes of units that run in enclaves though their units were restarted."""
-    secured = _secured_processes(running)
-    for process in observed.processes:
-        if process.unit and process.enclave in secured:
-            yield (
-                f"{secured[process.enclave].label} still runs in {process.enclave}: stop it if "
-                f"{process.unit} did not start it; otherwise take sros out of the unit"
-            )
-
-
-def _say_how_to_start(running: RunningRobot, observed: ObservedProcesses) -> None:
-    """Show how to start, without security, processes that do not run or have another command."""
-    robot, secured, nodes = running.robot, _secured_processes(running), ObservedNodes(running.robot)
-    known = running.with_later_processes(robot.processes)
-    commands = {tuple(process.command) for process in known.processes}
-    others = [
-        process for command, process in running.open_processes.items() if command not in commands
-    ]
-    for process in _processes_by_hand(robot, observed):
-        if process.enclave in secured or tuple(process.command) in running.open_processes:
-            continue
-        names, old = nodes.names_in(process.enclave)
-        under = f", under its old name {old}" if old else ""
-        state = "does not run; "
-        if like := [other.label for other in others if _is_like(other, process, names)]:
-            state = f"runs open by another command ({like[0]}); if that is another program, "
-        command = process.open_command(robot.domain)
-        robot.shell.say(f"{process.enclave} {state}start it open{under}: {command}")
-
-
-def _secured_guests(running: RunningRobot, observed: ObservedProcesses) -> Iterator[str]:
-    """Yield processes that run in an enclave of the export in which none was observed."""
-    secured = _secured_processes(running)
-    for name in sorted(secured.keys() - {process.enclave for process in observed.processes}):
-        guest = secured[name]
-        how = f"restart it open: {process_text(guest)}"
-        if not running.may_use_files(guest):
-            how = f"it is {guest.label} of user {guest.user}, who cannot read its files"
-        yield f"{name} runs in an enclave, too; {how}"
-
-
-def _unknown_processes(running: RunningRobot) -> Iterator[str]:
-    """Yield processes that may run secured, although sros did not start them from this folder."""
-    pids = {process.pid for process, _ in running.secured_everywhere}
-    for other in running.in_domain:
-        if (enclave := other.enclave) and other.pid not in pids and not other.is_daemon:
-            why = f" ({enclave.problem})" if enclave.problem else ""
-            yield (
-                f"{other.label} runs secured with the files of '{keystore_text(enclave)}'{why}, "
-                "which are not known as those of this folder; open processes do not hear it"
-            )
-    for unseen in running.processes.unseen:
-        if unseen.speaks:
-            yield f"{unseen.label} speaks ROS 2, and cannot be looked at: {unseen.why}"
-    if running.processes.hidden or any(not unseen.speaks for unseen in running.processes.unseen):
-        running.robot.shell.say(
-            "some processes cannot be looked at: to be sure of them, ask as root"
+    def __init__(self, running: RunningRobot, observed: ObservedProcesses) -> None:
+        self._running, self._robot, self._observed = running, running.robot, observed
+        by_user = sorted(
+            running.secured_everywhere, key=lambda secured: running.may_use_files(secured.process)
         )
+        # Of several processes in an enclave, best the process of a user who can read its files.
+        self._secured = {enclave.name: process for process, enclave in by_user}
+        by_hand = observed.commands_by_hand(self._robot.folder)
+        self._started_by_hand = [*chain.from_iterable(by_hand.values())]
+
+    def commands_to_open(self) -> Iterator[str]:
+        """Yield how to restart the processes open that run in enclaves and that no unit starts."""
+        closed = [process for process in self._started_by_hand if process.enclave in self._secured]
+        counts = Counter(process.enclave for process in closed)
+        commands = []
+        for process in closed:
+            secured = self._secured[process.enclave]
+            is_alone = counts[process.enclave] == 1 and not process.launch
+            if is_alone and not process.container and self._running.may_use_files(secured):
+                process = secured_process(secured, process.enclave)
+            commands.append(process.open_command(self._robot.domain))
+        for command in dict.fromkeys(commands):
+            yield f"restart it open: {command}"
+
+    def secured_units(self) -> Iterator[str]:
+        """Yield the processes of units that run in enclaves though their units were restarted."""
+        for process in self._observed.processes:
+            if process.unit and process.enclave in self._secured:
+                yield (
+                    f"{self._secured[process.enclave].label} still runs in {process.enclave}: stop "
+                    f"it if {process.unit} did not start it; otherwise take sros out of the unit"
+                )
+
+    def say_how_to_start(self) -> None:
+        """Show how to start, open, processes that do not run or have another command."""
+        running, nodes = self._running, ObservedNodes(self._robot)
+        known = running.with_later_processes(self._robot.processes)
+        known_commands = {tuple(process.command) for process in known.processes}
+        unknown = [
+            process
+            for command, process in running.open_processes.items()
+            if command not in known_commands
+        ]
+        for process in self._started_by_hand:
+            runs_open = tuple(process.command) in running.open_processes
+            if process.enclave in self._secured or runs_open:
+                continue
+            names, old_name = nodes.names_in(process.enclave)
+            under = f", under its old name {old_name}" if old_name else ""
+            state = "does not run; "
+            if labels := [other.label for other in unknown if _is_like(other, process, names)]:
+                state = f"runs open by another command ({labels[0]}); if that is another program, "
+            command = process.open_command(self._robot.domain)
+            self._robot.shell.say(f"{process.enclave} {state}start it open{under}: {command}")
+
+    def secured_guests(self) -> Iterator[str]:
+        """Yield processes that run in an enclave of the export in which none was observed."""
+        known = {process.enclave for process in self._observed.processes}
+        for enclave in sorted(self._secured.keys() - known):
+            guest = self._secured[enclave]
+            remedy = f"restart it open: {process_text(guest)}"
+            if not self._running.may_use_files(guest):
+                remedy = f"it is {guest.label} of user {guest.user}, who cannot read its files"
+            yield f"{enclave} runs in an enclave, too; {remedy}"
+
+    def unknown_processes(self) -> Iterator[str]:
+        """Yield processes that may run secured, although this folder did not start them."""
+        running = self._running
+        pids = {process.pid for process, _ in running.secured_everywhere}
+        for process in running.in_domain:
+            if (enclave := process.enclave) and process.pid not in pids and not process.is_daemon:
+                why = f" ({enclave.problem})" if enclave.problem else ""
+                yield (
+                    f"{process.label} runs secured with the files of '{keystore_text(enclave)}'"
+                    f"{why}, which are not known as those of this folder; open processes do not "
+                    "hear it"
+                )
+        unseen_processes = running.processes.unseen
+        for unseen in unseen_processes:
+            if unseen.speaks:
+                yield f"{unseen.label} speaks ROS 2, and cannot be looked at: {unseen.why}"
+        if running.processes.hidden or any(not unseen.speaks for unseen in unseen_processes):
+            self._robot.shell.say(
+                "some processes cannot be looked at: to be sure of them, ask as root"
+            )
 
 
 def _is_like(process: Process, observed: ClosedProcess, nodes: Collection[str]) -> bool:
@@ -200,8 +209,8 @@ def _is_like(process: Process, observed: ClosedProcess, nodes: Collection[str]) 
 
     ``nodes`` are the full names of the observed process's nodes.
     """
-    if named := node_argument(process.program[1]):
-        return expand("~", *named) in nodes
+    if node := node_argument(process.program[1]):
+        return expand("~", *node) in nodes
     return program_of(process.program[1]) == program_of(tuple(observed.command))
 
 
@@ -242,12 +251,12 @@ def _restart_units(
         command = ["systemctl", *words]
         robot.shell.say(f"{'would run:' if dry_run else '+'} {shlex.join(command)}")
         try:
-            ended = 0 if dry_run else subprocess.run(command, check=False).returncode
+            status = 0 if dry_run else subprocess.run(command, check=False).returncode
         except OSError as error:
             raise UnavailableError(f"systemctl cannot be run: {error.strerror}") from error
-        if ended:
+        if status:
             raise SrosError(
-                f"`{shlex.join(command)}` ended with {ended}",
+                f"`{shlex.join(command)}` ended with {status}",
                 "Secured and open processes do not hear each other.",
                 "Fix it and run --apply again, or go back with --undo.",
             )

@@ -58,22 +58,7 @@ def assign(
     by_enclave: dict[str, list[ObservedNode]] = {}
     for node in nodes:
         by_enclave.setdefault(node.enclaves[0], []).append(node)
-    claims = [(process, ROUTER, "program") for process in near if process.is_router]
-    for known_by, shows_node in _KNOWN_BY.items():
-        unassigned = sorted(by_enclave.keys() - {enclave for _, enclave, _ in claims})
-        if known_by == "elimination" and len(unassigned) > 1:
-            continue
-        for enclave in unassigned:
-            claimed = {process.pid for process, _, _ in claims}
-            enclave_nodes = by_enclave[enclave]
-            processes = [
-                process
-                for process in near
-                if process.pid not in claimed
-                and any(shows_node(process, node, process_ids or {}) for node in enclave_nodes)
-            ]
-            if len(processes) <= len({node.participant for node in enclave_nodes}):
-                claims += [(process, enclave, known_by) for process in processes]
+    claims = _claims(near, by_enclave, process_ids or {})
     units = Counter({process.program[0]: origins[process.pid].unit for process in near}.values())
     assigned = []
     for process, enclave, known_by in claims:
@@ -99,6 +84,34 @@ def assign(
             if len({_process_prefix(node) for node in observed_nodes}) > counts[enclave]
         ),
     )
+
+
+def _claims(
+    processes: Sequence[Process],
+    by_enclave: Mapping[str, Sequence[ObservedNode]],
+    process_ids: Mapping[str, int],
+) -> list[tuple[Process, str, str]]:
+    """Return processes with their enclaves and how they are known, by the surest sign first.
+
+    A sign that more processes of an enclave show than it has participants shows nothing.
+    """
+    claims = [(process, ROUTER, "program") for process in processes if process.is_router]
+    for known_by, shows_node in _KNOWN_BY.items():
+        unassigned = sorted(by_enclave.keys() - {enclave for _, enclave, _ in claims})
+        if known_by == "elimination" and len(unassigned) > 1:
+            continue
+        for enclave in unassigned:
+            claimed = {process.pid for process, _, _ in claims}
+            nodes = by_enclave[enclave]
+            candidates = [
+                process
+                for process in processes
+                if process.pid not in claimed
+                and any(shows_node(process, node, process_ids) for node in nodes)
+            ]
+            if len(candidates) <= len({node.participant for node in nodes}):
+                claims += [(process, enclave, known_by) for process in candidates]
+    return claims
 
 
 def _process_prefix(node: ObservedNode) -> str:

@@ -81,24 +81,24 @@ class ObservedNodes:
             )
             yield replace(node, enclaves=moved) if moved else node
 
-    def expected(self, now: Observation | None = None) -> Observation:
+    def expected(self, current: Observation | None = None) -> Observation:
         """Return the nodes of enclaves in the policy, with the names that they should have.
 
         If the policy allows several names for an endpoint of a renamed node, the result has the
-        name that the node uses ``now``.
+        name that the node uses in the ``current`` graph.
         """
         names, nodes = {enclave.path for enclave in self.policy.enclaves}, []
         for node in self.in_their_enclaves():
             if new := self.renamed.get(node_name(node)):
-                endpoints = frozenset(self._current_endpoints(node, now).values())
+                endpoints = frozenset(self._current_endpoints(node, current).values())
                 nodes.append(replace(node, ns=new[0], name=new[1], endpoints=endpoints))
             elif names.issuperset(node.enclaves):
                 nodes.append(node)
         return make_observation(nodes)
 
-    def compared(self, away: Collection[str], now: Observation | None = None) -> Observation:
+    def compared(self, away: Collection[str], current: Observation | None = None) -> Observation:
         """Return the expected nodes that have a profile and whose enclave is not ``away``."""
-        nodes, _ = self.divide_by_profile(self.expected(now).nodes)
+        nodes, _ = self.divide_by_profile(self.expected(current).nodes)
         return make_observation(node for node in nodes if node.enclaves[0] not in away)
 
     @cached_property
@@ -160,23 +160,23 @@ class ObservedNodes:
         }
 
     def _current_endpoints(
-        self, node: ObservedNode, now: Observation | None
+        self, node: ObservedNode, current: Observation | None
     ) -> Mapping[Endpoint, Endpoint]:
         """Map the old endpoints of a renamed node to the endpoints that it should have now."""
         name = expand("~", *self.renamed[node_name(node)])
-        seen_nodes = (other for other in (now.nodes if now else ()) if node_name(other) == name)
-        current = {endpoint for other in seen_nodes for endpoint in other.endpoints}
+        nodes = (other for other in (current.nodes if current else ()) if node_name(other) == name)
+        endpoints = {endpoint for other in nodes for endpoint in other.endpoints}
         return {
-            endpoint: next((allowed for allowed in names if allowed in current), names[0])
+            endpoint: next((allowed for allowed in names if allowed in endpoints), names[0])
             for endpoint, names in self._allowed_endpoints[node].items()
         }
 
-    def moved_endpoints(self, now: Observation | None = None) -> Set[tuple[Endpoint, Endpoint]]:
+    def moved_endpoints(self, current: Observation | None = None) -> Set[tuple[Endpoint, Endpoint]]:
         """Return pairs of old and new endpoint, for the endpoints that renaming a node changes."""
         return {
             (before, after)
             for node in self._allowed_endpoints
-            for before, after in self._current_endpoints(node, now).items()
+            for before, after in self._current_endpoints(node, current).items()
             if before != after
         }
 

@@ -37,11 +37,14 @@ from sros_tool.wording import counted, enumerated, first_few
 
 
 class CommandStep(NamedTuple):
-    """The words of a command line of sros, what it makes, and where its output goes."""
+    """A command line of sros that is a step of closing a robot."""
 
     words: Sequence[str]
+    """The verb, with its arguments."""
     made: Path | None = None
+    """What the step makes; if it exists, the step is left out."""
     into: Path | None = None
+    """The file into which the output goes."""
     guards: bool = False
     """Whether the later steps are left out if this step finds something."""
     signs: bool = False
@@ -60,16 +63,7 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     Raises:
         SrosError: the robot cannot be watched, or the keystore was brought to another machine.
     """
-    if robot.export.exists() and not robot.keystore.exists():
-        raise UsageError(
-            f"the keystore '{robot.keystore}' is not there, and '{robot.export}' was exported "
-            "from it",
-            "A new keystore would have other CAs.",
-            "Bring the keystore back to change the robot; --proof and --undo need only the export.",
-        )
-    results = (robot.observation_file, robot.policy, robot.keystore, robot.export)
-    if robot.folder.is_dir() and [*robot.folder.iterdir()] and not any(map(Path.exists, results)):
-        robot.shell.say(f"'{robot.folder}' has files of yours: sros adds its own to them")
+    _check_folder(robot)
     if robot.observed and robot.named_elsewhere:
         robot.check_elsewhere()
         robot.observed = robot.observed.belonging_elsewhere(robot.named_elsewhere)
@@ -80,17 +74,12 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
         with suppress(SrosError):  # the steps say what is wrong
             denied_before = _denied_access(robot)
     done, problems, is_stopped = _do_steps(robot, duration, partial=partial, dry_run=dry_run)
-    changes = [] if dry_run or is_stopped else _remove_enclaves(robot)
+    removed = [] if dry_run or is_stopped else _remove_enclaves(robot)
     state = current_state(robot, robot.read_policy())._replace(steps=done, dry_run=dry_run)
     if dry_run or is_stopped:
         return state._replace(problems=problems)
-    if robot.observed:
-        known = {process.enclave for process in robot.observed.processes}
-        later = [process for process in state.observed.processes if process.enclave not in known]
-        if later:
-            processes = [*robot.observed.processes, *later]
-            robot.remember(robot.observed._replace(processes=processes))
-    changes = [*write_start_files(robot, state), *changes]
+    _remember_later_processes(robot, state.observed)
+    changes = [*write_start_files(robot, state), *removed]
     denied = _denied_access(robot)
     newly_denied = [right for right in denied if right not in denied_before]
     problems += _problems_of(robot, state, partial=partial)
@@ -99,6 +88,30 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     return state._replace(
         denied=denied, newly_denied=newly_denied, problems=problems, changes=changes
     )
+
+
+def _check_folder(robot: LocalRobot) -> None:
+    """Raise `UsageError` without the keystore of an export; say if the folder has other files."""
+    if robot.export.exists() and not robot.keystore.exists():
+        raise UsageError(
+            f"the keystore '{robot.keystore}' is not there, and '{robot.export}' was exported "
+            "from it",
+            "A new keystore would have other CAs.",
+            "Bring the keystore back to change the robot; --proof and --undo need only the export.",
+        )
+    results = (robot.observation_file, robot.policy, robot.keystore, robot.export)
+    if robot.folder.is_dir() and [*robot.folder.iterdir()] and not any(map(Path.exists, results)):
+        robot.shell.say(f"'{robot.folder}' has files of yours: sros adds its own to them")
+
+
+def _remember_later_processes(robot: LocalRobot, observed: ObservedProcesses) -> None:
+    """Write the processes of enclaves of which none was observed, if the robot was watched."""
+    if robot.observed:
+        known = {process.enclave for process in robot.observed.processes}
+        later = [process for process in observed.processes if process.enclave not in known]
+        if later:
+            processes = [*robot.observed.processes, *later]
+            robot.remember(robot.observed._replace(processes=processes))
 
 
 def _denied_access(robot: LocalRobot) -> list[str]:
@@ -170,11 +183,11 @@ def _do(robot: LocalRobot, step: CommandStep) -> tuple[str, list[str]]:
     Raises:
         SrosError: the robot cannot be watched.
     """
-    watches = step.into == robot.observation_file
-    if watches:
+    is_watch = step.into == robot.observation_file
+    if is_watch:
         check_watchable(robot)
     robot.shell.say(f"+ {step.command}")
-    if watches:
+    if is_watch:
         return "done", watch(robot, step.words)
     status, output, messages = robot.shell.run(step.words, bool(step.into))
     if status or (step.guards and output):
@@ -274,9 +287,9 @@ def _user_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[s
     """Yield the users of processes who cannot read their enclaves."""
     owner, export = robot.export.stat().st_uid, robot.export.absolute()
     for user in sorted({process.user for process in observed.processes}):
-        closed = [path for path in export.parents if not _may_enter(user, path.stat())]
-        if closed and user:
-            yield f"user {user}, who runs processes, cannot enter '{closed[-1]}'"
+        barred = [path for path in export.parents if not _may_enter(user, path.stat())]
+        if barred and user:
+            yield f"user {user}, who runs processes, cannot enter '{barred[-1]}'"
         if user != owner:
             yield (
                 f"processes run as user {user}, and only user {owner} can read the enclaves: "
@@ -302,26 +315,26 @@ def _unknown_process_problems(robot: LocalRobot, state: CloseState) -> Iterator[
     observed, close = state.observed, robot.close_command
     silent = "they would not be heard any more (accept: --partial)"
     if observed.unknown:
-        named = first_few(observed.unknown, MOST_NAMES)
-        opened = f"go back by {close} --undo, and " if state.secured else ""
+        processes = first_few(observed.unknown, MOST_NAMES)
+        undo = f"go back by {close} --undo, and " if state.secured else ""
         yield (
             f"sros saw no node of {counted(len(observed.unknown), 'process', 'processes')}: "
-            f"{named}; {opened}watch again while they run: {close} --for 1m; "
+            f"{processes}; {undo}watch again while they run: {close} --for 1m; "
             f"otherwise {silent}"
         )
-    here = {process.enclave: process.pid for process in observed.processes}
-    if twice := sorted(here.keys() & {*observed.elsewhere}):
+    pids = {process.enclave: process.pid for process in observed.processes}
+    if twice := sorted(pids.keys() & {*observed.elsewhere}):
         yield (
-            f"nodes of {twice[0]} are in process {here[twice[0]]} and in another one that "
+            f"nodes of {twice[0]} are in process {pids[twice[0]]} and in another one that "
             "sros does not see: if another robot is in this ROS domain, switch it off, or "
             "give it a domain of its own, remove the rights that it added to "
             f"'{robot.policy}', and watch again: {close} --for 1m"
         )
     if only_there := [name for name in observed.elsewhere if name not in twice]:
-        named = first_few(only_there, MOST_NAMES)
+        enclaves = first_few(only_there, MOST_NAMES)
         options = " ".join(f"--elsewhere {name}" for name in only_there)
         yield (
-            f"sros knows no process of this machine for nodes of {named}; if they run on "
+            f"sros knows no process of this machine for nodes of {enclaves}; if they run on "
             f"another machine: {close} {options}; otherwise {silent}"
         )
 
@@ -363,4 +376,5 @@ def _shared_node_problems(robot: LocalRobot) -> Iterator[str]:
 
 
 def _may_enter(user: int, folder: os.stat_result) -> bool:
+    """Return whether a user may enter a folder, by its mode."""
     return bool(folder.st_mode & (stat.S_IXUSR if folder.st_uid == user else 0o011))

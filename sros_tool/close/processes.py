@@ -70,8 +70,8 @@ class ClosedProcess(NamedTuple):
     ) -> ClosedProcess:
         """Return a running process with its enclave and what started it."""
         start = enclave, *process.program, origin.folder, process.user, origin.unit
-        named = process.environment.get(RMW, "")
-        rmw = RMW_ZENOH if process.is_zenoh else named if named in RMWS else ""
+        variable = process.environment.get(RMW, "")
+        rmw = RMW_ZENOH if process.is_zenoh else variable if variable in RMWS else ""
         chooses = process.environment.get(ENCLAVE) == enclave
         return cls(*start, known_by, origin.launch, origin.container, rmw, (), chooses)
 
@@ -236,9 +236,10 @@ class ObservedProcesses(NamedTuple):
 
         It differs from the enclave of the process if the program itself chooses that enclave.
         """
-        names = {process.enclave, *process.shares}
-        program = (other for other in self.processes if other.enclave in names)
-        return min((part.chooses, part.enclave) for part in program)[1]
+        enclaves = {process.enclave, *process.shares}
+        return min(
+            (other.chooses, other.enclave) for other in self.processes if other.enclave in enclaves
+        )[1]
 
     def commands_by_hand(self, folder: Path) -> Mapping[str, Sequence[ClosedProcess]]:
         """Map shell commands to the processes that they start and that no unit starts alone.
@@ -253,8 +254,8 @@ class ObservedProcesses(NamedTuple):
         commands: dict[str, list[ClosedProcess]] = {}
         for process in sorted(self.processes, key=lambda process: process.enclave != ROUTER):
             if not process.unit:
-                first = process._replace(enclave=self.started_in(process))
-                command = first.secured_command(folder, launches.get(tuple(process.launch), ""))
+                started = process._replace(enclave=self.started_in(process))
+                command = started.secured_command(folder, launches.get(tuple(process.launch), ""))
                 commands.setdefault(command, []).append(process)
         return commands
 
@@ -262,8 +263,8 @@ class ObservedProcesses(NamedTuple):
 def is_in_domain(process: Process, domain: int) -> bool:
     """Return whether a process may be in a ROS domain, in the network of this process."""
     # A domain that rcl cannot read can be any for a program without it.
-    near = process.domain == str(domain) or not process.domain.isdecimal()
-    return near and not process.network
+    may_be_in = process.domain == str(domain) or not process.domain.isdecimal()
+    return may_be_in and not process.network
 
 
 def process_text(process: Process) -> str:

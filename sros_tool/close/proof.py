@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from sros_tool.checks.keystores.issued import STALE
-from sros_tool.checks.kind import NOTE
+from sros_tool.checks.kind import NOTE, Finding
 from sros_tool.checks.processes import PROCESS_NOT_SEEN, process_findings
 from sros_tool.close.nodes import ObservedNodes, node_name, ros_use
 from sros_tool.close.processes import ObservedProcesses
@@ -160,84 +160,91 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
 
 
 def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
-    """Look for processes that are open, or that something is wrong with."""
+    """Look for processes that are open, or that something is wrong with.
+
+    ``number`` enclaves have a process with the current files.
+    """
+    robot = running.robot
+    findings = _process_findings(running)
+    enclaves = {tuple(process.command): process.enclave for process in robot.processes.processes}
+    remedies = {
+        process.label: f"Stop it: another process runs in {enclaves[process.program[1]]}."
+        for process in running.in_domain
+        if not process.asks_for_security
+        and enclaves.get(process.program[1]) in running.current_enclaves
+    }
+    for finding in findings:
+        remedy = remedies.get(finding.subject, finding.remedy)
+        robot.shell.say(f"{finding.subject}: {finding.text}. {remedy}")
+    wrong = [finding for finding in findings if finding.id != PROCESS_NOT_SEEN.id]
+    if findings:
+        worst = (wrong or findings)[0]
+        return Proof(_STARTED, False if wrong else None, f"{worst.subject}: {worst.text}")
+    guests = "".join(f"; {guest}" for guest in _guests(running))
+    summary = f"{counted(number, 'enclave')}, and no open process in domain {robot.domain}"
+    return Proof(_STARTED, True, f"{summary}{guests}")
+
+
+def _process_findings(running: RunningRobot) -> list[Finding]:
+    """Return what `check runtime` finds in the robot's domain, as from the observer's enclave."""
     robot = running.robot
     robot.shell.say(
         f'$ eval "$(sros env {shlex.quote(str(robot.export))} {OBSERVER})"; sros check runtime'
     )
     # This shell starts no node.
-    here = {**robot.shell.environment, **robot.variables(OBSERVER), ENCLAVE: ""}
-    near = tuple(running.in_domain)
-    others = [process for process in running.processes.processes if process not in near]
-    examined, now = replace(running.processes, processes=near), robot.shell.now()
-    findings = [
-        finding
-        for finding in process_findings(here, examined, now=now, zone=robot.shell.zone)
-        if finding.severity > NOTE
-    ]
-    closed = {tuple(process.command): process.enclave for process in robot.processes.processes}
-    other_remedies = {
-        process.label: f"Stop it: another process runs in {closed[process.program[1]]}."
-        for process in near
-        if not process.asks_for_security
-        and closed.get(process.program[1]) in running.current_enclaves
-    }
-    for finding in findings:
-        remedy = other_remedies.get(finding.subject, finding.remedy)
-        robot.shell.say(f"{finding.subject}: {finding.text}. {remedy}")
-    wrong = [finding for finding in findings if finding.id != PROCESS_NOT_SEEN.id]
-    if findings:
-        first = (wrong or findings)[0]
-        return Proof(_STARTED, False if wrong else None, f"{first.subject}: {first.text}")
+    environment = {**robot.shell.environment, **robot.variables(OBSERVER), ENCLAVE: ""}
+    examined = replace(running.processes, processes=tuple(running.in_domain))
+    findings = process_findings(environment, examined, now=robot.shell.now(), zone=robot.shell.zone)
+    return [finding for finding in findings if finding.severity > NOTE]
+
+
+def _guests(running: RunningRobot) -> Iterator[str]:
+    """Yield processes that are not the robot's: with files of others, or open in other domains."""
     known_pids = {process.pid for process, _ in running.secured}
-    guests = [
-        f"; {process.label} runs in {process.enclave.name} with the files of "
-        f"'{keystore_text(process.enclave)}'"
-        for process in near
-        if process.enclave and process.pid not in known_pids and not process.is_daemon
-    ]
-    guests += [
-        f"; {process.label} runs open in domain {process.domain}"
-        for process in others
-        if not (process.enclave or process.network or process.is_daemon)
-    ]
-    summary = f"{counted(number, 'enclave')}, and no open process in domain {robot.domain}"
-    return Proof(_STARTED, True, f"{summary}{''.join(guests)}")
+    in_domain = running.in_domain
+    for process in in_domain:
+        if process.enclave and process.pid not in known_pids and not process.is_daemon:
+            files = keystore_text(process.enclave)
+            yield f"{process.label} runs in {process.enclave.name} with the files of '{files}'"
+    for process in running.processes.processes:
+        is_open = not (process.enclave or process.network or process.is_daemon)
+        if is_open and process not in in_domain:
+            yield f"{process.label} runs open in domain {process.domain}"
 
 
 def _why_missing(running: RunningRobot, missing: Sequence[str], observed: ObservedProcesses) -> str:
     """Return which enclaves have no process, or an open one, and what the others lack."""
     robot = running.robot
-    wrong = {
+    outdated = {
         enclave.name: (process, running.why_not_current(process, enclave))
         for process, enclave in running.secured
         if enclave.name in missing
     }
-    are_open = {process.enclave: process.pid for process in observed.processes if process.pid}
-    absent = [name for name in missing if name not in wrong]
-    others = {name: f"stop process {pid}, which is open" for name, pid in are_open.items()}
-    others |= {
+    open_pids = {process.enclave: process.pid for process in observed.processes if process.pid}
+    absent = [name for name in missing if name not in outdated]
+    causes = {name: f"stop process {pid}, which is open" for name, pid in open_pids.items()}
+    causes |= {
         enclave.name: f"{process.label} has the files of '{keystore_text(enclave)}'"
         for process in running.in_domain
         if (enclave := process.enclave)
     }
-    named = ", ".join(f"{name} ({others[name]})" if name in others else name for name in absent)
+    enclaves = ", ".join(f"{name} ({causes[name]})" if name in causes else name for name in absent)
     reasons = [
-        f"no secured process of {named}; start it as {robot.commands_file} says; "
+        f"no secured process of {enclaves}; start it as {robot.commands_file} says; "
         f"if it ended: sros explain {shlex.quote(str(robot.export))} --log ITS_LOG"
     ] * bool(absent)
-    if may_end := [name for name in absent if name not in {*are_open, *robot.without}]:
+    if may_end := [name for name in absent if name not in {*open_pids, *robot.without}]:
         options = " ".join(f"--without {name}" for name in may_end)
         reasons.append(f"if it does not always run, add {options}")
-    if absent and (in_others := running.in_other_domains()):
-        reasons.append(in_others)
-    for why in dict.fromkeys(why for _, why in wrong.values()):
-        named = ", ".join(
-            f"{name} (process {wrong[name][0].pid})"
+    if absent and (in_other_domains := running.in_other_domains()):
+        reasons.append(in_other_domains)
+    for why in dict.fromkeys(why for _, why in outdated.values()):
+        enclaves = ", ".join(
+            f"{name} (process {outdated[name][0].pid})"
             for name in missing
-            if name in wrong and wrong[name][1] == why
+            if name in outdated and outdated[name][1] == why
         )
-        reasons.append(f"{why} the processes of {named}; restart them")
+        reasons.append(f"{why} the processes of {enclaves}; restart them")
     return "; ".join(reasons)
 
 
@@ -247,22 +254,18 @@ def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection
     Processes of the enclaves ``away`` do not run; ``running`` are the processes of the other
     enclaves at the beginning of the proof.
     """
-    words = ["audit", str(running.robot.rights_source), "--keystore", str(running.robot.export)]
-    words += ["--enclave", OBSERVER, "--domain", str(running.robot.domain), "--json"]
+    robot = running.robot
+    words = ["audit", str(robot.rights_source), "--keystore", str(robot.export)]
+    words += ["--enclave", OBSERVER, "--domain", str(robot.domain), "--json"]
     words += ["--partial"] * bool(away)
     for _ in range(_TRIES):  # nodes may still be starting
         try:
-            status, audited = running.robot.shell.read_json(words)
+            status, audited = robot.shell.read_json(words)
         except UnavailableError as error:
             return Proof(TALK, None, f"{error}{_renamed_text(nodes, None, fails=False)}")
-        now = observation_from_json(audited)
-        denied = nodes.denied_rights(nodes.expected(now))
+        comparison = _TalkComparison(running, nodes, away, audited)
         differences = {
-            **_differences_of_audit(running, audited, away),
-            "gone": _lost_endpoints(nodes.compared(away, now), now, denied),
-            "left alone": _abandoned_names(
-                nodes.compared(away, now), nodes.expected(now), nodes.moved_endpoints(now), denied
-            ),
+            **comparison.differences(),
             "not judged": audited["unjudged"],
             "not done": ["the ROS graph kept changing"] if status else [],
         }
@@ -270,61 +273,79 @@ def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection
             (f"{why}: {first_few(names, 3)}" for why, names in differences.items() if names), ""
         )
         if not reason:
-            summary = _comparison_text(nodes, now, away, denied)
-            return Proof(TALK, True, f"{summary}{_renamed_text(nodes, now, fails=False)}")
-    return Proof(TALK, False, f"{reason}{_renamed_text(nodes, now, fails=True)}")
+            renamed = _renamed_text(nodes, comparison.current, fails=False)
+            return Proof(TALK, True, f"{comparison.summary()}{renamed}")
+    return Proof(TALK, False, f"{reason}{_renamed_text(nodes, comparison.current, fails=True)}")
 
 
-def _differences_of_audit(
-    running: RunningRobot, audited: Mapping[str, Any], away: Collection[str]
-) -> Mapping[str, Sequence[str]]:
-    """Return what the observer's audit finds: denied rights, refused enclaves, unseen nodes."""
-    ended = _ended_since(running)
-    unseen = [node for node in audited["unseen"] if node["enclave"] not in away]
-    return {
-        "denied": [
-            f"{right['enclave']} {right['right']} {right['name']}: {right['reason']}"
-            for right in audited["denied"]
-        ],
-        "refused": [refused["enclave"] for refused in audited["refused"]],
-        "ended while the proof ran": [
-            f"{node['node'] or node['enclave']} ({ended[node['enclave']]}; start it again, "
-            f"or, if it does not always run, add --without {node['enclave']})"
-            for node in unseen
-            if node["enclave"] in ended
-        ],
-        "not seen": [_unseen_text(running, node["node"], node["enclave"]) for node in unseen],
-    }
+class _TalkComparison:
+    """The nodes of the open robot, compared with what an observer in an enclave audited now.
+
+    ``audited`` is the JSON of `sros audit`; the others are as in `_proof_of_talk`.
+    """
+
+    def __init__(
+        self,
+        running: RunningRobot,
+        nodes: ObservedNodes,
+        away: Collection[str],
+        audited: Mapping[str, Any],
+    ) -> None:
+        self.current = observation_from_json(audited)
+        self._running, self._nodes, self._away, self._audited = running, nodes, away, audited
+        self._denied = nodes.denied_rights(nodes.expected(self.current))
+
+    def differences(self) -> Mapping[str, Sequence[str]]:
+        """Return what differs from the open robot, by what happened to it."""
+        ended, nodes = _ended_since(self._running), self._nodes
+        unseen = [node for node in self._audited["unseen"] if node["enclave"] not in self._away]
+        before, expected = nodes.compared(self._away, self.current), nodes.expected(self.current)
+        moved = nodes.moved_endpoints(self.current)
+        return {
+            "denied": [
+                f"{right['enclave']} {right['right']} {right['name']}: {right['reason']}"
+                for right in self._audited["denied"]
+            ],
+            "refused": [refused["enclave"] for refused in self._audited["refused"]],
+            "ended while the proof ran": [
+                f"{node['node'] or node['enclave']} ({ended[node['enclave']]}; start it again, "
+                f"or, if it does not always run, add --without {node['enclave']})"
+                for node in unseen
+                if node["enclave"] in ended
+            ],
+            "not seen": [
+                _unseen_text(self._running, node["node"], node["enclave"]) for node in unseen
+            ],
+            "gone": _lost_endpoints(before, self.current, self._denied),
+            "left alone": _abandoned_names(before, expected, moved, self._denied),
+        }
+
+    def summary(self) -> str:
+        """Return what was compared, what the policy denies now, and which nodes are new."""
+        before = self._nodes.compared(self._away)
+        number = counted(len(before.nodes), "node")
+        text = f"{number} with {before.endpoint_count} endpoints as before"
+        text += f", without {', '.join(sorted(self._away))}" if self._away else ""
+        if denied := self._denied:
+            text += f", but for {counted(len(denied), 'right')} that the policy denies now: "
+            text += ", ".join(f"{right.right.enclave} {right.right.describe()}" for right in denied)
+        known = {*map(node_name, before.nodes)}
+        _, without_profile = self._nodes.divide_by_profile(self.current.nodes)
+        new = sorted(
+            f"{node_name(node)} in {' or '.join(node.enclaves) or 'no enclave'}"
+            for node in without_profile
+            if node_name(node) not in known and not is_tool(node)
+        )
+        return text + (f"; new, without a profile: {first_few(new, MOST_NAMES)}" if new else "")
 
 
-def _comparison_text(
-    nodes: ObservedNodes, now: Observation, away: Collection[str], denied: Sequence[DeniedRight]
-) -> str:
-    """Return what was compared, what the policy denies now, and which nodes are new, as text."""
-    before = nodes.compared(away)
-    number = counted(len(before.nodes), "node")
-    text = f"{number} with {before.endpoint_count} endpoints as before"
-    text += f", without {', '.join(sorted(away))}" if away else ""
-    if denied:
-        text += f", but for {counted(len(denied), 'right')} that the policy denies now: "
-        text += ", ".join(f"{right.right.enclave} {right.right.describe()}" for right in denied)
-    known = {*map(node_name, before.nodes)}
-    _, without_profile = nodes.divide_by_profile(now.nodes)
-    new = sorted(
-        f"{node_name(node)} in {' or '.join(node.enclaves) or 'no enclave'}"
-        for node in without_profile
-        if node_name(node) not in known and not is_tool(node)
-    )
-    return text + (f"; new, without a profile: {first_few(new, MOST_NAMES)}" if new else "")
-
-
-def _renamed_text(nodes: ObservedNodes, now: Observation | None, *, fails: bool) -> str:
+def _renamed_text(nodes: ObservedNodes, current: Observation | None, *, fails: bool) -> str:
     """Return which nodes were compared under new names, and which ones not at all, as text."""
     renamed, text = nodes.renamed, ""
     if renamed:
         names = [f"{old} as {expand('~', *renamed[old])}" for old in sorted(renamed)]
         text = f"; compared under a new name: {first_few(names, MOST_NAMES)}"
-        pairs = nodes.moved_endpoints(now)
+        pairs = nodes.moved_endpoints(current)
         topics = sorted({(ros_use(old)[1], ros_use(new)[1]) for old, new in pairs})
         private = tuple(f"{name}/" for name in renamed)
         if moved := [f"{old} as {new}" for old, new in topics if not old.startswith(private)]:
@@ -357,9 +378,9 @@ def _ended_since(running: RunningRobot) -> dict[str, str]:
 
 def _unseen_text(running: RunningRobot, node: str, enclave: str) -> str:
     """Return a node that an enclave has a profile for, and what to do if it does not exist."""
-    for process, running_in in running.secured:
+    for process, process_enclave in running.secured:
         if (
-            running_in.name == enclave
+            process_enclave.name == enclave
             and process.is_zenoh
             and named_enclave(process.command) != enclave
         ):
@@ -373,12 +394,12 @@ def _unseen_text(running: RunningRobot, node: str, enclave: str) -> str:
 
 
 def _lost_endpoints(
-    before: Observation, now: Observation, denied: Iterable[DeniedRight]
+    before: Observation, current: Observation, denied: Iterable[DeniedRight]
 ) -> list[str]:
     """Return the endpoints, as text, that nodes had before and lack now, unless ``denied``."""
     expected = {*_endpoints_of(before.nodes)} - _denied_endpoints(denied)
     lost: dict[str, list[str]] = {}
-    gone = expected - {*_endpoints_of(now.nodes)}
+    gone = expected - {*_endpoints_of(current.nodes)}
     for node, right, name in sorted({(node, *ros_use(endpoint)) for node, endpoint in gone}):
         lost.setdefault(f"{node} {right}", []).append(name)
     return [f"{uses} {first_few(names, MOST_NAMES)}" for uses, names in lost.items()]
@@ -398,16 +419,20 @@ def _abandoned_names(
     refused = _denied_endpoints(denied)
     robot_nodes = [node for node in expected.nodes if not is_tool(node)]
     kept = {endpoint for _, endpoint in {*_endpoints_of(robot_nodes)} - refused}
-    used = {*_endpoints_of(node for node in before.nodes if not is_tool(node))} - refused
-    other = {PUBLISH: SUBSCRIBE, SUBSCRIBE: PUBLISH}
+    uses = {*_endpoints_of(node for node in before.nodes if not is_tool(node))} - refused
+    opposite = {PUBLISH: SUBSCRIBE, SUBSCRIBE: PUBLISH}
     new_names = {
-        old._replace(direction=other[old.direction]): ros_use(new)[1]
+        old._replace(direction=opposite[old.direction]): ros_use(new)[1]
         for old, new in moved
         if old not in kept
     }
-    alone = {(node, *ros_use(end), new_names[end]) for node, end in used if end in new_names}
+    abandoned = {
+        (node, *ros_use(endpoint), new_names[endpoint])
+        for node, endpoint in uses
+        if endpoint in new_names
+    }
     return [
-        f"{node} {right} {name}, which is {new} now" for node, right, name, new in sorted(alone)
+        f"{node} {right} {name}, which is {new} now" for node, right, name, new in sorted(abandoned)
     ]
 
 
@@ -421,5 +446,6 @@ def _denied_endpoints(denied: Iterable[DeniedRight]) -> set[tuple[str, Endpoint]
 def _endpoints_of(nodes: Iterable[ObservedNode]) -> Iterator[tuple[str, Endpoint]]:
     """Yield node name and endpoint, with ``*`` for the parts that change with every start."""
     for node in nodes:
-        for topic, way in node.endpoints:
-            yield node_name(node), Endpoint(topic.replace(node.name, stable_name(node.name)), way)
+        for endpoint in node.endpoints:
+            topic = endpoint.topic.replace(node.name, stable_name(node.name))
+            yield node_name(node), endpoint._replace(topic=topic)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 
@@ -30,55 +31,66 @@ def access_lines(policy: Policy, folder: Path) -> list[str]:
 
     Names that are used only as every node uses them (the common parts) are left out.
     """
-    common = common_parts(folder, policies_dir())
-    parts = [part for part in _NODE_PARTS if part in common.rights]
-    ordinary = {
-        (enclave.path, right.right, right.name)
-        for enclave in policy.enclaves
-        for profile in enclave.all_profiles()
-        for right in common.included_rights(parts, profile.ns, profile.node)
-    }
+    sides = _sides(policy, folder)
+    kinds = [*RIGHTS]
+    names_in_order = sorted(
+        sides, key=lambda use: (not all(sides[use]), kinds.index(use[0]), use[1])
+    )
+    lines = [
+        f"{kind.removesuffix('s')} {name}: "
+        + " -> ".join(first_few(names, MOST_NAMES) or "nobody" for names in sides[kind, name])
+        for kind, name in names_in_order
+    ]
+    surplus = len(lines) - _MOST_LINES
+    return [
+        *lines[:_MOST_LINES],
+        *([f"and {counted(surplus, 'more name')}"] if surplus > 0 else []),
+    ]
+
+
+def _sides(policy: Policy, folder: Path) -> Mapping[tuple[str, str], Sequence[Sequence[str]]]:
+    """Map kinds and names to the enclaves that may use them, by the rights of the kind."""
     rights = policy_rights(policy)
     rules, enclaves = Rules(rights), sorted({right.enclave for right in rights})
-    shown = {
-        (right.kind, right.name)
-        for right in rights
-        if right.kind in RIGHTS
-        and right.qualifier is ALLOW
-        and (right.enclave, right.right, right.name) not in ordinary
-    }
-    stated = {right for right in rights if right.qualifier is ALLOW and is_expression(right.name)}
+    allowed = {right for right in rights if right.qualifier is ALLOW}
+    ordinary = _ordinary_uses(policy, folder)
+    expressions = {right for right in allowed if is_expression(right.name)}
 
     def may(enclave: str, right: str, name: str) -> bool:
         if rules.allow(enclave, right, name):
             return True
         # A denial of some of the names leaves the others.
-        is_stated = Right(enclave, ALLOW, right, name) in stated
-        return is_stated and not rules.cover(Right(enclave, DENY, right, name))
+        is_allowed = Right(enclave, ALLOW, right, name) in expressions
+        return is_allowed and not rules.cover(Right(enclave, DENY, right, name))
 
-    sides = {
+    return {
         (kind, name): [
             [enclave for enclave in enclaves if may(enclave, right, name)] for right in RIGHTS[kind]
         ]
-        for kind, name in shown
+        for kind, name in {
+            (right.kind, right.name)
+            for right in allowed
+            if right.kind in RIGHTS and (right.enclave, right.right, right.name) not in ordinary
+        }
     }
-    kinds = [*RIGHTS]
-    in_order = sorted(
-        sides, key=lambda named: (not all(sides[named]), kinds.index(named[0]), named[1])
-    )
-    lines = [
-        f"{kind.removesuffix('s')} {name}: "
-        + " -> ".join(first_few(names, MOST_NAMES) or "nobody" for names in sides[kind, name])
-        for kind, name in in_order
-    ]
-    more = len(lines) - _MOST_LINES
-    return [*lines[:_MOST_LINES], *([f"and {counted(more, 'more name')}"] if more > 0 else [])]
+
+
+def _ordinary_uses(policy: Policy, folder: Path) -> set[tuple[str, str, str]]:
+    """Return enclave, right and name for the rights that the common parts give to every node."""
+    common = common_parts(folder, policies_dir())
+    parts = [part for part in _NODE_PARTS if part in common.rights]
+    return {
+        (enclave.path, right.right, right.name)
+        for enclave in policy.enclaves
+        for profile in enclave.all_profiles()
+        for right in common.included_rights(parts, profile.ns, profile.node)
+    }
 
 
 def requirements_broken_by(robot: Path, addition: str, moment: datetime) -> list[Requirement]:
     """Return the requirements in the folder of a closed robot that more rights would break.
 
-    ``addition`` is the policy document with these rights.  None if the folder has no requirements,
+    ``addition`` is the policy document with these rights.  Empty if the folder has no requirements,
     or the policy with the addition cannot be decided.
     """
     file, path = robot / REQUIREMENTS, robot / CLOSED_POLICY

@@ -109,8 +109,8 @@ class LocalRobot:
         self._check_writers()
         is_watched = self.processes_file.exists()
         self.observed = read_processes(self.processes_file) if is_watched else None
-        wanted = domain_of(shell.environment) if domain is None else domain
-        self.domain = self.observed.domain if self.observed else wanted
+        chosen = domain_of(shell.environment) if domain is None else domain
+        self.domain = self.observed.domain if self.observed else chosen
         if domain not in (None, self.domain):
             raise UsageError(
                 f"the robot was watched in domain {self.domain}, not {domain}",
@@ -131,10 +131,10 @@ class LocalRobot:
             ways = [*replaceable_on_the_way(path, trusted)]
             if path.exists() and (why := other_writers(path.stat(), trusted)):
                 ways.insert(0, (path, why))
-            for step, why in ways:
+            for place, why in ways:
                 raise SrosError(
                     f"others can change '{path}'",
-                    f"'{step}': {why}.",
+                    f"'{place}': {why}.",
                     "Close the robot into a folder that only you and root can change.",
                 )
 

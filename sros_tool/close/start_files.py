@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import shlex
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
-from sros_tool.close.processes import COMPOSE_FILE, ClosedProcess, launch_words
+from sros_tool.close.processes import COMPOSE_FILE, ClosedProcess, ObservedProcesses, launch_words
 from sros_tool.close.robot import LocalRobot
 from sros_tool.close.state import CloseState
 from sros_tool.files import remove_file
@@ -28,7 +28,7 @@ DROP_IN = "sros-close.conf"
 
 def write_start_files(robot: LocalRobot, state: CloseState) -> list[FileChange]:
     """Write the files that start each process with security; return what changed."""
-    observed, folder = state.observed, robot.folder.absolute()
+    observed = state.observed
     environments = {
         process.enclave: robot.variables(process.enclave, process.rmw)
         for process in observed.processes
@@ -37,44 +37,57 @@ def write_start_files(robot: LocalRobot, state: CloseState) -> list[FileChange]:
         f"{unit_instance(enclave)}.env": render_environment(variables, "docker")
         for enclave, variables in environments.items()
     }
-    services = [
-        "# Rename the services to those of your own file; give both files to Docker Compose 2."
-    ]
     for process in observed.processes:
-        variables = environments[observed.started_in(process)]
         if process.unit:
-            text = render_environment(variables, "systemd")
-            if process.lacks_enclave_argument:
-                words = (*process.command, ROS_ARGS, "--enclave", process.enclave)
-                text += f"ExecStart=\nExecStart={' '.join(unit_words(words))}\n"
-            files[f"units/{process.unit}.d/{DROP_IN}"] = (
-                f"{drop_in_heading(robot)}[Service]\n{text}"
-            )
-        enclave_files = str(folder / "export/enclaves" / process.enclave.strip("/"))
-        name = object_name(process.enclave)
-        service = render_container(
-            Container(process.enclave, name, variables, enclave_files), COMPOSE
-        )
-        services += ["services:", *service.splitlines()[1:]][len(services) > 1 :]
-    lines = _command_lines(robot, state)
-    if shutil.which("ros2", path=robot.shell.environment.get("PATH")):
-        launch = shlex.join(launch_words(folder, ("ros2", "launch"), ("PACKAGE", "FILE")))
-        lines += ["", "# Any launch file; each process needs name= in it.", launch]
-    files |= {robot.commands_file.name: _text(lines).lstrip(), COMPOSE_FILE: _text(services)}
+            variables = environments[observed.started_in(process)]
+            files[f"units/{process.unit}.d/{DROP_IN}"] = _drop_in(robot, process, variables)
+    files[robot.commands_file.name] = _commands_text(robot, state)
+    files[COMPOSE_FILE] = _compose_text(robot, observed, environments)
     changes = unit_changes(robot.start, files, force=True)
     write_units(robot.start, files, changes)
     written = [FileChange(action, str(robot.start / path)) for path, action in changes.items()]
-    kept = {robot.start / path for path in files}
+    return [*written, *_remove_environments(robot, files)]
+
+
+def _remove_environments(robot: LocalRobot, kept: Collection[str]) -> list[FileChange]:
+    """Remove the environments that were written here for enclaves without a known process."""
     keystore = f"{KEYSTORE}={robot.export.absolute()}\n".encode()
     unneeded = [
         path
-        for path in sorted({*robot.start.glob("*.env")} - kept)
-        if keystore in read_bytes(path, "environment file")  # written here, for another enclave
+        for path in sorted(robot.start.glob("*.env"))
+        if path.name not in kept and keystore in read_bytes(path, "environment file")
     ]
     for path in unneeded:
         remove_file(path)
         robot.shell.say(f"removed {path}: it was for an enclave without a known process")
-    return [*written, *(FileChange("remove", str(path)) for path in unneeded)]
+    return [FileChange("remove", str(path)) for path in unneeded]
+
+
+def _drop_in(robot: LocalRobot, process: ClosedProcess, variables: Mapping[str, str]) -> str:
+    """Return the drop-in of the unit that starts a process."""
+    text = render_environment(variables, "systemd")
+    if process.lacks_enclave_argument:
+        words = (*process.command, ROS_ARGS, "--enclave", process.enclave)
+        text += f"ExecStart=\nExecStart={' '.join(unit_words(words))}\n"
+    return f"{drop_in_heading(robot)}[Service]\n{text}"
+
+
+def _compose_text(
+    robot: LocalRobot,
+    observed: ObservedProcesses,
+    environments: Mapping[str, Mapping[str, str]],
+) -> str:
+    """Return a file for Docker Compose with a service for each process."""
+    services = []
+    for process in observed.processes:
+        files = str(robot.export.absolute() / "enclaves" / process.enclave.strip("/"))
+        variables = environments[observed.started_in(process)]
+        container = Container(process.enclave, object_name(process.enclave), variables, files)
+        services += render_container(container, COMPOSE).splitlines()[1:]
+    heading = (
+        "# Rename the services to those of your own file; give both files to Docker Compose 2."
+    )
+    return _text([heading, *(["services:"] if services else []), *services])
 
 
 def drop_in_heading(robot: LocalRobot) -> str:
@@ -82,7 +95,7 @@ def drop_in_heading(robot: LocalRobot) -> str:
     return f"# Made by `sros close {robot.folder.absolute()}`; undone by its --undo.\n"
 
 
-def _command_lines(robot: LocalRobot, state: CloseState) -> list[str]:
+def _commands_text(robot: LocalRobot, state: CloseState) -> str:
     """Return the commands that start processes by hand: first those that are due now."""
     folder, due = robot.folder.absolute(), state.pending_by_hand
     commands = state.observed.commands_by_hand(folder)
@@ -101,7 +114,11 @@ def _command_lines(robot: LocalRobot, state: CloseState) -> list[str]:
         lines += ["", f"# {name} {why}: COMMAND is what starts it", start]
     if rest:
         lines += ["", "# These processes run closed, with the current files."]
-    return [*lines, *_commands(rest)]
+    lines += _commands(rest)
+    if shutil.which("ros2", path=robot.shell.environment.get("PATH")):
+        launch = shlex.join(launch_words(folder, ("ros2", "launch"), ("PACKAGE", "FILE")))
+        lines += ["", "# Any launch file; each process needs name= in it.", launch]
+    return _text(lines).lstrip()
 
 
 def _commands(by_hand: Mapping[str, Sequence[ClosedProcess]]) -> Iterator[str]:

@@ -273,22 +273,35 @@ class CloseState(NamedTuple):
 def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
     """Return the processes of the enclaves that the policy has, as they run now."""
     running = RunningRobot(robot)
-    observed, new = ObservedProcesses(robot.domain), set[str]()
-    names = {enclave.name for _, enclave in running.secured} - {OBSERVER}
-    secured = {name: name in running.current_enclaves for name in sorted(names)}
+    secured = {
+        name: name in running.current_enclaves
+        for name in sorted({enclave.name for _, enclave in running.secured} - {OBSERVER})
+    }
+    observed = ObservedProcesses(robot.domain)
     if robot.observed:
         observed = running.with_later_processes(robot.observed).with_current_pids(running.processes)
-    if policy:
-        observed = observed.within(policy)
-        known = {process.enclave for process in observed.processes} | names
+    observed = observed.within(policy) if policy else observed
+    known = {process.enclave for process in observed.processes} | secured.keys()
+    new = set[str]()
+    if policy and robot.observed:
         new = {enclave.path for enclave in policy.enclaves} - known - {*observed.elsewhere}
-        new -= robot.not_here
-    new -= {OBSERVER} if robot.observed else new
-    known = {process.enclave for process in observed.processes} | new | secured.keys()
-    check_enclaves(robot.without, known | robot.not_here, "--without")
-    until = _valid_until(robot)
-    started = observed, (), secured, sorted(new), robot.without, until
-    return CloseState(robot.folder, *started, (), (), (), (), False, ())
+        new -= robot.not_here | {OBSERVER}
+    check_enclaves(robot.without, known | new | robot.not_here, "--without")
+    return CloseState(
+        folder=robot.folder,
+        observed=observed,
+        steps=(),
+        secured=secured,
+        new=sorted(new),
+        without=robot.without,
+        valid_until=_valid_until(robot),
+        denied=(),
+        newly_denied=(),
+        problems=(),
+        proofs=(),
+        dry_run=False,
+        changes=(),
+    )
 
 
 def _valid_until(robot: LocalRobot) -> datetime | None:

@@ -6,7 +6,7 @@ import json
 import os
 import shlex
 import threading
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
 from sros_tool.close.assignment import (
@@ -28,7 +28,7 @@ from sros_tool.names import expand, is_expression
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.merge import plan_merge
 from sros_tool.policy.model import ALLOW, Policy
-from sros_tool.policy.rights import policy_rights
+from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.runtime.environment import RMW_ZENOH
 from sros_tool.runtime.processes import Process, ProcessOrigin, ProcessTable, process_origin
 from sros_tool.runtime.rmw import RMW
@@ -76,23 +76,41 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
     Raises:
         SrosError: no node was observed.
     """
-    started: _StartedProcesses = {}
-    with _looking(robot, started):
-        status, output, _ = robot.shell.run(words, True)
+    with _recorded_processes(robot) as started:
+        status, document, _ = robot.shell.run(words, True)
+    running = RunningRobot(robot)
     if status:
-        others = RunningRobot(robot).in_other_domains()
+        others = running.in_other_domains()
         raise UnavailableError(
             f"there is no robot to close: no node was observed in domain {robot.domain}",
             f"{others}." if others else "",
             f"{'Otherwise start' if others else 'Start'} the robot open, and run this again.",
         )
-    return _remember(robot, output, started)
+    replace_file(robot.observer, (policies_dir() / "observer.xml").read_bytes())
+    learned = json.loads(document)
+    all_nodes = observation_from_json(learned).nodes
+    in_enclaves = ObservedNodes(robot, all_nodes).in_their_enclaves()
+    nodes = [node for node in in_enclaves if not is_tool(node)]
+    observed = _observed_processes(running, nodes, learned["ended"], started)
+    _remember(robot, document, observed)
+    _say_variables(running, observed)
+    number = counted(len(observed.processes), "process", "processes")
+    robot.shell.say(f"saw {counted(len(nodes), 'node')} in {number} of this machine")
+    if others := running.in_other_domains():
+        robot.shell.say(others)
+    if os.path.lexists(robot.observed_policy):  # of an earlier watch
+        remove_file(robot.observed_policy)
+    without_enclave = [node.fqn for node in all_nodes if not node.enclaves and not is_tool(node)]
+    problems = [_without_enclave_text(robot, without_enclave)] if without_enclave else []
+    lacking = _lacking_text(robot, nodes) if learned["dry_run"] else ""
+    return problems + [lacking] * bool(lacking)
 
 
 @contextmanager
-def _looking(robot: LocalRobot, started: _StartedProcesses) -> Iterator[None]:
-    """Add to ``started`` all processes that run during the context, and what started them."""
-    table, over = ProcessTable(), threading.Event()
+def _recorded_processes(robot: LocalRobot) -> Iterator[_StartedProcesses]:
+    """Record all processes that run during the context, and what started them."""
+    table, is_over = ProcessTable(), threading.Event()
+    started: _StartedProcesses = {}
 
     def look() -> None:
         for process in table.look(robot.shell.now()).processes:
@@ -106,31 +124,24 @@ def _looking(robot: LocalRobot, started: _StartedProcesses) -> Iterator[None]:
         while True:
             with suppress(OSError):  # the next look may succeed
                 look()
-            if over.wait(_LOOK_SECONDS):
+            if is_over.wait(_LOOK_SECONDS):
                 return
 
     looking = threading.Thread(target=look_until_over)
     looking.start()
     try:
-        yield
+        yield started
     finally:
-        over.set()
+        is_over.set()
         looking.join()
 
 
-def _remember(robot: LocalRobot, document: str, started: _StartedProcesses) -> list[str]:
-    """Write which process has which nodes, and the policy of the observer.
+def _remember(robot: LocalRobot, document: str, observed: ObservedProcesses) -> None:
+    """Write the observation and the processes, also those of earlier watches that do not run now.
 
-    ``document`` is the observation, and ``started`` are the processes that ran while sros watched.
-    Return, as sentences, which nodes have no enclave, and which of the observed rights an earlier
-    policy lacks.
+    Raises:
+        UsageError: an option names an enclave that the robot does not have.
     """
-    replace_file(robot.observer, (policies_dir() / "observer.xml").read_bytes())
-    running, learned = RunningRobot(robot), json.loads(document)
-    every_node = observation_from_json(learned).nodes
-    in_enclaves = ObservedNodes(robot, every_node).in_their_enclaves()
-    nodes = [node for node in in_enclaves if not is_tool(node)]
-    observed = _observed_processes(robot, nodes, learned["ended"], running, started)
     enclaves_here = {process.enclave for process in observed.processes}
     not_here = (robot.not_here - enclaves_here).union(robot.named_elsewhere)
     robot.check_elsewhere()
@@ -140,20 +151,10 @@ def _remember(robot: LocalRobot, document: str, started: _StartedProcesses) -> l
     remembered = observed._replace(processes=[*observed.processes, *kept])
     replace_file(robot.observation_file, document.encode())
     robot.remember(remembered.belonging_elsewhere(not_here))
-    _say_variables(robot, observed, running)
-    number = counted(len(observed.processes), "process", "processes")
-    robot.shell.say(f"saw {counted(len(nodes), 'node')} in {number} of this machine")
-    if others := running.in_other_domains():
-        robot.shell.say(others)
-    if os.path.lexists(robot.observed_policy):  # of an earlier watch
-        remove_file(robot.observed_policy)
-    without_enclave = [node.fqn for node in every_node if not node.enclaves and not is_tool(node)]
-    problems = [_without_enclave_text(robot, without_enclave)] if without_enclave else []
-    lacking = _lacking_text(robot, nodes) if learned["dry_run"] else ""
-    return problems + [lacking] * bool(lacking)
 
 
 def _without_enclave_text(robot: LocalRobot, names: Sequence[str]) -> str:
+    """Return, as a sentence, which nodes the graph shows without an enclave."""
     return (
         f"{first_few(names, MOST_NAMES)}: the identifier of the participant is that of a secured "
         f"one, so '{robot.policy}' has no rights for this node; if it is of the robot, start it "
@@ -162,18 +163,16 @@ def _without_enclave_text(robot: LocalRobot, names: Sequence[str]) -> str:
 
 
 def _observed_processes(
-    robot: LocalRobot,
+    running: RunningRobot,
     nodes: Sequence[ObservedNode],
     ended_participants: Collection[str],
-    running: RunningRobot,
     started: _StartedProcesses,
 ) -> ObservedProcesses:
     """Return the processes of the observed nodes, also those that ended while sros watched."""
-    processes = running.processes.processes
+    processes, domain = running.processes.processes, running.robot.domain
     pids = [process.pid for process in processes if "libddsc" in process.libraries]
     stayed = [node for node in nodes if node.participant not in ended_participants]
-    process_ids = process_ids_of_cyclone(pids, robot.domain)
-    observed = assign(stayed, processes, robot.domain, process_ids)
+    observed = assign(stayed, processes, domain, process_ids_of_cyclone(pids, domain))
     ended = {node.enclaves[0] for node in nodes} - {node.enclaves[0] for node in stayed}
     commands = {process.command for process in processes}
     finished = ended_processes(
@@ -185,17 +184,17 @@ def _observed_processes(
     return observed._replace(processes=with_units, ended=sorted(ended))
 
 
-def _say_variables(robot: LocalRobot, observed: ObservedProcesses, running: RunningRobot) -> None:
+def _say_variables(running: RunningRobot, observed: ObservedProcesses) -> None:
     """Print variables of the processes that neither their commands nor this shell set."""
-    rmws = {process.pid: process.rmw for process in observed.processes}
+    robot, rmws = running.robot, {process.pid: process.rmw for process in observed.processes}
     for process in running.processes.processes:
-        more = process.environment.keys() - {*robot.shell.environment, *_SHELL_VARIABLES}
-        more -= {RMW} if rmws.get(process.pid) else set()
-        if process.pid in rmws and more:
+        unset = process.environment.keys() - {*robot.shell.environment, *_SHELL_VARIABLES}
+        unset -= {RMW} if rmws.get(process.pid) else set()
+        if process.pid in rmws and unset:
             robot.shell.say(
                 f"{process.label} has variables that this shell does not have, and that its "
                 f"command in {robot.commands_file} does not set: "
-                f"{first_few(sorted(more), MOST_NAMES)}"
+                f"{first_few(sorted(unset), MOST_NAMES)}"
             )
 
 
@@ -212,29 +211,40 @@ def _lacking_text(robot: LocalRobot, nodes: Sequence[ObservedNode]) -> str:
     if not lacking:
         return ""
     write(draft(robot.observed_policy, learned, common))
-    used, stated = policy_rights(learned.policy()), policy_rights(policy)
-    rights, meanings = [], [*_lost_namespaces(nodes, policy)]
-    for right in lacking:
-        rights.append(f"{right.enclave} {right.right} {right.name}")
-        named = (
-            other
-            for other in stated
-            if (other.enclave, other.qualifier) == (right.enclave, ALLOW)
-            and not is_expression(other.name)
-        )
-        if meaning := likely_meaning(right, used, named):
-            meanings.append(meaning)
+    rights = [f"{right.enclave} {right.right} {right.name}" for right in lacking]
+    meanings = [
+        *_lost_namespaces(nodes, policy),
+        *_likely_meanings(lacking, policy_rights(learned.policy()), policy_rights(policy)),
+    ]
     files = shlex.join((str(robot.policy), str(robot.observed_policy)))
     add = f"sros merge_policy {files} --in-place"
-    first = (
+    restart = (
         f"{first_few(meanings, MOST_NAMES)}; then restart it with that, and watch again: "
         f"{robot.close_command} --for 1m; otherwise, " * bool(meanings)
     )
     return (
         f"'{robot.policy}' stays as it is, and lacks {counted(len(rights), 'right')} seen now "
-        f"({first_few(rights, MOST_NAMES)}); {first}if a process should not have them, stop "
+        f"({first_few(rights, MOST_NAMES)}); {restart}if a process should not have them, stop "
         f"it, and run `{robot.close_command}`; if they are right, add them: {add}"
     )
+
+
+def _likely_meanings(
+    lacking: Iterable[Right], used: Collection[Right], policy: Collection[Right]
+) -> Iterator[str]:
+    """Yield clauses on names of a policy that nodes probably mean by those that it lacks.
+
+    ``used`` are the rights that the nodes use, and ``policy`` those of the policy.
+    """
+    for right in lacking:
+        allowed = (
+            other
+            for other in policy
+            if (other.enclave, other.qualifier) == (right.enclave, ALLOW)
+            and not is_expression(other.name)
+        )
+        if meaning := likely_meaning(right, used, allowed):
+            yield meaning
 
 
 def _lost_namespaces(nodes: Sequence[ObservedNode], policy: Policy) -> Iterator[str]:
@@ -242,16 +252,16 @@ def _lost_namespaces(nodes: Sequence[ObservedNode], policy: Policy) -> Iterator[
 
     A namespace does not count if a node of this name was seen there, too.
     """
-    seen = {node_name(node) for node in nodes}
+    observed_names = {node_name(node) for node in nodes}
     namespaces: dict[str, set[str]] = {}
     for enclave in policy.enclaves:
         for profile in enclave.all_profiles():
             if not is_expression(f"{profile.ns}{profile.node}"):
                 namespaces.setdefault(profile.node, set()).add(profile.ns)
     for node in nodes:
-        stated = namespaces.get(node.name, set())
-        lost = [ns for ns in stated if expand("~", ns, node.name) not in seen]
-        if node.ns not in stated and len(lost) == 1:
+        in_policy = namespaces.get(node.name, set())
+        lost = [ns for ns in in_policy if expand("~", ns, node.name) not in observed_names]
+        if node.ns not in in_policy and len(lost) == 1:
             yield (
                 f"perhaps {node_name(node)} is {expand('~', lost[0], node.name)}, started without "
                 f"its namespace (-r __ns:={lost[0]})"

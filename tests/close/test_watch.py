@@ -17,7 +17,7 @@ def test_variables_that_a_command_does_not_set_are_named() -> None:
     closed = ClosedProcess.from_process(talker, "/talker", ProcessOrigin("", "/opt"), "program")
     shown: list[str] = []
     shell = SimpleNamespace(environment={"HOME": "/root"}, say=shown.append)
-    robot: Any = SimpleNamespace(shell=shell, commands_file="commands.txt")
-    now: Any = SimpleNamespace(processes=RunningProcesses((talker,)))
-    watch._say_variables(robot, ObservedProcesses(0, [closed]), now)
+    robot = SimpleNamespace(shell=shell, commands_file="commands.txt")
+    running: Any = SimpleNamespace(robot=robot, processes=RunningProcesses((talker,)))
+    watch._say_variables(running, ObservedProcesses(0, [closed]))
     assert len(shown) == 1 and shown[0].endswith("its command in commands.txt does not set: GAIN")
