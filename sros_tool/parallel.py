@@ -60,7 +60,7 @@ class Tally:
         """Return the number of items that are done."""
         return sum(self._counts)
 
-    def left(self) -> float | None:
+    def remaining_seconds(self) -> float | None:
         """Return the estimated remaining seconds; None before the first item is done."""
         done = self.done()
         return (time.monotonic() - self._began) * (self.total - done) / done if done else None

@@ -156,8 +156,8 @@ def audit(
                 reported.add(key)
                 echo(f"denied: {line}", err=True)
 
-    then = "the result is shown"
-    snapshot, rmw = observe(environment, watch, spin_time, report, then=then)
+    at_end = "the result is shown"
+    snapshot, rmw = observe(environment, watch, spin_time, report, at_end=at_end)
     audited = judge(snapshot.everything)
     kept_changing = snapshot.seconds if not snapshot.settled else 0
     fine = audited.allowed and (partial or (audited.complete and not kept_changing))

@@ -1063,7 +1063,11 @@ class _Line:
     def _draw(self, _number: int, _frame: FrameType | None) -> None:
         done, total, left = self._done, self._total, None
         if self._tally.total:
-            done, total, left = self._tally.done(), self._tally.total, self._tally.left()
+            done, total, left = (
+                self._tally.done(),
+                self._tally.total,
+                self._tally.remaining_seconds(),
+            )
         count = f" {done} of {total}" if total and done else ""
         seconds = time.monotonic() - self._began
         time_left = (

@@ -129,13 +129,13 @@ def observe(
     spin_time: float | None,
     report: Callable[[Observation], None],
     *,
-    then: str,
+    at_end: str,
 ) -> tuple[Snapshot, str]:
     """Observe the ROS graph; return the result and the RMW in use.
 
     ``watch`` is the value of --watch; None observes for ``spin_time`` seconds, or until the graph
     stops changing.  While watching, ``report`` gets everything seen so far whenever it has grown;
-    ``then`` tells the user what happens at the end.
+    ``at_end`` tells the user what happens at the end.
     """
     from sros_tool.graph.observe import (
         SECURED,
@@ -161,7 +161,7 @@ def observe(
     try:
         with RosGraph(environment) as graph:
             if watch is not None:
-                snapshot = _watch(graph, seconds, lambda seen: report(identify(seen)), then)
+                snapshot = _watch(graph, seconds, lambda seen: report(identify(seen)), at_end)
             elif spin_time is not None:
                 snapshot = look_for(graph, spin_time, time.monotonic)
             else:
@@ -190,13 +190,13 @@ def _enclaves_by_identity(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 def _watch(
-    graph: RosGraph, seconds: float | None, report: Callable[[Observation], None], then: str
+    graph: RosGraph, seconds: float | None, report: Callable[[Observation], None], at_end: str
 ) -> Snapshot:
     from sros_tool.graph.observe import watch
 
     with _signal_watch() as stopped:
         until = f"for {seconds:.0f} s, or {_FOREVER}" if seconds else _FOREVER
-        echo(f"watching {until}; then {then}", err=True)
+        echo(f"watching {until}; then {at_end}", err=True)
         begin = time.monotonic()
         snapshot = watch(graph, seconds, time.monotonic, stop=stopped, report=report)
         if stopped():
@@ -465,7 +465,7 @@ def generate_policy(
         watch,
         spin_time,
         report,
-        then="the result is shown" if dry_run else "the policy is written",
+        at_end="the result is shown" if dry_run else "the policy is written",
     )
     seen = named(snapshot.observation if watch is None else snapshot.everything)
     stayed = {node.participant for node in snapshot.observation.nodes}

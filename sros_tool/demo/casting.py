@@ -251,7 +251,7 @@ class _Enclaves(NamedTuple):
 
     def rows(self) -> Iterator[Row]:
         """Yield a row for each enclave with faulty or revoked files, up to `_MOST_FAULTY`."""
-        rows = [revoked_enclave_row(name, by_own) for name, by_own in self.revoked.items()]
+        rows = [revoked_enclave_row(name, has_list) for name, has_list in self.revoked.items()]
         rows += [faulty_enclave_row(name, why) for name, why in self.faulty.items()]
         yield from rows[:_MOST_FAULTY]
 

@@ -130,7 +130,7 @@ class DrawnUnit(NamedTuple):
     group: tuple[object, ...] = ()
 
     @property
-    def alone(self) -> bool:
+    def is_single_enclave(self) -> bool:
         """Whether the unit is a single enclave, not a robot or namespace."""
         return self.what == _ENCLAVE
 
@@ -593,7 +593,7 @@ class _Draft:
                 yield enclave
             elif self._is_drawn(unit):
                 note = "differs" if enclave.path in differing else ""
-                if unit in self._inside and self._units[unit].alone:
+                if unit in self._inside and self._units[unit].is_single_enclave:
                     equal = self._unit_names(self._classes[self._inside[unit]])
                     note = f"{len(equal)} equal enclaves"
                 path, group = self._path(enclave.path), self._text(enclave.group).fill(self._label)

@@ -87,7 +87,7 @@ def parse_json5(text: str, *, lines: bool = True) -> Any:
     if not lines and not _NOT_IN_JSON5.search(text):
         with suppress(Json5Error):  # then the reader of JSON5 says what is wrong
             return parse_json(text)
-    return _Reader(text, _MOST_TOKENS if lines else _MOST_WITHOUT_LINES).whole()
+    return _Reader(text, _MOST_TOKENS if lines else _MOST_WITHOUT_LINES).document()
 
 
 def parse_json(text: str) -> Any:
@@ -150,7 +150,7 @@ class _Reader:
         self._tokens = _tokens(text, maximum)
         self._now = next(self._tokens)
 
-    def whole(self) -> Any:
+    def document(self) -> Any:
         value = self._value(_MOST_DEPTH)
         if self._now.kind != "end":
             raise self._unexpected_error()

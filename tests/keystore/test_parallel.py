@@ -38,10 +38,10 @@ def test_what_forked_workers_have_done_is_counted(monkeypatch: pytest.MonkeyPatc
             parallel.tick()
         if os.getpid() == own:
             wait_for(lambda: tally.done() == len(ITEMS), "the worker counts its share")
-            seen.append((tally.total, tally.left()))
+            seen.append((tally.total, tally.remaining_seconds()))
 
     with parallel.tallied() as tally:
-        assert tally.left() is None
+        assert tally.remaining_seconds() is None
         for _ in range(2):
             parallel.map_slices(ITEMS, work)
             assert (tally.total, tally.done()) == (0, 0)

@@ -637,15 +637,15 @@ def faulty_enclave_row(enclave: str, fault: str) -> Row:
     return _discovery_row(name, Identity(OWN, enclave), RowStatus.VISIBLE, fault)
 
 
-def revoked_enclave_row(enclave: str, own: bool) -> Row:
+def revoked_enclave_row(enclave: str, has_list: bool) -> Row:
     """Return a row that shows whether a revoked enclave can join the others.
 
-    ``own`` says whether the enclave itself has the revocation list with its certificate.
+    ``has_list`` says whether the enclave itself has the revocation list with its certificate.
     """
     return _discovery_row(
         f"{enclave}, revoked, joins the other enclaves",
         Identity(OWN, enclave),
-        RowStatus.NOT_LET_IN if own else RowStatus.NOT_VISIBLE,
+        RowStatus.NOT_LET_IN if has_list else RowStatus.NOT_VISIBLE,
         "the revocation list of the keystore names its certificate",
     )
 
