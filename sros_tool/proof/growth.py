@@ -1132,18 +1132,21 @@ def _new_nodes(before: AccessSource, after: AccessSource) -> Iterator[NewNode]:
     A node that is alone in its enclave may have another name than before, and a node whose name a
     wildcard of the enclave matched is not new.
     """
-    old_enclaves, new_enclaves = map(_enclaves_of_nodes, (before, after))
-    assigned = [
-        (node, path)
-        for node, profiles in sorted(new_enclaves.items())
-        for path in sorted((profiles.keys() & before.enclaves.keys()) - old_enclaves[node].keys())
-        if not any(map(node_of(profiles[path]).is_within, nodes_of(before.enclaves[path])))
-    ]
+    old_nodes, new_nodes = _enclaves_of_nodes(before, after), _enclaves_of_nodes(after, before)
+    assigned = []
+    for node, robots in sorted(new_nodes.items()):
+        for robot, profiles in sorted(robots.items()):
+            earlier = _enclaves_near(old_nodes.get(node, {}), robot).keys()
+            left = earlier - _enclaves_near(robots, robot).keys()
+            assigned += [
+                (node, path, profiles[path], earlier, left)
+                for path in sorted((profiles.keys() & before.enclaves.keys()) - earlier)
+                if not any(map(node_of(profiles[path]).is_within, nodes_of(before.enclaves[path])))
+            ]
     if not assigned:  # of a large fleet, the rights are many
         return
     old_rights, new_rights = map(_rights_by_enclave, (before.rights, after.rights))
-    for node, path in assigned:
-        profile, earlier = new_enclaves[node][path], old_enclaves[node].keys()
+    for node, path, profile, earlier, left in assigned:
         had = [right for enclave in earlier for right in old_rights.get(enclave, ())]
         had = had if earlier else [*profile_rights(path, profile)]
         known = Rules(right._replace(enclave=path) for right in had)
@@ -1152,9 +1155,8 @@ def _new_nodes(before: AccessSource, after: AccessSource) -> Iterator[NewNode]:
         gained += _rights_without_denial(had, path, Rules(new_rights.get(path, ())))
         if gained:
             full = f"/{'/'.join(node)}".replace("//", "/")
-            moved_from = min(earlier - new_enclaves[node].keys(), default="")
             place = after.shown_source(profile.source)
-            yield NewNode(full, path, moved_from, min(gained, key=order), place)
+            yield NewNode(full, path, min(left, default=""), min(gained, key=order), place)
 
 
 def _rights_without_denial(had: Iterable[Right], path: str, stated: Rules) -> Iterator[Right]:
@@ -1183,12 +1185,14 @@ def _dropped_denials(before: AccessSource, after: AccessSource) -> Iterator[Drop
     stated = Rules(after.rights)
     left = {right.enclave for right in after.rights} | after.permissions.keys()
     owed = defaultdict(set, {"": {denial for denial in denials if denial.enclave in left}})
-    old_enclaves, new_enclaves = map(_enclaves_of_nodes, (before, after))
-    for node, profiles in old_enclaves.items():
-        now = new_enclaves.get(node, {}).keys()
-        for path, old_path in product(now - profiles, profiles.keys() - now):
-            rights = unfolded(profile_rights(path, profiles[old_path]))
-            owed[old_path].update(right for right in rights if right.qualifier is DENY)
+    old_nodes, new_nodes = _enclaves_of_nodes(before, after), _enclaves_of_nodes(after, before)
+    for node, robots in old_nodes.items():
+        for robot, profiles in robots.items():
+            now = _enclaves_near(new_nodes.get(node, {}), robot).keys()
+            new = now - _enclaves_near(robots, robot).keys()
+            for path, old_path in product(new, profiles.keys() - now):
+                rights = unfolded(profile_rights(path, profiles[old_path]))
+                owed[old_path].update(right for right in rights if right.qualifier is DENY)
     for old_path, denied in owed.items():
         names = {part: undenied_name(part, stated) for part in denied}
         for right in sorted(folded(part for part, name in names.items() if name)):
@@ -1197,15 +1201,31 @@ def _dropped_denials(before: AccessSource, after: AccessSource) -> Iterator[Drop
             yield DroppedDenial(right, name if stated.overlaps(right) else "", old_path)
 
 
-def _enclaves_of_nodes(side: AccessSource) -> defaultdict[tuple[str, str], dict[str, Profile]]:
-    """Map namespace and name of each node in policies to its enclaves, with its profiles there."""
-    enclaves: defaultdict[tuple[str, str], dict[str, Profile]] = defaultdict(dict)
+_Node = tuple[str, str]
+_EnclavesByRobot = dict[str, dict[str, Profile]]
+
+
+def _enclaves_of_nodes(side: AccessSource, other: AccessSource) -> dict[_Node, _EnclavesByRobot]:
+    """Map namespace and name of each node in policies to its enclaves, with its profiles there.
+
+    The enclaves are divided by their robots ("": no robot), which may have nodes of the same name.
+    """
+    fleet = side.fleet or other.fleet
+    nodes: dict[_Node, _EnclavesByRobot] = {}
     for path, enclave in side.enclaves.items():
+        robot = robot_of(fleet, path) if fleet else None
         for profile in enclave.all_profiles():
-            node = profile.ns.strip("/"), profile.node
-            others = enclaves[node][path].groups if path in enclaves[node] else ()
-            enclaves[node][path] = replace(profile, groups=(*others, *profile.groups))
-    return enclaves
+            robots = nodes.setdefault((profile.ns.strip("/"), profile.node), {})
+            profiles = robots.setdefault(robot.name if robot else "", {})
+            others = profiles[path].groups if path in profiles else ()
+            profiles[path] = replace(profile, groups=(*others, *profile.groups))
+    return nodes
+
+
+def _enclaves_near(robots: _EnclavesByRobot, robot: str) -> dict[str, Profile]:
+    """Return the enclaves of a node that are of a robot or of none; for "", all."""
+    near = (robots.get("", {}), robots.get(robot, {})) if robot else robots.values()
+    return {path: profile for profiles in near for path, profile in profiles.items()}
 
 
 def undenied_name(denied: Right, stated: Rules) -> str | None:

@@ -149,6 +149,30 @@ def test_a_node_that_loses_a_denial_in_another_enclave(
     assert (line in ended.out) == bool(found)
 
 
+def test_a_node_that_moves_on_each_robot_of_a_fleet(tmp_path: Path) -> None:
+    """Nodes of other robots may have the same name, such as in domains of their own."""
+    (tmp_path / "fleet.toml").write_text("robots = {r1 = {}, r2 = {}}")
+    deny = publish("/secret").replace("ALLOW", "DENY")
+    moves = f'<profile ns="/" node="moves">{publish("/a")}'
+    stays, other = (f'<profile ns="/" node="{n}">{publish("/a")}</profile>' for n in "so")
+    for file, web, mux in (
+        ("base.xml", f"{stays}{moves}{deny}</profile>", other),
+        ("head.xml", stays, f"{other}{moves}</profile>"),
+    ):
+        enclaves = (("web", web), ("mux", mux))
+        text = "".join(
+            f'<enclave path="/{{robot}}/{name}"><profiles>{nodes}</profiles></enclave>'
+            for name, nodes in enclaves
+        )
+        (tmp_path / file).write_text(
+            f'<policy version="0.2.0"><enclaves>{text}</enclaves></policy>'
+        )
+    words = ("base.xml", "head.xml", "--fleet", "fleet.toml", "--json")
+    found = json.loads(sros("diff_policy", "--no-new-access", *words, cwd=tmp_path).ok().out)
+    denials = {(e["denial"]["enclave"], e["moved_from"]) for e in found["dropped_denials"]}
+    assert {e for e in denials if e[1]} == {("/r1/mux", "/r1/web"), ("/r2/mux", "/r2/web")}
+
+
 @pytest.mark.parametrize("part", range(8 if LONG else 1))
 def test_random_pairs_against_single_questions(tmp_path: Path, part: int) -> None:
     """Policies, keystores, fleets and Zenoh files: what is new is found, and nothing else."""
