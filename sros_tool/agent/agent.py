@@ -37,6 +37,7 @@ from sros_tool.agent.settings import AgentSettings, agent_folder
 from sros_tool.agent.state import mark_outdated, read_seal, read_state, write_seal, write_state
 from sros_tool.checks.keystores.installed import (
     InstalledEnclave,
+    exposed_keys,
     exposed_sentences,
     open_installed,
     unusable_sentences,
@@ -196,6 +197,11 @@ class _Round:
         clock = self._clock(proven)
         # Documents that were verified prove that this moment has passed, whatever the clock shows.
         certain = max(now, before.latest) if before.latest else now
+        readable_keys = exposed_keys(self._folder, now)
+        recent = {key: at for key, at in before.exposed.items() if abs(now - at) < _REPAIRED_FOR}
+        # Remembered before the change, which closes the keys of changed enclaves to others.
+        exposed = recent | dict.fromkeys(readable_keys, now)
+        self._state = replace(self._state, exposed=exposed)
         installation, fetched = self._fetch_and_install(certain)
         repaired = self._state.repaired_at
         if repaired and abs(now - repaired) < _REPAIRED_FOR:
@@ -205,6 +211,7 @@ class _Round:
         if clock is not RobotClock.BEHIND:  # what is wrong is seen on a clock that is right
             self._problems += unusable_sentences(opened)
         self._problems += exposed_sentences(self._folder, now)
+        self._note_closed_keys(exposed, now)
         self._note_due(installation.changed, names)
         restarted: Sequence[str] = ()
         if clock is not RobotClock.BEHIND:  # nodes would not accept their certificates
@@ -363,6 +370,18 @@ class _Round:
                 f"{first_few(paths, 3)}. Find out who or what changes files on this robot."
             )
             self._state = replace(self._state, repaired=text, repaired_at=now)
+
+    def _note_closed_keys(self, exposed: Mapping[str, datetime], now: datetime) -> None:
+        """Report the keys that others could read until the agent closed them, for a day."""
+        closed = {key: exposed[key] for key in exposed.keys() - exposed_keys(self._folder, now)}
+        self._state = replace(self._state, exposed=closed)
+        if closed:
+            self._problems.append(
+                f"Until {iso(max(closed.values()))}, others could read "
+                f"{counted(len(closed), 'private key')}: {first_few(sorted(closed), 3)}. The agent "
+                "set the mode to 0600. If anybody may have copied a key: `sros renew KEYSTORE "
+                "ENCLAVE --new-key --revoke-old` in the keystore."
+            )
 
     def _install(self, release: Release, certain_time: datetime) -> Installation:
         settings, state = self._settings, self._state

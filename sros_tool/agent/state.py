@@ -48,7 +48,9 @@ class AgentState:
     round, as text: of all files, and of the files that decide whom the enclave trusts.  A change of
     a digest, whoever wrote the files, makes a restart due.  ``fetched`` and
     ``sent`` are when the source and the inbox were last reached.  ``repaired`` is a sentence on
-    files that were not those of the release and were replaced, at ``repaired_at``.
+    files that were not those of the release and were replaced, at ``repaired_at``.  ``exposed``
+    maps paths of private keys that others could read, until the agent closed them, to the time of
+    that round.
     """
 
     release: int = 0
@@ -64,6 +66,7 @@ class AgentState:
     problems: tuple[str, ...] = ()
     repaired: str = ""
     repaired_at: datetime | None = None
+    exposed: Mapping[str, datetime] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
 
     def next_sequence(self, now: datetime) -> int:
@@ -111,6 +114,10 @@ def _state_from(value: Any) -> AgentState:
     value["files"] = {
         check_enclave_name(_text(name)): _text(text)
         for name, text in dict(value.get("files", {})).items()
+    }
+    value["exposed"] = {
+        _text(path): parse_iso(_text(moment))
+        for path, moment in dict(value.get("exposed", {})).items()
     }
     value["problems"] = tuple(map(_text, value["problems"]))
     return AgentState(**value)

@@ -93,7 +93,7 @@ def print_follow_up(
 ) -> None:
     """Print the next steps after a change on standard error; arguments as for `print_changed`."""
     if not result.dry_run:
-        _print_closed(result.root, result.changes)
+        print_closed(result.root, result.changes)
     if rights:  # on stderr, because stdout is that of ros2/sros2
         _tell(rights_lines(result.root, result.rights, dry_run=result.dry_run))
     _tell(after)
@@ -146,8 +146,11 @@ def _change_lines(root: Path, paths: Sequence[str]) -> Iterator[str]:
     yield from folded(fleet, lines)
 
 
-def _print_closed(root: Path, changes: Sequence[Change]) -> None:
-    """Report on stderr keys that were closed to other users, and adoption of an sros2 keystore."""
+def print_closed(root: Path, changes: Sequence[Change], *, keystore: Path | None = None) -> None:
+    """Report on stderr keys that were closed to other users, and adoption of an sros2 keystore.
+
+    ``root`` is an export of ``keystore``, or, without that argument, the keystore itself.
+    """
     if any(change.action == "adopt" for change in changes):
         echo(
             f"took over '{root}', which ros2/sros2 made: it has settings and a ledger from now on. "
@@ -157,7 +160,7 @@ def _print_closed(root: Path, changes: Sequence[Change]) -> None:
         )
     closed = [str(root / change.path) for change in changes if change.action == "close"]
     if closed:
-        where = quote(str(root))
+        where = quote(str(keystore or root))
         echo(
             "closed to other users, who could open them until now: "
             f"{first_few(closed, _CLOSED_SHOWN)}. Run the nodes as the owner of the keystore, or "

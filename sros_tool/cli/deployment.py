@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sros_tool.cli.changed import print_changed, print_follow_up, print_plan
+from sros_tool.cli.changed import print_changed, print_closed, print_follow_up, print_plan
 from sros_tool.cli.common import (
     PATH,
     allow_refusal_option,
@@ -143,6 +143,8 @@ def distribute_key(
         for change in export.changes if done else ():
             if word := {"replace": "replaced", "remove": "removed"}.get(change.action):
                 echo(f"{word} {change.path}", err=True)
+        if done:
+            print_closed(below, export.changes, keystore=root)
     for name in selection.names if done and not as_json else ():
         echo(f"exported enclave {name} to {where}", err=target == _STREAM)
     if as_json:

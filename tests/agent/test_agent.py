@@ -406,6 +406,24 @@ def test_a_round_names_what_no_process_could_start_with_and_what_others_can_chan
     assert key.startswith("enclaves/r1/c/key.pem: a private key that others can read")
 
 
+def test_a_key_that_others_could_read_is_named_for_a_day_after_the_agent_closed_it(
+    home: Home, r1: Robot
+) -> None:
+    r1.round()
+    key = r1.folder / "enclaves/r1/a/key.pem"
+    for release in (home.renewed, None):
+        key.chmod(0o644)
+        if release is None:
+            (r1.folder / "enclaves/r1/a/permissions.p7s").unlink()
+        r1.release = release or r1.release
+        problems = r1.round().problems
+        assert key.stat().st_mode & 0o777 == 0o600
+        assert any("others could read 1 private key: enclaves/r1/a/key.pem" in p for p in problems)
+    later = moment() + timedelta(hours=23)
+    assert any("others could read" in problem for problem in r1.round(later).problems)
+    assert not r1.round(moment() + timedelta(hours=25)).problems
+
+
 # ── the clock ──────────────────────────────────────────────────────────────────────────────
 
 

@@ -81,6 +81,19 @@ def test_exported_enclaves_are_listed(keystore: Path, tmp_path: Path) -> None:
     assert sros("list_enclaves", tmp_path / "out").ok().out == "/a\n/b\n"
 
 
+def test_a_key_that_an_export_closes_to_others_is_named(keystore: Path, tmp_path: Path) -> None:
+    robot = tmp_path / "robot"
+    sros("distribute_key", keystore, "/a", robot).ok()
+    (robot / "enclaves/a" / "key.pem").chmod(0o644)
+    (robot / "enclaves/a" / "governance.p7s").write_text("x")
+    said = sros("distribute_key", keystore, "/a", robot, "--force").ok().err
+    assert stat.S_IMODE((robot / "enclaves/a" / "key.pem").stat().st_mode) == 0o600
+    assert (
+        f"closed to other users, who could open them until now: {robot}/enclaves/a/key.pem" in said
+    )
+    assert f"sros renew {keystore} ENCLAVE --new-key" in said
+
+
 def test_a_host_by_patterns(keystore: Path, tmp_path: Path) -> None:
     sros("create_enclave", keystore, "/r1/x", "/r1/y/z", "/r2/x").ok()
     sros("distribute_key", keystore, "--match", "/r1/*", "--match", "/a", tmp_path / "1.tgz").ok()

@@ -9,7 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
 
-from sros_tool.checks.keystores.files import check_files
+from sros_tool.checks.keystores.files import KEY_READABLE, check_files
 from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR
 from sros_tool.errors import SrosError
@@ -68,6 +68,16 @@ def exposed_sentences(folder: Path, now: datetime) -> Iterator[str]:
         yield f"The modes of the files in '{folder}' cannot be checked: {error}"
     for (title, text), files in paths.items():
         yield f"{first_few(files, _MOST_NAMED)}: {title}: {text}."
+
+
+def exposed_keys(folder: Path, now: datetime) -> frozenset[str]:
+    """Return the paths, in ``folder``, of private keys that others can read, as far as known."""
+    keys = set()
+    with suppress(SrosError, OSError):
+        for finding in check_files(CheckedKeystore(OpenedKeystore(folder), now, on_robot=True)):
+            if finding.kind is KEY_READABLE:
+                keys.add(os.path.relpath(finding.file, folder))
+    return frozenset(keys)
 
 
 def installed_sentences(folder: Path, names: Sequence[str], now: datetime) -> Iterator[str]:
