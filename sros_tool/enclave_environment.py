@@ -778,7 +778,7 @@ def _unknown_node_error(
     nodes: Mapping[str, tuple[str, str]],
     enclave_paths: Sequence[tuple[str, ...]],
 ) -> UsageError:
-    """Return the error for a command whose node depends on the name that its program gives it.
+    """Return the error for a command that does not show which node its program starts.
 
     ``nodes`` is what `sros_tool.runtime.environment.possible_nodes` returns; ``found`` are the
     enclaves of these nodes.

@@ -335,7 +335,9 @@ def _open(config: zenoh.Config, patience: float, stop: threading.Event) -> zenoh
             return None
     endpoint = json.loads(config.get_json("connect/endpoints"))[0]
     if _is_open(endpoint):
-        raise _RefusedError(f"{reason} to {endpoint} within {patience:g} s, whose port is open")
+        raise _RefusedError(
+            f"{reason} to {endpoint} within {patience:g} s, though its port is open"
+        )
     raise zenoh.ZError(f"nobody listens at {endpoint}")
 
 

@@ -421,7 +421,7 @@ class ZenohEvaluator:
         return replace(answer, in_part=tuple(passing))
 
     def _acts(self, enclave: str, part: Question, brief: bool) -> bool:
-        """Return whether the data of a part of an action pass; a call acts without its reply."""
+        """Return whether the data of a part of an action pass; a call needs only the request."""
         answer = self.answer(enclave, part, reach=False, brief=brief)
         needed = [c for c in answer.checks if part.word == "reply" or c.message != Message.REPLY]
         return bool(needed) and all(check.allowed for check in needed)

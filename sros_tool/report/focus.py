@@ -192,7 +192,7 @@ class FocusFlow:
         )
 
     def _stages(self, edge: Edge) -> tuple[set[int], set[int]]:
-        """Return the columns of a name in which an enclave could write it, and could read it."""
+        """Return the columns where the edge's enclave could write the name, and could read it."""
         writes: set[int] = set()
         reads: set[int] = set()
         before, after = self.before.get(edge.enclave, 0), self.after.get(edge.enclave, 0)
