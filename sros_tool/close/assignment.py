@@ -13,7 +13,7 @@ import json
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 
 from sros_tool.close.processes import (
@@ -48,42 +48,47 @@ def assign(
     None is for processes that run now.
     """
     by_pid = {process.pid: process for process in running}  # the last program that it ran
-    near = [
+    candidates = [
         process
         for process in by_pid.values()
         if is_in_domain(process, domain) and not process.is_daemon
     ]
     if origins is None:
-        origins = {process.pid: process_origin(process.pid) for process in near}
+        origins = {process.pid: process_origin(process.pid) for process in candidates}
     by_enclave: dict[str, list[ObservedNode]] = {}
     for node in nodes:
         by_enclave.setdefault(node.enclaves[0], []).append(node)
-    claims = _claims(near, by_enclave, process_ids or {})
-    units = Counter({process.program[0]: origins[process.pid].unit for process in near}.values())
+    claims = _claims(candidates, by_enclave, process_ids or {})
+    units = Counter(
+        {process.program[0]: origins[process.pid].unit for process in candidates}.values()
+    )
     assigned = []
     for process, enclave, known_by in claims:
         origin = origins[process.pid]
-        alone = origin if units[origin.unit] == 1 else origin._replace(unit="")
-        assigned.append(ClosedProcess.from_process(process, enclave, alone, known_by))
-    enclaves: dict[int, set[str]] = {}
-    for closed in assigned:
-        enclaves.setdefault(closed.pid, set()).add(closed.enclave)
-    claimed = {process.pid for process, _, _ in claims}
-    unknown = [process for process in near if process.pid not in {*claimed, *enclaves}]
+        if units[origin.unit] > 1:  # it does not start the process alone
+            origin = origin._replace(unit="")
+        assigned.append(ClosedProcess.from_process(process, enclave, origin, known_by))
+    known = {process.pid for process, _, _ in claims} | {closed.pid for closed in assigned}
     counts = Counter(closed.enclave for closed in assigned)
     return ObservedProcesses(
         domain,
-        sorted(
-            closed._replace(shares=sorted(enclaves[closed.pid] - {closed.enclave}))
-            for closed in assigned
-        ),
-        [process_text(process) for process in unknown],
-        sorted(
+        processes=sorted(_with_shares(assigned)),
+        unknown=[process_text(process) for process in candidates if process.pid not in known],
+        elsewhere=sorted(
             enclave
             for enclave, observed_nodes in by_enclave.items()
             if len({_process_prefix(node) for node in observed_nodes}) > counts[enclave]
         ),
     )
+
+
+def _with_shares(assigned: Sequence[ClosedProcess]) -> Iterator[ClosedProcess]:
+    """Yield processes with the other enclaves whose processes the same program starts."""
+    enclaves: dict[int, set[str]] = {}
+    for process in assigned:
+        enclaves.setdefault(process.pid, set()).add(process.enclave)
+    for process in assigned:
+        yield process._replace(shares=sorted(enclaves[process.pid] - {process.enclave}))
 
 
 def _claims(
@@ -124,6 +129,7 @@ def _process_prefix(node: ObservedNode) -> str:
 
 
 def _shows_its_id(process: Process, node: ObservedNode, process_ids: Mapping[str, int]) -> bool:
+    """Return whether a node's participant has or states the process id."""
     if not node.participant.startswith(_FAST_DDS):
         return process_ids.get(node.participant) == process.pid
     low, high = process.pid & 0xFF, process.pid >> 8 & 0xFF
@@ -132,10 +138,12 @@ def _shows_its_id(process: Process, node: ObservedNode, process_ids: Mapping[str
 
 
 def _is_named(process: Process, node: ObservedNode, _process_ids: object) -> bool:
+    """Return whether the command gives the node its name and namespace."""
     return node_argument(process.command) == (node.ns, node.name)
 
 
 def _has_program_named_alike(process: Process, node: ObservedNode, _process_ids: object) -> bool:
+    """Return whether the program is called like the node."""
     return program_of(process.command).removesuffix(".py") == node.name
 
 

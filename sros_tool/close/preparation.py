@@ -242,13 +242,13 @@ def _remove_enclaves(robot: LocalRobot) -> list[FileChange]:
         if any((enclave_path(robot.keystore, name) / file).exists() for file in KEY_FILES):
             removed[name] = "its enclave belongs to another machine"
     with Folder(robot.export) as export:
-        for inside in map(enclave_folder, removed):
-            for entry in (f"{inside}/{name}" for name in export.names(inside)):
+        for folder in map(enclave_folder, removed):
+            for entry in (f"{folder}/{name}" for name in export.names(folder)):
                 if not stat.S_ISDIR(export.mode(entry)):
                     export.unlink(entry)
-        for inside in sorted(map(enclave_folder, removed), reverse=True):  # inner ones first
-            if not export.names(inside):
-                export.rmdir(inside)
+        for folder in sorted(map(enclave_folder, removed), reverse=True):  # inner ones first
+            if not export.names(folder):
+                export.rmdir(folder)
     paths = {str(enclave_path(robot.export, name)): why for name, why in removed.items()}
     for path, why in paths.items():
         robot.shell.say(f"removed {path}: {why}")

@@ -48,6 +48,7 @@ _START_SECONDS = 3.0
 """How long processes that were restarted by hand may take until they run in their enclaves."""
 
 _TRIES = 3
+"""How often the observer looks until the nodes do what they did on the open robot."""
 
 
 def prove(robot: LocalRobot) -> CloseState:
@@ -152,7 +153,7 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
         return Proof(SILENCE, None, f"{error}")
     if value["nodes"]:
         nodes = {f"{node['namespace'].rstrip('/')}/{node['name']}" for node in value["nodes"]}
-        return Proof(SILENCE, False, f"it sees {first_few(sorted(nodes), 3)}")
+        return Proof(SILENCE, False, f"it sees {first_few(sorted(nodes), MOST_NAMES)}")
     if not hears:
         return Proof(SILENCE, None, "nor does the observer in its enclave see the robot now")
     number = counted(len(before.nodes), "node")
@@ -269,13 +270,13 @@ def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection
             "not judged": audited["unjudged"],
             "not done": ["the ROS graph kept changing"] if status else [],
         }
-        reason = next(
-            (f"{why}: {first_few(names, 3)}" for why, names in differences.items() if names), ""
-        )
-        if not reason:
+        reasons = [
+            f"{why}: {first_few(names, MOST_NAMES)}" for why, names in differences.items() if names
+        ]
+        if not reasons:
             renamed = _renamed_text(nodes, comparison.current, fails=False)
             return Proof(TALK, True, f"{comparison.summary()}{renamed}")
-    return Proof(TALK, False, f"{reason}{_renamed_text(nodes, comparison.current, fails=True)}")
+    return Proof(TALK, False, f"{reasons[0]}{_renamed_text(nodes, comparison.current, fails=True)}")
 
 
 class _TalkComparison:

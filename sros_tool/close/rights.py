@@ -24,6 +24,7 @@ from sros_tool.wording import counted, first_few
 
 _NODE_PARTS = ("common/node.xml", "common/rclcpp_node.xml", "common/rclpy_node.xml")
 _MOST_LINES = 20
+"""Number of names that are shown; the others are counted."""
 
 
 def access_lines(policy: Policy, folder: Path) -> list[str]:

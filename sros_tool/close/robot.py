@@ -34,6 +34,7 @@ from sros_tool.wording import first_few
 
 REQUIREMENTS, TEMPLATE, OBSERVER = "requirements.toml", "production", CLOSED_OBSERVER
 MOST_NAMES = 3
+"""Number of names that a text lists before it counts the others."""
 
 
 class Shell(NamedTuple):

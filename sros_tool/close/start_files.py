@@ -122,6 +122,7 @@ def _commands_text(robot: LocalRobot, state: CloseState) -> str:
 
 
 def _commands(by_hand: Mapping[str, Sequence[ClosedProcess]]) -> Iterator[str]:
+    """Yield the lines of commands, below comments with the enclaves of their processes."""
     for command, processes in by_hand.items():
         yield from ("", f"# {', '.join(process.enclave for process in processes)}", command)
 

@@ -36,6 +36,7 @@ from sros_tool.values import DryRun, FileChanges, Words, shows
 from sros_tool.wording import first_few
 
 _LONGEST_PATH = 300
+"""Number of characters of a path that another process chose, in texts."""
 
 TALK = "everything that talked can still talk"
 SILENCE = "an open listener finds nothing"

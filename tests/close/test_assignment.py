@@ -9,9 +9,7 @@ import pytest
 
 from sros_tool.close.assignment import assign
 from sros_tool.graph.observation import Endpoint, ObservedNode
-from sros_tool.runtime.processes import (
-    Process,
-)
+from sros_tool.runtime.processes import Process
 
 
 def process(pid: int, *command: str, **more: Any) -> Process:
@@ -57,8 +55,8 @@ def test_the_enclave_of_a_process(
     nodes: list[ObservedNode], processes: list[Process], known: dict[str, str]
 ) -> None:
     observed = assign(nodes, processes, 0)
-    assert {each.enclave: each.known_by for each in observed.processes} == known
-    assert set(observed.elsewhere) == {each.enclaves[0] for each in nodes} - known.keys()
+    assert {closed.enclave: closed.known_by for closed in observed.processes} == known
+    assert set(observed.elsewhere) == {seen.enclaves[0] for seen in nodes} - known.keys()
 
 
 def test_a_process_of_cyclone_dds_is_known_by_what_it_says() -> None:
@@ -66,15 +64,15 @@ def test_a_process_of_cyclone_dds_is_known_by_what_it_says() -> None:
     nodes = [node("a", "01107f01a530"), node("b", "0110")]
     processes = [process(0x130A5, "x"), process(2, "y")]
     observed = assign(nodes, processes, 0, {"0110": 0x130A5, "01107f01a530": 2})
-    known = {each.enclave: (each.pid, each.known_by) for each in observed.processes}
+    known = {closed.enclave: (closed.pid, closed.known_by) for closed in observed.processes}
     assert known == {"/a": (2, "process id"), "/b": (0x130A5, "process id")}
 
 
-def test_nodes_of_the_same_name_elsewhere_are_told() -> None:
+def test_nodes_of_the_same_name_elsewhere_are_reported() -> None:
     own, same = node("a", "010f7f01a53001"), node("a", "010f7f01a53002")
     talker = process(0x30A5, "/opt/a")
     assert assign([own, same], [talker], 0).elsewhere == []
     for other in (node("a", "010f7f02a530"), node("a", "010f7f01ffff"), node("a", "0110aa")):
         observed = assign([own, other], [talker], 0)
-        assert [each.pid for each in observed.processes] == [talker.pid]
+        assert [closed.pid for closed in observed.processes] == [talker.pid]
         assert observed.elsewhere == ["/a"]

@@ -7,11 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.runtime.processes import (
-    ProcessOrigin,
-    _forked_by,
-    process_origin,
-)
+from sros_tool.runtime.processes import ProcessOrigin, _forked_by, process_origin
 
 
 @pytest.mark.parametrize(
