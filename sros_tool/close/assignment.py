@@ -65,7 +65,7 @@ def assign(
     assigned = []
     for process, enclave, known_by in claims:
         origin = origins[process.pid]
-        if units[origin.unit] > 1:  # it does not start the process alone
+        if units[origin.unit] != 1:  # it does not start the process alone
             origin = origin._replace(unit="")
         assigned.append(ClosedProcess.from_process(process, enclave, origin, known_by))
     known = {process.pid for process, _, _ in claims} | {closed.pid for closed in assigned}

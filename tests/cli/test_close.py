@@ -1166,7 +1166,10 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     """Seen while sros watched, it has to be seen again; another one may be away, as a laptop."""
     robot.close()
     assert "has no enclave /x. It has" in robot.close("--elsewhere", "/x", status=2).err
-    assert "is remembered" in robot.close("--proof", "--elsewhere", "/listener", status=2).err
+    assert (
+        "the folder remembers it"
+        in robot.close("--proof", "--elsewhere", "/listener", status=2).err
+    )
     robot.absent = {"/listener"}
     ended = robot.close("--elsewhere", "/listener")
     left = "robot/export/enclaves/listener"
