@@ -421,7 +421,8 @@ _DONE = {
 @click.option(
     "--delete-old-key",
     is_flag=True,
-    help="Delete the old CA's private key instead of keeping it in the folder 'retired'.",
+    help="In the stages reissue and retire: delete the old CA's private key instead of keeping it "
+    "in the folder 'retired'. Refused if the key is outside of the keystore.",
 )
 @click.option(
     "--allow-unconfirmed",
@@ -576,8 +577,6 @@ def _print_step(
     reissued = any(change.path.endswith("/cert.pem") for change in step.changes)
     done = f"{_DONE['reissue']}, and " if together and reissued else ""
     echo(f"{done}{_DONE[step.stage]}: {', '.join(step.files)}")
-    for place in step.kept_elsewhere:
-        echo(f"the old key at '{place}' is no longer used; it was not deleted", err=True)
     if step.stage == "retire":
         how = (
             "together"

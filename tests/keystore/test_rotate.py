@@ -6,7 +6,7 @@ import json
 import re
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -287,8 +287,11 @@ def test_same_key_is_not_for_a_ca_that_signs_permissions(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("when", [RotationStage.REISSUE, RotationStage.RETIRE])
 def test_the_old_key_is_deleted_when_asked(when: RotationStage, root: Path) -> None:
+    refused(lambda: rotate_ca(root, now=NOW, delete_old_key=True), root, "deletes no key")
     for stage in STAGES:
-        rotate_ca(root, stage, now=NOW, delete_old_key=stage is when)
+        step = rotate_ca(root, stage, now=NOW, delete_old_key=stage is when)
+        if stage is when:
+            assert "deletes the old key" in str(step.notes)
     assert not list(root.glob("retired/*.key.pem"))
     check(root)
 
@@ -310,10 +313,15 @@ def test_keys_in_files_elsewhere(tmp_path: Path) -> None:
     assert snapshot(tmp_path) == before
     rotate_ca(root, now=NOW, new_keys=places("new"))
     check(root)
-    step = rotate_ca(root, now=NOW)
-    assert step.kept_elsewhere == tuple(places("old").places.values())
-    rotate_ca(root, now=NOW)
-    check(root)
+    for says in ("needs it until the stage retire", "nothing needs it any more"):
+        refused(lambda: rotate_ca(root, now=NOW, delete_old_key=True), root, "outside of the key")
+        step = rotate_ca(root, now=NOW)
+        assert step.kept_elsewhere == tuple(places("old").places.values())
+        told = next(note.text for note in step.notes if "identity CA" in note.text)
+        assert "does not delete" in told
+        assert says in told
+        check(root)
+    assert (tmp_path / "old_identity").exists()
     create_enclaves(root, ["/later"], now=NOW)
     check(root)
     assert not list(root.glob("private/*.pem"))
@@ -332,18 +340,46 @@ def test_from_the_keystore_to_elsewhere(tmp_path: Path) -> None:
     check(root)
 
 
-def test_an_encrypted_key_has_an_encrypted_successor(tmp_path: Path) -> None:
-    root = tmp_path / "ks"
-    locked = Keyring(secrets=lambda what: "open, sesame", encrypt=True)
-    create_keystore(root, template=load_template("development"), now=NOW, keyring=locked)
-    opened = replace(locked, encrypt=False)
+@pytest.mark.parametrize("outside", [(), ("identity",), ("identity", "permissions")])
+def test_an_encrypted_key_has_an_encrypted_successor(
+    outside: Collection[str], tmp_path: Path
+) -> None:
+    def keyring(number: int, *, encrypt: bool = False) -> Keyring:
+        places = {role: f"file:{tmp_path}/{role}{number}.key.pem" for role in outside}
+        return Keyring(lambda what: "open, sesame", places, encrypt)
+
+    def make(root: Path) -> None:
+        locked = keyring(1, encrypt=True)
+        create_keystore(root, template=load_template("production"), now=NOW, keyring=locked)
+
+    make(root := tmp_path / "ks")
+    opened = replace(keyring(1), places={})
     create_enclaves(root, NAMES, now=NOW, keyring=opened)
     for _ in STAGES:
-        rotate_ca(root, now=NOW, keyring=opened, new_keys=opened)
-        keys = [*root.glob("private/*.pem"), *root.glob("retired/*.key.pem")]
+        rotate_ca(root, now=NOW, keyring=opened, new_keys=keyring(2))
+        keys = [path for path in tmp_path.rglob("*.key.pem") if path.parent.name != "enclaves"]
+        assert len(keys) == 4
         assert all(b"ENCRYPTED" in path.read_bytes() for path in keys)
     create_enclaves(root, ["/later"], now=NOW, keyring=opened)
     check(root)
+
+
+def test_a_new_key_that_is_protected_less_is_said(tmp_path: Path) -> None:
+    """A file that the user made becomes the key of the new CA as it is."""
+    root, plain = tmp_path / "ks", tmp_path / "plain.pem"
+    locked = Keyring(lambda what: "open, sesame", {"identity": f"file:{tmp_path}/old"}, True)
+    create_keystore(root, template=load_template("production"), now=NOW, keyring=locked)
+    plain.write_bytes(key_pem(generate_key()))
+    new = replace(locked, places={"identity": f"file:{plain}"})
+    step = rotate_ca(root, now=NOW, keyring=locked, new_keys=new, dry_run=True)
+    (told,) = (note.text for note in step.notes if note.id == "keystore.new-key-plain")
+    assert "has no passphrase, and the current key has one" in told
+    (tmp_path / "old").rename(tmp_path / "away")
+    new = Keyring(locked.secrets, {"identity": f"file:{tmp_path}/new"})
+    step = rotate_ca(root, now=NOW, keyring=locked, new_keys=new, roles=["identity"])
+    (told,) = (note.text for note in step.notes if note.id == "keystore.new-key-plain")
+    assert "sros cannot see" in told
+    assert (tmp_path / "new").exists()
 
 
 # ── revocation ─────────────────────────────────────────────────────────────────────────────

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
 
-from sros_tool.errors import DocumentError, KeystoreError, PkiError, UsageError
+from sros_tool.errors import DocumentError, KeystoreError, PkiError, SrosError, UsageError
 from sros_tool.files import remove_file, write_new_file
 from sros_tool.keystore.issuing.ca_service import CaService, check_ca_service
 from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, ROLES, ca_key, key_path
@@ -189,6 +189,15 @@ class Keyring:
                 "trusted.",
                 f"If that is intended, name it yourself: --{role}-key {quote(place)}.",
             )
+
+    def is_encrypted(self, keystore: OpenedKeystore, role: str, template: Template) -> bool | None:
+        """Return whether the file of a CA's key is encrypted; None if no such file can be read."""
+        place = self.place(role, template)
+        if is_token_uri(place) or is_ca_service(place):
+            return None
+        with suppress(SrosError):
+            return b"ENCRYPTED" in self._read(keystore, key_path(keystore.root, place), role)
+        return None
 
     def settings_with_places(self, template: Template) -> Template:
         """Return ``template`` with the places of the CA keys, as settings of a new keystore."""

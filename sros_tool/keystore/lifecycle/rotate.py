@@ -56,6 +56,7 @@ from sros_tool.keystore.layout import (
     ca_key,
     enclave_folder,
     enclave_path,
+    key_path,
 )
 from sros_tool.keystore.ledger import (
     SAME_KEY,
@@ -90,6 +91,7 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.pki.keys import PublicKey, algorithm, is_weak
+from sros_tool.pki.token import is_token_uri
 from sros_tool.validity import Span, Window, span_text, window
 from sros_tool.wording import first_few
 
@@ -104,7 +106,7 @@ class RotationStep(Changed):
 
     ``stage`` is the stage of the keystore afterwards.  ``files`` are the stems of the CA files that
     are replaced ("identity_ca", "permissions_ca" or "ca").  ``kept_elsewhere`` are the places of
-    old keys outside of the keystore, which sros does not delete.  ``cut_off`` are robots that have
+    old keys outside of the keystore, which sros never deletes.  ``cut_off`` are robots that have
     not confirmed the previous stage, and can no longer communicate with the others.
     """
 
@@ -135,14 +137,15 @@ def rotate_ca(
     If the keystore is already at the stage ``to``, nothing is changed.  ``roles`` ("identity",
     "permissions"; default: both) and the ``validity`` of the new CAs are only used when a rotation
     begins.  ``keyring`` opens the current keys; ``new_keys`` names the places of new keys outside
-    of the keystore.  In a keystore with a fleet, a stage that cuts off robots, because they have
-    not confirmed the previous stage, needs ``allow_unconfirmed``.  The nodes of the vendors in
-    ``allow_refusal`` may stop working.
+    of the keystore.  ``delete_old_key`` deletes old keys that are in the keystore.  In a keystore
+    with a fleet, a stage that cuts off robots, because they have not confirmed the previous stage,
+    needs ``allow_unconfirmed``.  The nodes of the vendors in ``allow_refusal`` may stop working.
 
     Raises:
         KeystoreError: a key is missing, an enclave cannot be moved to the new CA, robots would be
             cut off, or vendors would refuse enclaves that they accept today.
-        UsageError: the stage ``to`` is over, or is not the next stage.
+        UsageError: the stage ``to`` is over, or is not the next stage, or has no old key that
+            ``delete_old_key`` could delete.
     """
     change = KeystoreChange(
         root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
@@ -433,6 +436,7 @@ class _Rotator:
         """
         if self._rotation.stage is RotationStage.REISSUE:
             self._retire_old_cas()
+            self._refuse_deletion(stage)
             return stage
         if self._rotation.stage is RotationStage.NONE:
             successors = self._begin_rotation(
@@ -449,8 +453,46 @@ class _Rotator:
                 self._distribute(successors)
             else:
                 self._reissue(successors, stage, progress)
+        self._refuse_deletion(stage)
         self._change.record(successors[0].new)
         return stage
+
+    def _refuse_deletion(self, stage: RotationStage) -> None:
+        """Raise `UsageError` if sros shall delete an old key that it does not delete."""
+        if self._delete and stage is RotationStage.DISTRIBUTE:
+            raise UsageError(
+                "the stage distribute deletes no key",
+                "The old CA still issues.",
+                "Add --delete-old-key to a later stage.",
+            )
+        if self._delete and self.kept_elsewhere:
+            raise UsageError(
+                f"sros deletes no key outside of the keystore: {', '.join(self.kept_elsewhere)}",
+                "Another keystore may use the key, and there may be copies.",
+                "Leave out --delete-old-key. After the stage retire, delete this key yourself, and "
+                f"the files `*.key.pem` in '{self._root}/{RETIRED}'.",
+            )
+
+    def _note_old_key(
+        self, roles: Sequence[str], place: str, stage: RotationStage, *, outside: bool = False
+    ) -> None:
+        """Add a note on where the old key of a CA is after ``stage``, and until when to keep it."""
+        revokes = stage is RotationStage.REISSUE and IDENTITY in roles
+        if self._delete:
+            text = f"--delete-old-key deletes the old key of the {_ca_name(roles)}"
+            text += "; until the stage retire, `sros revoke` needs --until-retired" * revokes
+        else:
+            where = place if outside else f"{self._root}/{place}"
+            does = "does not delete" if outside else "keeps"
+            text = f"sros {does} the old key of the {_ca_name(roles)}, '{where}'; "
+            text += (
+                "`sros revoke` needs it until the stage retire"
+                if revokes
+                else "nothing needs it any more"
+            )
+        self._change.notes.append(Note("rotation.old-key", f"{text}."))
+        if outside:
+            self.kept_elsewhere.append(place)
 
     # ── the stages ─────────────────────────────────────────────────────────────────────────
 
@@ -549,7 +591,7 @@ class _Rotator:
             write_bundle(
                 self._transaction, successor.file, successor.roles, bundle, self._change.names
             )
-            old_key = self._install_key(successor)
+            old_key = self._install_key(successor, stage)
             self.replacements.append(replace(successor.replacement(), old_key=old_key))
             if stage is RotationStage.RETIRE:
                 self._keep_certificate(successor.old[0])
@@ -637,8 +679,16 @@ class _Rotator:
             )
             self._keep_certificate(old)
             key = retired_key(old)
-            if self._delete and (self._root / key).exists():
-                self._transaction.remove(key)
+            outside = bool(replacement.old_key)
+            if outside or (self._root / key).exists():
+                self._note_old_key(
+                    files[replacement.file],
+                    replacement.old_key or key,
+                    RotationStage.RETIRE,
+                    outside=outside,
+                )
+                if self._delete and not outside:
+                    self._transaction.remove(key)
         self._transaction.remove(ROTATION)
 
     # ── files ──────────────────────────────────────────────────────────────────────────────
@@ -650,7 +700,7 @@ class _Rotator:
     def _keep_certificate(self, old: x509.Certificate) -> None:
         self._transaction.write(f"{RETIRED}/{old.serial_number:x}.cert.pem", pem(old))
 
-    def _install_key(self, successor: _Successor) -> str:
+    def _install_key(self, successor: _Successor, stage: RotationStage) -> str:
         """Stage the move of the old key to ``retired``, and of the new key to the old key's place.
 
         Return the place of the old key if it is outside of the keystore, else "".
@@ -658,13 +708,14 @@ class _Rotator:
         transaction, root = self._transaction, self._root
         old_key = ""
         place = f"{PRIVATE}/{successor.file}.key.pem"
-        if (root / place).is_file():
-            if not self._delete:
-                key = transaction.read(place)
-                transaction.write(retired_key(successor.old[0]), key, private=True)
-        else:
+        outside = not (root / place).is_file()
+        if outside:
             old_key = self._change.keyring.place(successor.roles[0], self._template)
-            self.kept_elsewhere.append(old_key)
+        elif not self._delete:
+            key = transaction.read(place)
+            transaction.write(retired_key(successor.old[0]), key, private=True)
+        kept = old_key or retired_key(successor.old[0])
+        self._note_old_key(successor.roles, kept, stage, outside=outside)
         if successor.key == f"{PRIVATE}/next_{successor.file}.key.pem":
             transaction.write(place, transaction.read(successor.key), private=True)
             transaction.remove(successor.key)
@@ -820,6 +871,10 @@ def _check_place(change: KeystoreChange, file: str, role: str, new_keys: Keyring
         )
 
 
+def _ca_name(roles: Sequence[str]) -> str:
+    return f"{roles[0]} CA" if len(roles) == 1 else "CA"
+
+
 def _make_successor(
     change: KeystoreChange,
     file: str,
@@ -830,11 +885,11 @@ def _make_successor(
 ) -> _Successor:
     transaction, template = change.transaction, change.template
     old = change.keystore.certificates_of(file)
-    present = transaction.root / f"{PRIVATE}/{file}.key.pem"
-    encrypted = present.is_file() and b"ENCRYPTED" in change.keystore.read(present, "CA key")
-    new_keys = replace(new_keys, encrypt=new_keys.encrypt or encrypted)
+    encrypted = change.keyring.is_encrypted(change.keystore, roles[0], template)
+    new_keys = replace(new_keys, encrypt=new_keys.encrypt or encrypted is True)
     place = new_keys.places.get(roles[0], "")
     elsewhere = replace(template, identity_key="", permissions_key="")
+    given = new_keys.is_encrypted(change.keystore, roles[0], elsewhere) if place else None
     key = new_keys.make(transaction, at, roles[0], elsewhere, compared=True)
     if same_key(old[0], key):
         raise KeystoreError(
@@ -842,6 +897,15 @@ def _make_successor(
             "A new CA needs a new key.",
             f"Name another place with --{roles[0]}-key.",
         )
+    is_plain = given is False or not (given or new_keys.encrypt or is_token_uri(place))
+    if is_plain and encrypted is not False:
+        path = quote(str(key_path(change.root, place or at)))
+        why = "the current key has one" if encrypted else "sros cannot see whether the current has"
+        text = (
+            f"the new key of the {_ca_name(roles)} has no passphrase, and {why}. To encrypt it: "
+            f"`openssl pkcs8 -topk8 -scrypt -in {path} -out {path}.new && mv {path}.new {path}`."
+        )
+        change.notes.append(Note("keystore.new-key-plain", text))
     # Fast DDS 2.9.1 refuses peers whose permissions CA has another name (tested).
     name = old[0].subject
     if PERMISSIONS not in roles:

@@ -514,7 +514,7 @@ class RotationChange(NamedTuple):
     ]
     """All enclaves of the keystore, with their outcomes."""
     old_keys_elsewhere: Sequence[str]
-    """Places of old CA keys outside of the keystore, which sros does not delete."""
+    """Places of old CA keys outside of the keystore, which sros never deletes."""
     cut_off: Sequence[str]
     """The robots of the fleet that have not confirmed the previous stage, and so cannot communicate
     with the others until they get its files (``--allow-unconfirmed``)."""
