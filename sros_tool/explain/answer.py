@@ -28,8 +28,13 @@ from sros_tool.dds.governance import DomainRule, ProtectionKind, TopicRule
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import UsageError
 from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
     CLOSED_POLICY,
+    CRL_FILE,
     FLEET,
+    IDENTITY_CA_FILE,
+    KEY_FILE,
+    KEY_URI_FILE,
     folder_of_closed_robot,
     is_original_keystore,
 )
@@ -650,6 +655,9 @@ _WORST_FIRST = (
 )
 
 
+_CERTIFICATE_FILES = frozenset({CERTIFICATE_FILE, IDENTITY_CA_FILE, CRL_FILE})
+
+
 class Evaluator:
     """Answers questions to one vendor about one enclave."""
 
@@ -664,6 +672,21 @@ class Evaluator:
     def access(self) -> Access | None:
         """Access of a process on this vendor; None if it cannot start, or no peer accepts it."""
         return self._participant.access
+
+    @property
+    def has_accepted_certificate(self) -> bool:
+        """Whether a process with the key of the enclave can use its certificate."""
+        return _CERTIFICATE_FILES.isdisjoint(problem.file for problem in self._participant.problems)
+
+    def for_other_certificates(self) -> Evaluator:
+        """Return the evaluator for whoever has another certificate that the permissions fit.
+
+        Faults of the enclave's own certificate and key do not count for it.
+        """
+        faulty = {problem.file for problem in self._participant.problems}
+        if not faulty or faulty - {*_CERTIFICATE_FILES, KEY_FILE, KEY_URI_FILE}:
+            return self
+        return Evaluator(self.vendor, self.enclave._replace(state=None), self.context)
 
     def answer(self, question: Question) -> Answer:
         """Return the answer to a question, without policy lines, change and remedy."""

@@ -343,9 +343,9 @@ def _note_on_fitting_permissions(evaluator: Evaluator, answer: Answer) -> Iterat
     if answer.allowed or not answer.question.right:
         return
     holders = [
-        holder.name
+        holder.enclave.name
         for holder in _fitting_holders(evaluator)
-        if Evaluator(evaluator.vendor, holder, evaluator.context).answer(answer.question).allowed
+        if holder.for_other_certificates().answer(answer.question).allowed
     ]
     if holders:
         text = (
@@ -357,14 +357,14 @@ def _note_on_fitting_permissions(evaluator: Evaluator, answer: Answer) -> Iterat
         yield Note("explain.fitting-permissions", text)
 
 
-def _fitting_holders(evaluator: Evaluator) -> Iterator[LoadedEnclave]:
-    """Yield other enclaves of the keystore whose permissions also fit an enclave's certificate.
+def _fitting_holders(evaluator: Evaluator) -> Iterator[Evaluator]:
+    """Yield evaluators of enclaves whose permissions also fit the certificate of another enclave.
 
     Only enclaves are read whose paths have all parts of the enclave's path.
     """
     enclave, keystore = evaluator.enclave, evaluator.enclave.keystore
     own_parts, certified = {*enclave.name.split("/")}, {enclave.name: enclave.subject}
-    if keystore is None or enclave.state is None:
+    if keystore is None or enclave.state is None or not evaluator.has_accepted_certificate:
         return
     for name in keystore.names:
         if name == enclave.name or not own_parts <= {*name.split("/")}:
@@ -373,7 +373,7 @@ def _fitting_holders(evaluator: Evaluator) -> Iterator[LoadedEnclave]:
         grant = holder.state.grant if holder.state else None
         granted = {name: [grant.subject] if grant else []}
         if other_fitting_enclaves(evaluator.vendor.traits, certified, granted):
-            yield holder
+            yield Evaluator(evaluator.vendor, holder, evaluator.context)
 
 
 # ── Zenoh, next to it ──────────────────────────────────────────────────────────────────────
@@ -542,6 +542,8 @@ def _title(vendor: Vendor, why: str) -> str:
 
 def _outcome(evaluator: Evaluator, name: str, question: Question) -> VendorOutcome:
     answer = evaluator.answer(question)
+    others = evaluator.for_other_certificates()
+    of_others = answer if others is evaluator else others.answer(question)
     expression = answer.decision.expression or ""
     return VendorOutcome(
         name,
@@ -551,8 +553,8 @@ def _outcome(evaluator: Evaluator, name: str, question: Question) -> VendorOutco
         expression,
         opened=_opened_parts(evaluator, question),
         in_part=_allowed_parts(evaluator, answer),
-        subject=evaluator.enclave.subject,
-        granted=answer.grant.subject if answer.grant else "",
+        subject=evaluator.enclave.subject if evaluator.has_accepted_certificate else "",
+        granted=of_others.grant.subject if of_others.allowed and of_others.grant else "",
     )
 
 
@@ -700,7 +702,7 @@ class VendorOfKeystore(NamedTuple):
     def _with_holders(self, outcomes: Sequence[VendorOutcome]) -> tuple[VendorOutcome, ...]:
         """Return outcomes, in which a denial names allowed enclaves whose permissions also fit."""
         certified = {o.enclave: o.subject for o in outcomes if o.subject and not o.allowed}
-        granted = {o.enclave: [o.granted] for o in outcomes if o.granted and o.allowed}
+        granted = {o.enclave: [o.granted] for o in outcomes if o.granted}
         vendors = {self.vendor, *(self.stated(o.enclave) or self.vendor for o in outcomes)}
         holders: dict[str, tuple[str, ...]] = {}
         for vendor in vendors if granted else ():

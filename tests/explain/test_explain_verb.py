@@ -6,12 +6,13 @@ import json
 import os
 import shutil
 import sys
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from sros_tool.api import explain_access
+from sros_tool.api import create_keystore, explain_access, generate, renew
 from sros_tool.cli.common import now
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.files import policies_dir, templates_dir
@@ -599,9 +600,30 @@ def test_permissions_of_another_enclave_that_fit_are_said(tmp_path: Path) -> Non
             assert ("with the permissions of /robot/mux, which are not" in single.err) is fits
         reach = explain(keystore, "--reach", "/mux").ok().err
         assert ("can also use the permissions of /robot/mux" in reach) is (template == "sros2")
+        shutil.move(keystore / "enclaves/robot/mux/key.pem", tmp_path / "key.pem")
+        single = explain(keystore, "/mux", "publish", "/cmd_vel", "--vendor", "cyclonedds")
+        assert ("with the permissions of /robot/mux" in single.err) is (template == "sros2")
         (keystore / "enclaves/mux/cert.pem").write_text("broken")
         reach = explain(keystore, "--reach", "/mux").ok().err
         assert "the permissions of /robot/mux" not in reach  # no process can run as /mux
+
+
+def test_permissions_of_another_enclave_fit_no_expired_certificate(tmp_path: Path) -> None:
+    """The other enclave was renewed."""
+    enclaves = {"/mux": publish("/t"), "/robot/mux": publish("/cmd_vel")}
+    (tmp_path / "p.xml").write_text(policy_text(enclaves))
+    text = (templates_dir() / "sros2.toml").read_text()
+    authority, *others = text.split("10y")
+    (tmp_path / "t.toml").write_text(f"{authority}10y{'365d'.join(others)}")
+    keystore, then = tmp_path / "ks", now() - timedelta(days=300)
+    create_keystore(keystore, str(tmp_path / "t.toml"), now=then)
+    generate(keystore, tmp_path / "p.xml", now=then)
+    renew(keystore, ["/robot/mux"])
+    asked = ("publish", "/cmd_vel", "--vendor", "cyclonedds")
+    for later, fits in (("1d", True), ("90d", False)):
+        who = explain(keystore, "--who", *asked, "--at", later).ok().out
+        single = explain(keystore, "/mux", *asked, "--at", later).err
+        assert [" the permissions of /robot/mux" in said for said in (who, single)] == [fits] * 2
 
 
 def test_a_name_that_is_an_action_is_asked_about_as_one_of_everybody(fibonacci: Path) -> None:
