@@ -790,6 +790,7 @@ def _convert(
 
 
 _MOST_NEW_LINES = 20
+_MOST_NEW_RIGHTS = 3
 """Maximum number of reach lines, and of enclaves in a line, in text output; JSON has all."""
 _MOST_CHARACTERS = 12_000
 """Maximum length of each list in Markdown, in characters."""
@@ -847,9 +848,10 @@ def _new_node_lines(head: AccessSource, nodes: Iterable[NewNode]) -> Iterator[st
     from sros_tool.fleet.robots import folded
 
     lines = []
-    for node, enclave, moved_from, right, place in nodes:
+    for node, enclave, moved_from, rights, place in nodes:
         where = f"moves from enclave {moved_from} to" if moved_from else "is new in enclave"
-        text = f"+ node {node} {where} {enclave}, and may {right.describe()} there  ({place})"
+        may = first_few([right.describe() for right in rights], _MOST_NEW_RIGHTS)
+        text = f"+ node {node} {where} {enclave}, and may {may} there  ({place})"
         lines.append((enclave, text))
     return folded(head.fleet, lines)
 

@@ -48,7 +48,7 @@ from sros_tool.names import (
     node_of_service,
     service_of,
 )
-from sros_tool.policy.model import ALLOW, DENY, Profile, Source
+from sros_tool.policy.model import ALLOW, DENY, Profile, Qualifier, Source
 from sros_tool.policy.patterns import common_name, literal_prefix
 from sros_tool.policy.rights import (
     KIND_OF,
@@ -73,7 +73,13 @@ from sros_tool.proof.protection import (
     strict_protection,
 )
 from sros_tool.proof.sources import ALL_DOMAINS, AT, AccessSource
-from sros_tool.proof.worlds import ROS_TOPICS, domains_of, enforced_access, is_enforced
+from sros_tool.proof.worlds import (
+    ROS_TOPICS,
+    domains_of,
+    enforced_access,
+    is_enforced,
+    valid_topics,
+)
 from sros_tool.proof.zenoh_settings import unknown_settings
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Hop, HopPath, Network, unguarded
 from sros_tool.translate import governance_for, grant_rights
@@ -176,8 +182,9 @@ class NewNode(NamedTuple):
     """The enclave that has the node in HEAD, and not in BASE."""
     moved_from: str
     """An enclave that had the node in BASE, and no longer has it; or empty."""
-    right: Right
-    """Example of a right of the enclave that the process did not have."""
+    rights: tuple[Right, ...]
+    """Rights of the enclave that the process did not have, those of every node last. Where a DENY
+    of BASE is gone, the name is an example."""
     place: Source
     """File and line of the node in HEAD."""
 
@@ -353,7 +360,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     worlds = _worlds(before, after)
     added = tuple(_gains(before, after, worlds, scope, limit))
     lost = tuple(dict.fromkeys(_lost_protection(base, head, limit, rules=not added)))
-    new_nodes = tuple(_new_nodes(base, head))
+    new_nodes = tuple(_new_nodes(base, head, limit))
     unclear = tuple(_not_compared_clauses(base, head))
     if unclear and not (added or lost or new_nodes):
         raise DocumentError(
@@ -1126,7 +1133,7 @@ def _reached_with_hops(edges: _Edges, start: str) -> dict[str, Hop]:
 # ── nodes ──────────────────────────────────────────────────────────────────────────────────
 
 
-def _new_nodes(before: AccessSource, after: AccessSource) -> Iterator[NewNode]:
+def _new_nodes(before: AccessSource, after: AccessSource, limit: SearchLimit) -> Iterator[NewNode]:
     """Yield the nodes that policies assign to another enclave, which has more rights.
 
     A node that is alone in its enclave may have another name than before, and a node whose name a
@@ -1147,31 +1154,64 @@ def _new_nodes(before: AccessSource, after: AccessSource) -> Iterator[NewNode]:
         return
     old_rights, new_rights = map(_rights_by_enclave, (before.rights, after.rights))
     for node, path, profile, earlier, left in assigned:
-        had = [right for enclave in earlier for right in old_rights.get(enclave, ())]
-        had = had if earlier else [*profile_rights(path, profile)]
-        known = Rules(right._replace(enclave=path) for right in had)
-        allowed = (right for right in new_rights.get(path, ()) if right.qualifier is ALLOW)
-        gained = [right for right in allowed if not known.cover(right)]
-        gained += _rights_without_denial(had, path, Rules(new_rights.get(path, ())))
-        if gained:
+        had = [old_rights.get(enclave, ()) for enclave in earlier]
+        own_rights = [*profile_rights(path, profile)]
+        if gained := _gained_rights(had or [own_rights], new_rights.get(path, ()), limit):
             full = f"/{'/'.join(node)}".replace("//", "/")
             place = after.shown_source(profile.source)
-            yield NewNode(full, path, min(left, default=""), min(gained, key=order), place)
+            yield NewNode(full, path, min(left, default=""), gained, place)
 
 
-def _rights_without_denial(had: Iterable[Right], path: str, stated: Rules) -> Iterator[Right]:
-    """Yield denied rights of the enclaves of a node that its new enclave ``path`` allows.
+def _gained_rights(
+    had: Sequence[Collection[Right]], rights: Collection[Right], limit: SearchLimit
+) -> tuple[Right, ...]:
+    """Return what ``rights`` of an enclave allow, and none of ``had`` does; see `NewNode.rights`.
 
-    What another one of its enclaves allowed is not new.
+    ``had`` has the rights of several enclaves. What every node has, such as its own services, comes
+    last.
     """
-    rights = set(had)
-    enclaves, known = {right.enclave for right in rights}, Rules(rights)
-    for denial in sorted(right for right in rights if right.qualifier is DENY):
-        kept = stated.cover(denial._replace(enclave=path))
-        if kept or any(known.allow(enclave, denial.right, denial.name) for enclave in enclaves):
-            continue
-        right = denial._replace(enclave=path, qualifier=ALLOW)
-        yield from (right,) if stated.cover(right) else stated.overlapping(right)
+    known, now = [_allowed_names(enclave) for enclave in had], _allowed_names(rights)
+    stated = Rules(right for enclave in had for right in enclave)
+    enclaves = {right.enclave for enclave in had for right in enclave}
+    gained: dict[Right, None] = {}
+    for right in rights:
+        for part in parts(right) if right.qualifier is ALLOW else ():
+            if any(stated.allow(enclave, part.right, part.name) for enclave in enclaves):
+                continue  # is faster than automata
+            had_names = NameSet.union(names.get(part.right, NameSet()) for names in known)
+            new_names = now[part.right] & names_of(Style.FNMATCH, (part.name,)) & _ROS_NAMES
+            example = (new_names - had_names).example(limit)
+            if example is None:
+                continue
+            covered = any(stated.cover(part._replace(enclave=enclave)) for enclave in enclaves)
+            only_denied = is_expression(part.name) and covered
+            gained[part._replace(name=example) if only_denied else right] = None
+            break
+
+    def importance(right: Right) -> tuple[object, ...]:
+        of_every_node = right.name in OF_EVERY_NODE or node_of_service(right.name) != ""
+        return of_every_node, *order(right)
+
+    return tuple(sorted(gained, key=importance))
+
+
+_ROS_NAMES = valid_topics("", "")
+
+
+def _allowed_names(rights: Iterable[Right]) -> dict[str, NameSet]:
+    """Map each right, such as publish, to the names that rights allow and do not deny."""
+    names: dict[tuple[str, Qualifier], list[str]] = defaultdict(list)
+    for _, qualifier, right, name in unfolded(rights):
+        names[right, qualifier].append(name)
+    allowed, denied = (
+        {
+            right: names_of(Style.FNMATCH, texts)
+            for (right, of), texts in names.items()
+            if of is each
+        }
+        for each in (ALLOW, DENY)
+    )
+    return {right: known - denied.get(right, NameSet()) for right, known in allowed.items()}
 
 
 # ── denials ────────────────────────────────────────────────────────────────────────────────

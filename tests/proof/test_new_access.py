@@ -173,6 +173,40 @@ def test_a_node_that_moves_on_each_robot_of_a_fleet(tmp_path: Path) -> None:
     assert {e for e in denials if e[1]} == {("/r1/mux", "/r1/web"), ("/r2/mux", "/r2/web")}
 
 
+def test_what_a_moved_node_may_is_compared_with_the_denials_of_other_nodes(tmp_path: Path) -> None:
+    """A DENY holds for all nodes of an enclave: a node has what its enclave may."""
+    deny = publish("/drive").replace("ALLOW", "DENY")
+    own = '<services reply="ALLOW"><service>/nav/get_parameters</service></services>'
+    nav, picker = (
+        f'<profile ns="/" node="{n}">{publish("/drive")}</profile>' for n in ("nav", "picker")
+    )
+    nav = nav.replace("</profile>", f"{own}</profile>")
+    gripper = f'<profile ns="/" node="gripper">{deny}</profile>'
+
+    def write(file: str, *enclaves: str) -> None:
+        text = "".join(
+            f'<enclave path="{path}"><profiles>{profiles}</profiles></enclave>'
+            for path, profiles in zip(("/arm", "/base"), enclaves, strict=True)
+            if profiles
+        )
+        (tmp_path / file).write_text(
+            f'<policy version="0.2.0"><enclaves>{text}</enclaves></policy>'
+        )
+
+    write("apart.xml", gripper, nav)
+    write("denied.xml", gripper + picker, nav)
+    write("freed.xml", gripper, nav + picker)
+    write("along.xml", "", nav + gripper)
+    ended = sros("diff_policy", "--no-new-access", "denied.xml", "freed.xml", cwd=tmp_path)
+    line = "+ node /picker moves from enclave /arm to /base, and may publish topic /drive, "
+    assert (ended.status, ended.out) == (
+        1, f"{line}reply service /nav/get_parameters there  (freed.xml:1)\n"
+    )  # fmt: skip
+    ended = sros("diff_policy", "--no-new-access", "apart.xml", "along.xml", cwd=tmp_path)
+    assert "publish topic /drive there" not in ended.out
+    assert "/gripper moves from enclave /arm to /base, and may reply service /nav" in ended.out
+
+
 @pytest.mark.parametrize("part", range(8 if LONG else 1))
 def test_random_pairs_against_single_questions(tmp_path: Path, part: int) -> None:
     """Policies, keystores, fleets and Zenoh files: what is new is found, and nothing else."""
