@@ -66,8 +66,8 @@ class Denial:
 
     With ``by_rule`` a deny rule denies it, so that an allow rule would not help; with ``remote``
     the permissions of a peer deny it.  ``enclave`` is "" if the log does not name it. ``process``
-    is the label of the process that printed the denial, or "", and ``line`` the number of its line,
-    from 1.  ``folder`` is the folder from which the process loaded its enclave, or "".
+    is the label of the process that printed the denial, or "", and ``lines`` the numbers of its
+    lines, from 1.  ``folder`` is the folder from which the process loaded its enclave, or "".
     """
 
     topic: str
@@ -77,7 +77,7 @@ class Denial:
     remote: bool = False
     vendor: Vendor = field(default=Vendor.FAST, compare=False)
     process: str = ""
-    line: int = field(default=0, compare=False)
+    lines: tuple[int, ...] = field(default=(), compare=False)
     folder: str = field(default="", compare=False)
 
 
@@ -107,7 +107,11 @@ def read_denials(text: str) -> tuple[Denial, ...]:
     for number, line in enumerate(log_lines(text), 1):
         process, rest = labeled_line(line)
         processes.setdefault(process, []).append((number, rest))
-    denials = {denial: None for item in processes.items() for denial in _denials_of(*item)}
+    lines: dict[Denial, list[int]] = {}
+    for item in processes.items():
+        for denial in _denials_of(*item):
+            lines.setdefault(denial, []).extend(denial.lines)
+    denials = [replace(denial, lines=tuple(numbers)) for denial, numbers in lines.items()]
     known = {replace(denial, direction="") for denial in denials if denial.direction}
     return tuple(denial for denial in denials if denial.direction or denial not in known)
 
@@ -125,7 +129,7 @@ def _denials_of(process: str, numbered: list[tuple[int, str]]) -> Iterator[Denia
             remote, direction = _direction(lines[index : index + 1 + _NEAR_LINES], topic)
             by_rule = "deny" in match["rule"].lower()
             yield Denial(
-                topic, direction, enclave, by_rule, remote, vendor, process, number, folder
+                topic, direction, enclave, by_rule, remote, vendor, process, (number,), folder
             )
 
 
@@ -258,7 +262,7 @@ def learned_from_logs(
     lines = [
         AskingLine(
             log,
-            denial.line,
+            denial.lines[0],
             process=denial.process or None,
             enclave=denial.enclave or enclave or None,
             direction=denial.direction,

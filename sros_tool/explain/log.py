@@ -265,8 +265,7 @@ def explain_log(
     examiner = _Examiner(find, context, root, keystore)
     lines = log_lines(plain)
     denied = read_denials(plain)
-    naming = _lines_naming(lines, {denial.topic for denial in denied})
-    denials = [(denial, naming[denial.process, denial.topic]) for denial in denied]
+    naming = _lines_naming(lines, denied)
     reported = {denial.process for denial in denied}
     hits = _strongest_hits(_log_hits(_joined_lines(lines)), reported)
     findings = [
@@ -276,8 +275,8 @@ def explain_log(
     ]
     lacking = examiner.missing_namespaces(denied)
     findings += [
-        examiner.denial(denial, named, lacking.get((denial.process, denial.enclave), ""))
-        for denial, named in denials
+        examiner.denial(denial, naming[denial], lacking.get((denial.process, denial.enclave), ""))
+        for denial in denied
     ]
     own_enclave = find("")
     findings += _dropped_message_findings(
@@ -406,15 +405,29 @@ def _grouped_hits(hits: Iterable[_Hit]) -> Iterator[list[_Hit]]:
 
 
 def _lines_naming(
-    lines: list[str], topics: set[str]
-) -> Mapping[tuple[str, str], list[tuple[int, str]]]:
-    """Map pairs of process and topic to the numbers and texts of lines that name the topic."""
-    lines_of = defaultdict[tuple[str, str], list[tuple[int, str]]](list)
+    lines: list[str], denials: Sequence[Denial]
+) -> Mapping[Denial, list[tuple[int, str]]]:
+    """Map denials to the numbers and texts of lines that name their topic.
+
+    If a process was denied a topic for several causes, a line that is no denial itself belongs to
+    the denial before it; a denial of which the direction is unknown may then be of any cause.
+    """
+    of_topic = defaultdict[tuple[str, str], list[Denial]](list)
+    for denial in denials:
+        of_topic[denial.process, denial.topic].append(denial)
+    topics = {topic for _, topic in of_topic}
+    denial_at = {number: denial for denial in denials for number in denial.lines}
+    lines_of = defaultdict[Denial, list[tuple[int, str]]](list)
     for number, line in enumerate(lines, 1):
         process, text = labeled_line(line)
         words = (word for pattern in _WORDS for word in pattern.findall(text))
         for topic in topics.intersection(words):
-            lines_of[process, topic].append((number, text))
+            causes = of_topic[process, topic]
+            own = [denial for denial in causes if denial_at.get(number) == denial]
+            if own or len(causes) == 1 or (causes and not denied_topic(text)):
+                last = (own or causes)[0]
+                lines_of[last].append((number, text))
+                of_topic[process, topic] = sorted(causes, key=lambda denial: denial != last)
     return lines_of
 
 

@@ -902,6 +902,35 @@ def test_a_known_line_is_shown_without_time_and_source() -> None:
     assert shown == f"line 2: {topic}  (2 times)"
 
 
+def test_each_cause_of_a_topic_has_its_own_lines(tmp_path: Path) -> None:
+    """What names the topic without a cause belongs to the cause before it, a half cause to none."""
+    fast = "[SECURITY Error] rt/a topic {} rule. (Permissions.cpp:1192) -> Function check_create_"
+    (tmp_path / "fast.log").write_text(
+        f"{fast.format('denied by deny')}datawriter\n"
+        "[SECURITY Error] rt/b topic not found in allow rule. -> Function check_create_datawriter\n"
+        f"{fast.format('not found in allow')}datareader\n"
+        "failed to create subscription for rt/a\n"
+    )
+    by_default = "is not permitted: rt/a denied by default rule(code: 145)\n"
+    (tmp_path / "cyclone.log").write_text(
+        "Local topic permission denied: rt/a denied by default rule(code: 145)\n"
+        "Local topic permission denied: rt/b found in deny_rule.(code: 145)\n"
+        f"Writer {by_default}Reader {by_default}Reader {by_default}"
+    )
+    for log, told in (
+        ("fast.log", [(1, 1, "publish /a"), (2, 1, "publish /b"), (3, 2, "subscribe /a")]),
+        ("cyclone.log", [(2, 1, "use /b"), (3, 1, "publish /a"), (4, 2, "subscribe /a")]),
+    ):
+        ended = sros("explain", "--log", log, "--json", cwd=tmp_path)
+        lines = (tmp_path / log).read_text().splitlines()
+        found = json.loads(ended.out)["findings"]
+        assert [
+            (each["line"], each["count"], each["cause"].partition("may not ")[2].partition(":")[0])
+            for each in found
+        ] == told
+        assert all(each["text"] in lines[each["line"] - 1] for each in found)
+
+
 def test_halves_of_services_are_told_as_services() -> None:
     texts = {
         "rq/addRequest topic not found in allow rule. -> check_create_datawriter": "call /add",
