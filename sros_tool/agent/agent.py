@@ -373,7 +373,11 @@ class _Round:
 
     def _note_closed_keys(self, exposed: Mapping[str, datetime], now: datetime) -> None:
         """Report the keys that others could read until the agent closed them, for a day."""
-        closed = {key: exposed[key] for key in exposed.keys() - exposed_keys(self._folder, now)}
+        closed = {
+            key: exposed[key]
+            for key in exposed.keys() - exposed_keys(self._folder, now)
+            if (self._folder / key).exists()  # an enclave that was removed has no key
+        }
         self._state = replace(self._state, exposed=closed)
         if closed:
             self._problems.append(

@@ -422,6 +422,11 @@ def test_a_key_that_others_could_read_is_named_for_a_day_after_the_agent_closed_
     later = moment() + timedelta(hours=23)
     assert any("others could read" in problem for problem in r1.round(later).problems)
     assert not r1.round(moment() + timedelta(hours=25)).problems
+    key.chmod(0o644)
+    left = {path: data for path, data in home.renewed.files.items() if "/r1/a/" not in path}
+    r1.release = home.release(left)
+    problems = r1.round().problems
+    assert not key.exists() and not any("others could read" in problem for problem in problems)
 
 
 # ── the clock ──────────────────────────────────────────────────────────────────────────────
