@@ -37,7 +37,8 @@ def time_of_file(seconds: float) -> datetime:
         return datetime.max.replace(tzinfo=UTC) if seconds > 0 else _EPOCH
 
 
-_SOON = timedelta(days=30)
+SOON = timedelta(days=30)
+"""How long before it expires a document counts as expiring soon, unless its validity is short."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +68,7 @@ class Window:
 
         This is 30 days before it expires, or a third of its length if that is shorter.
         """
-        return self.not_after - min(_SOON, (self.not_after - self.not_before) / 3)
+        return self.not_after - min(SOON, (self.not_after - self.not_before) / 3)
 
     def lifetime(self, made_at: datetime | None = None) -> timedelta:
         """Return how long a document with this validity is valid after it was made.

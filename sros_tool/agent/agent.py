@@ -81,7 +81,7 @@ from sros_tool.keystore.reader import read_certificate
 from sros_tool.keystore.transaction import recover_keystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import make_request, validity_of
-from sros_tool.pki.crl import list_number, load_crl, newest_list
+from sros_tool.pki.crl import list_number, load_crl, newest_list, read_lists
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 from sros_tool.pki.token import Secrets, open_enclave_key
 from sros_tool.runtime.processes import RunningProcesses, boot_id
@@ -475,32 +475,43 @@ class _Round:
         before, files = self._state.files, self._digests(names)
         due = {*self._state.due, *changed} & files.keys()
         list_due = {*self._state.list_due} & files.keys()
+        list_since = dict(self._state.list_since)
         for name, digests in files.items():
             before_all, _, before_trust = before.get(name, "").partition(" ")
             all_files, _, trust = digests.partition(" ")
+            if before_trust != trust:
+                list_since[name] = self._time()
             if before_all != all_files:
                 due.add(name)
                 if before_trust != trust:
                     list_due.add(name)
         self._state = replace(
-            self._state, due=tuple(sorted(due)), list_due=tuple(sorted(list_due)), files=files
+            self._state,
+            due=tuple(sorted(due)),
+            list_due=tuple(sorted(list_due)),
+            list_since={name: list_since[name] for name in files if name in list_since},
+            files=files,
         )
 
     def _digests(self, names: Iterable[str]) -> dict[str, str]:
         """Map each enclave to two digests: of its files without the key, and of its trust files.
 
-        The trust files decide which other enclaves it accepts.
+        The trust files decide which other enclaves it accepts.  Of a revocation list, only what it
+        revokes counts: processes with the list from before it was signed again do not lack it.
         """
         with Folder(self._folder) as opened:
             return {
                 name: " ".join(
                     hashlib.sha256(
                         " ".join(
-                            _sha256(opened, f"{enclave_folder(name)}/{file}") or "-"
+                            read_digest(opened, f"{enclave_folder(name)}/{file}") or "-"
                             for file in files
                         ).encode()
                     ).hexdigest()
-                    for files in (CONFIRMED_FILES, _TRUST_FILES)
+                    for files, read_digest in (
+                        (CONFIRMED_FILES, _sha256),
+                        (_TRUST_FILES, _trust_digest),
+                    )
                 )
                 for name in names
             }
@@ -556,12 +567,21 @@ class _Round:
             time.sleep(_LOOK_SECONDS)
 
     def _look(self, names: Iterable[str]) -> EnclaveProcesses:
-        """Examine the processes at the current time, which is later than the start of the round."""
-        passed = timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME) - self._began)
+        """Examine the processes at the current time."""
         machine = self._machine
         return look_at_processes(
-            self._folder, names, now=machine.now + passed, zone=machine.zone, look=machine.look
+            self._folder,
+            names,
+            now=self._time(),
+            zone=machine.zone,
+            look=machine.look,
+            list_since=self._state.list_since,
         )
+
+    def _time(self) -> datetime:
+        """Return the current time, which is later than the start of the round."""
+        passed = timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME) - self._began)
+        return self._machine.now + passed
 
     def _renewals(self, names: Iterable[str]) -> Renewals:
         asked = _renewals(
@@ -762,6 +782,22 @@ def _sha256(folder: Folder, path: str) -> str:
     with suppress(SrosError, OSError):
         return hashlib.sha256(folder.read_inside(path)).hexdigest()
     return ""
+
+
+def _trust_digest(folder: Folder, path: str) -> str:
+    """Return the digest of a file; of a revocation list that a CA of the enclave signed, only of
+    what it revokes.
+    """
+    place, _, file = path.rpartition("/")
+    with suppress(SrosError, OSError):
+        data = folder.read_inside(path) if file == CRL_FILE else b""
+        signed = newest_list(data, folder.read_inside(f"{place}/{IDENTITY_CA_FILE}"))
+        if signed and len(read_lists(data, "here")) == 1:
+            revoked = sorted(_revoked(data.decode()))
+            return hashlib.sha256(
+                f"{signed.issuer.public_bytes()!r} {revoked}".encode()
+            ).hexdigest()
+    return _sha256(folder, path)
 
 
 def _revoked(text: str) -> frozenset[int]:

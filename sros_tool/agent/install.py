@@ -207,10 +207,10 @@ def _check_release(
         raise KeystoreError(
             f"release {release.number} {OF_OTHER_CA}",
             f"{problem[:1].upper()}{problem[1:].rstrip('.')}. Nothing was changed.",
-            "Look whether the server has an old copy, from before a CA rotation. If this robot "
-            "missed a stage of a rotation, bring its files with `sros distribute_key KEYSTORE "
-            f"--robot {robot} FOLDER --force`. Otherwise the release comes from another "
-            "keystore, or was changed: find out who can write to the publishing folder.",
+            "If this robot missed a stage of a CA rotation, bring its files: `sros distribute_key "
+            f"KEYSTORE --robot {robot} FOLDER --force`. If not, look whether the server has an old "
+            "copy, from before a rotation. Otherwise the release comes from another keystore, or "
+            "was changed: find out who can write to the publishing folder.",
         )
     with Folder(folder) as opened:
         usable = [name for name in present if _had_certificate(opened, name)]

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, tzinfo
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 from sros_tool.agent.settings import AgentSettings
@@ -77,6 +78,7 @@ def look_at_processes(
     now: datetime,
     zone: tzinfo,
     look: Callable[[datetime], RunningProcesses] | None = None,
+    list_since: Mapping[str, datetime] = MappingProxyType({}),
 ) -> EnclaveProcesses:
     """Return what runs in the enclaves ``names`` of ``folder``; ``look`` reads the processes."""
     running = (look or ProcessTable().look)(now)
@@ -85,7 +87,12 @@ def look_at_processes(
     for process in own_processes:
         by_enclave.setdefault(_enclave_of(process), []).append(process)
     states = {name: _state(by_enclave.get(name, ()), _is_outdated) for name in names}
-    list_states = {name: _state(by_enclave.get(name, ()), may_lack_list) for name in states}
+
+    def lacks_list(process: Process, enclave: ProcessEnclave) -> bool:
+        since = list_since.get(_enclave_of(process))
+        return may_lack_list(process, enclave, has_list=bool(since and since < process.started))
+
+    list_states = {name: _state(by_enclave.get(name, ()), lacks_list) for name in states}
     other_processes = [
         process
         for process in running.processes

@@ -46,7 +46,8 @@ class AgentState:
     those in ``unseen``, no process was seen.  ``list_due`` are the enclaves whose processes may
     lack the revocation list.  ``files`` maps enclaves to two digests at the end of the last
     round, as text: of all files, and of the files that decide whom the enclave trusts.  A change of
-    a digest, whoever wrote the files, makes a restart due.  ``fetched`` and
+    a digest, whoever wrote the files, makes a restart due; ``list_since`` maps enclaves to the time
+    since when the second digest is the same.  ``fetched`` and
     ``sent`` are when the source and the inbox were last reached.  ``repaired`` is a sentence on
     files that were not those of the release and were replaced, at ``repaired_at``.  ``exposed``
     maps paths of private keys that others could read, until the agent closed them, to the time of
@@ -66,6 +67,7 @@ class AgentState:
     problems: tuple[str, ...] = ()
     repaired: str = ""
     repaired_at: datetime | None = None
+    list_since: Mapping[str, datetime] = field(default_factory=dict)
     exposed: Mapping[str, datetime] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
 
@@ -115,10 +117,11 @@ def _state_from(value: Any) -> AgentState:
         check_enclave_name(_text(name)): _text(text)
         for name, text in dict(value.get("files", {})).items()
     }
-    value["exposed"] = {
-        _text(path): parse_iso(_text(moment))
-        for path, moment in dict(value.get("exposed", {})).items()
-    }
+    for moments in ("exposed", "list_since"):
+        value[moments] = {
+            _text(path): parse_iso(_text(moment))
+            for path, moment in dict(value.get(moments, {})).items()
+        }
     value["problems"] = tuple(map(_text, value["problems"]))
     return AgentState(**value)
 

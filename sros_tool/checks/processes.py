@@ -222,13 +222,15 @@ def newer_files(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
         yield from (f"'{_plain_path(file)}' (its place or mode)" for file in moved[:1])
 
 
-def may_lack_list(process: Process, enclave: ProcessEnclave) -> bool:
+def may_lack_list(process: Process, enclave: ProcessEnclave, *, has_list: bool = False) -> bool:
     """Return whether a process may have loaded another revocation list, or other CAs.
 
     If only the enclave's own documents are newer than the process, it has loaded the same list.
+    With ``has_list``, any list since its start revokes the same.
     """
     moved = any(moment > process.started for moment in enclave.moved.values())
-    return moved or not {*newer_files(process, enclave)} <= _OWN_FILES
+    same_files = _OWN_FILES | ({CRL_FILE} if has_list else set())
+    return moved or not {*newer_files(process, enclave)} <= same_files
 
 
 _OWN_FILES = {CERTIFICATE_FILE, KEY_FILE, PERMISSIONS_FILE, GOVERNANCE_FILE}

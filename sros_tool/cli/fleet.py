@@ -591,10 +591,10 @@ def _status(
     DDS has known vulnerabilities that a later release of the same major version fixes, by the
     advisories of sros; --robot and --advisories list them.
 
-    sros counts the revocation list as in force on a robot if the robot has the list, and its
-    confirmation says that no process has to restart for it. `sros agent` tells processes that lack
-    the list from those that lack only new permissions, governance or certificates of their own; in
-    other confirmations, every due restart counts.
+    sros counts the revocation list as in force on a robot if the robot has the list, or an earlier
+    one that revokes the same, and its confirmation says that no process has to restart for it.
+    `sros agent` tells processes that lack the list from those that lack only new permissions,
+    governance or certificates of their own; in other confirmations, every due restart counts.
 
     Example:
       $ sros fleet status keystore
@@ -784,6 +784,7 @@ def _list_in_force(status: FleetStatus) -> tuple[int, int] | None:
 
 def _remedies(root: Path, to_dos: Collection[str]) -> Mapping[str, str]:
     """Map each entry of the column `to do` to instructions."""
+    from sros_tool.keystore.expiry import renewal_command
     from sros_tool.keystore.fleet import publish_command
 
     where = quote(str(root))
@@ -795,7 +796,7 @@ def _remedies(root: Path, to_dos: Collection[str]) -> Mapping[str, str]:
     known = {
         "deliver": by_hand,
         "publish": publish,
-        "renew": f"`sros renew {where} --all-expiring 30d`, then {publish or 'deliver'}",
+        "renew": f"`{renewal_command(root)}`, then {publish or 'deliver'}",
         "take it out of the fleet file": "remove the robot from the fleet file, and run "
         f"`sros generate_artifacts -k {where} -p POLICY --fleet FILE`",
         "upgrade the DDS": "upgrade the package of the library, which is named below, on the "
@@ -810,6 +811,7 @@ def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     """Yield when the first file on a robot expires, if that is soon, and what to do."""
     from datetime import timedelta
 
+    from sros_tool.keystore.expiry import renewal_command
     from sros_tool.keystore.fleet import publish_command
     from sros_tool.validity import iso
 
@@ -828,11 +830,11 @@ def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     when = f"{end:%Y-%m-%d}" if time_left > timedelta(days=1) else iso(end)
     label = "first expiry on a robot" if time_left > timedelta(0) else "expired on a robot since"
     short_lived = [name for robot in soon for name in robot.short_lived]
-    named = [*map(quote, short_lived[:_MOST_GROUPS])]
+    named = short_lived[:_MOST_GROUPS]  # names of enclaves need no quotes
     named += ["..."] * (len(short_lived) > _MOST_GROUPS)
-    if not all(robot.short_lived for robot in soon):
-        named.append("--all-expiring 30d")
     command = f"`sros renew {quote(str(root))} {' '.join(named)}`, then "
+    if not all(robot.short_lived for robot in soon):
+        command = f"`{renewal_command(root, *named)}`, then "
     if kind == "crl":
         command = f"`sros crl {quote(str(root))} --refresh`, then "
     if not any("current" in robot.files.get(kind, ()) for robot in soon):
@@ -1087,6 +1089,8 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
     if robot.fetches and robot.lacks_key:
         names = first_few(robot.lacks_key, _MOST_GROUPS)
         yield f"lacks the key of {names}, which no release brings"
+    elif robot.lacks_ca:
+        yield "does not trust the CA that seals releases, so fetching cannot help"
     elif robot.is_locked_out and robot.enclaves:
         yield "all its certificates are revoked: a web server with the current list refuses it"
     if robot.restart:

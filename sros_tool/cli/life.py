@@ -481,6 +481,7 @@ def rotate_ca(
       retired the old CA: identity_ca, permissions_ca
       $ sros rotate_ca keystore --finish   # or all at once; then restart all
     """
+    from sros_tool.keystore.fleet import publish_command
     from sros_tool.keystore.lifecycle.rotate import renew_identity_ca
     from sros_tool.keystore.lifecycle.rotate import rotate_ca as work
     from sros_tool.keystore.lifecycle.rotation import RotationStage, rotation_status
@@ -549,6 +550,12 @@ def rotate_ca(
         f"cut off: {', '.join(step.cut_off)} {cannot} talk to robots with the files of this stage "
         "before getting these files, too"
     )
+    if step.cut_off and publish_command(root):
+        cut_off += (
+            ". A robot that fetches and does not trust the new CA yet refuses all later releases: "
+            f"`sros distribute_key {quote(str(root))} --robot NAME FOLDER --force`, and bring "
+            "FOLDER to the robot"
+        )
     print_changed(step, shown, after=[cut_off] if step.cut_off else (), restart=False)
 
 

@@ -44,11 +44,12 @@ from sros_tool.enclave_environment import (
     other_node_notes,
     target_path,
 )
-from sros_tool.errors import KeystoreError, Note, UnavailableError, UsageError
+from sros_tool.errors import KeystoreError, Note, SrosError, UnavailableError, UsageError
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.runtime.environment import COMPOSE, CONTAINER_FORMS, KUBERNETES, SECRET
 from sros_tool.runtime.units import Job
 from sros_tool.terminal import echo, echo_document, echo_lines
+from sros_tool.validity import SOON
 from sros_tool.values import FileChange
 
 if TYPE_CHECKING:
@@ -574,6 +575,9 @@ def units(
             )
     elif command:
         raise UsageError("COMMAND is for nodes, and no enclave is named")
+    limit = SOON
+    with suppress(SrosError, OSError):  # a robot's folder has no settings
+        limit = OpenedKeystore(root).template.renewal_limit
     for job in jobs:
         files |= job_units(
             Job(job),
@@ -585,6 +589,7 @@ def units(
             writable=_inbox(root) if job == Job.AGENT else (),
             inbox=str(inbox.absolute()) if inbox else "",
             publishing=str(publishing.absolute()) if publishing else "",
+            renewal_limit=limit,
         )
     changes = unit_changes(folder, files, force=force)
     if not dry_run:

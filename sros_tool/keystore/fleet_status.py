@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from enum import StrEnum
 from functools import cached_property
+from itertools import chain
 from typing import Annotated, NamedTuple
 
 from sros_tool.dds.advisories import Advisory, known_vulnerabilities
@@ -31,6 +32,7 @@ from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
     CONFIRMED_FILES,
     EXPIRED_METADATA,
+    OF_OTHER_CA,
     Confirmation,
     Received,
     RobotClock,
@@ -61,7 +63,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     has_enclave,
 )
-from sros_tool.keystore.ledger import RESTORED, Entry, behind_clause, clock_behind
+from sros_tool.keystore.ledger import RESTORED, SAME_KEY, Entry, behind_clause, clock_behind
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.parallel import map_slices
@@ -144,6 +146,8 @@ _TO_DO = {
     State.ANOTHER: "find out why",
 }
 """State of a robot → the remedy, if the state alone decides it."""
+_SUSPICIOUS = (State.LATER, State.UNKNOWN, State.ANOTHER)
+"""States of a robot of which somebody has to find out why, before anything is brought to it."""
 
 
 def _kind_of(path: str) -> str:
@@ -201,11 +205,13 @@ class RobotStatus:
     robot whose files differ from the keystore's: whether the release that was published last for it
     has the current files of the keystore.  ``short_lived`` are enclaves with such a validity, of
     which a file expires soon or has expired.  ``has_list`` says whether it has the current
-    revocation list, in force or not, and ``renew_from`` from when a file of it expires soon.
+    revocation list, or an earlier one that revokes the same, in force or not, and ``renew_from``
+    from when a file of it expires soon.
     ``lacks_key`` are enclaves whose key the keystore has and the robot does not, which no release
     brings.  ``is_ahead`` says that, by its message, its files are newer than the backup of the
     keystore. ``reads_copy`` says that it fetched after the publication and got an earlier release,
-    and ``is_locked_out`` that all its certificates are revoked.  The first ``reported`` problems
+    and ``is_locked_out`` that all its certificates are revoked.  ``lacks_ca`` says that it refuses
+    releases, because it does not trust the CA that seals them.  The first ``reported`` problems
     are in the words of the robot.
     """
 
@@ -253,9 +259,10 @@ class RobotStatus:
     """The files that the processes of each enclave of the robot have loaded, by its last
     confirmation; null if the confirmation does not tell."""
     crl_in_force: bool | None
-    """Whether the robot has the current revocation list, says that no process may run with an
-    earlier one or with earlier CAs, and is not ``offline``; false if this is not known, or the
-    keystore is older than its robots; null if the keystore has no list, or the robot has no
+    """Whether the robot has the current revocation list, or an earlier one that revokes the same,
+    which has not expired, says that no process may run with another list or with earlier CAs, and
+    is not ``offline``; false if this is not known, or the keystore is older than its robots; null
+    if the keystore has no list, or the robot has no
     enclave. `sros agent` knows the processes that lack only new permissions, governance or
     certificates of their own; for other robots, any restart that is due counts."""
     expiry: Mapping[Annotated[str, Words(_EXPIRING)], datetime]
@@ -277,6 +284,7 @@ class RobotStatus:
     reads_copy: bool = False
     is_ahead: bool = False
     is_locked_out: bool = False
+    lacks_ca: bool = False
     reported: int = 0
 
     @property
@@ -325,7 +333,10 @@ class RobotStatus:
         """Return the status at ``now``, when files of the robot may have expired."""
         if not self.enclaves or all(end > now for end in self.expiry.values()):
             return self
-        return replace(self, state=max(self.state, State.EXPIRED, key=_BADNESS.__getitem__))
+        status = self
+        if (end := self.expiry.get("crl")) and end <= now:
+            status = self.without_list()
+        return replace(status, state=max(self.state, State.EXPIRED, key=_BADNESS.__getitem__))
 
     def without_list(self) -> RobotStatus:
         """Return the status if it is not known whether the last revocation list is in force."""
@@ -347,6 +358,8 @@ class RobotStatus:
             return look if self.problems else ""
         if self.is_ahead and (self.release or 0) > (self.published or 0):
             return "publish"
+        if self.lacks_ca and self.state not in (State.BROKEN, *_SUSPICIOUS):
+            return "deliver"
         if self.state in _TO_DO and not self.is_ahead:
             return _TO_DO[self.state]
         if self.state is State.UNUSABLE:
@@ -526,7 +539,7 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
     robots = [fleet.robot(name) for name in names] or list(fleet.robots.values())
     compared = _compare_robots(keystore, fleet, robots)
     stages = _Stages(keystore)
-    records = _KeystoreRecords(keystore, fleet, compared)
+    records = _KeystoreRecords(keystore, fleet, compared, stages.sealing_ca)
     existing = keystore.names
     unassigned = 0 if names else len(existing) - sum(len(robot.enclaves) for robot in compared)
     unrecorded = unrecorded_enclaves(fleet, existing, {robot.name for robot in robots})
@@ -592,6 +605,12 @@ class _ComparedRobot(NamedTuple):
     def confirmed(self) -> Confirmation | None:
         """The confirmation; None if the robot sent none."""
         return self.received.confirmation if self.received else None
+
+    def has_all(self, kind: str, is_equal: Callable[[_Difference], bool] = lambda _: False) -> bool:
+        """Return whether all its files of a kind are current, or other files that are equal."""
+        others = [file for file in self.different if _kind_of(file.path) == kind]
+        number = self.current.get(kind, 0) + len(others)
+        return number == len(self.enclaves) and all(map(is_equal, others))
 
     def running(self) -> Mapping[str, RunningFiles] | None:
         """Return what the processes of its enclaves have loaded; None if not reported."""
@@ -769,9 +788,15 @@ class _KeystoreRecords:
     """Identification, by the ledger, of confirmed files that differ from the keystore."""
 
     def __init__(
-        self, keystore: OpenedKeystore, fleet: Fleet, compared_robots: Sequence[_ComparedRobot]
+        self,
+        keystore: OpenedKeystore,
+        fleet: Fleet,
+        compared_robots: Sequence[_ComparedRobot],
+        sealing_ca: str,
     ) -> None:
+        """``sealing_ca`` is the SHA-256 of the permissions CA that seals releases now."""
         self._keystore = keystore
+        self._sealing_ca = sealing_ca
         self._root = keystore.root
         self.has_list = keystore.has(CRL)
         """Whether the keystore has a revocation list."""
@@ -790,6 +815,7 @@ class _KeystoreRecords:
         self._issued: dict[str, Entry] = {}
         self._revoked_serials: set[str] = set()
         self._revoked: set[str] = set()
+        self._equal_lists: set[str] = set()
         different = [
             file for robot in compared_robots for file in robot.different if file.confirmed
         ]
@@ -806,6 +832,8 @@ class _KeystoreRecords:
         )
         for robot in compared_robots:
             wanted_digests.update(*robot.expiring.values())
+            if robot.different:
+                wanted_digests.add(sealing_ca)
         wanted_digests.discard("")  # of a file that the robot does not have
         ledger = keystore.ledger if wanted_digests else keystore.ledger_with("what", "revocation")
         for entry in ledger.entries:
@@ -813,7 +841,10 @@ class _KeystoreRecords:
                 self._issued.setdefault(entry.sha256, entry)
             if entry.what == "certificate":
                 self._revoked.discard(entry.enclave)
+            elif entry.what == "crl":
+                self._equal_lists.add(entry.sha256)
             elif entry.what == "revocation":
+                self._equal_lists.clear()
                 self._revoked_serials.add(entry.serial)
                 if entry.enclave and entry.reason != SUPERSEDED:
                     self._revoked.add(entry.enclave)
@@ -830,12 +861,22 @@ class _KeystoreRecords:
             if f"{entry.serial:x}" not in self._revoked_serials
         }
         self._revoked_serials.update(reason_by_serial)
+        if reason_by_serial:  # the ledger does not say which lists have them
+            self._equal_lists.clear()
         for entry in self._keystore.ledger_file.with_values("serial", reason_by_serial).entries:
             if (
                 entry.what == "certificate"
                 and reason_by_serial.get(entry.serial, SUPERSEDED) != SUPERSEDED
             ):
                 self._revoked.add(entry.enclave)
+
+    def is_list_equal(self, file: _Difference) -> bool:
+        """Return whether an earlier revocation list revokes all that the current list revokes.
+
+        Each list has all serial numbers, so this is so for every list that was signed after the
+        last revocation in the ledger, if the ledger has all revocations on the current list.
+        """
+        return bool(file.exported and file.is_own) and file.confirmed in self._equal_lists
 
     def is_later(self, robot: str, release: int) -> bool:
         """Return whether no release with so high a number was ever published for a robot."""
@@ -903,6 +944,23 @@ class _KeystoreRecords:
                     enclaves_without_key.add(enclave_of(file.path))
         keys = {name: enclave_path(self._root, name) / KEY_FILE for name in enclaves_without_key}
         return tuple(sorted(name for name, key in keys.items() if os.path.lexists(key)))
+
+    def lacks_ca(self, compared_robot: _ComparedRobot, *, is_published: bool) -> bool:
+        """Return whether a robot that fetches does not trust the CA that seals releases.
+
+        Until the keystore's current files are published (``is_published``), what is published may
+        still be sealed by the earlier CA.  A CA with the same key as its predecessor may be
+        trusted by robots that have only the predecessor.
+        """
+        confirmed = compared_robot.confirmed
+        trusted = {*chain.from_iterable(compared_robot.authorities.get("permissions_ca", ()))}
+        if not (confirmed and trusted) or self._sealing_ca in trusted:
+            return False
+        last = self.published.get(compared_robot.robot.name, 0)
+        is_refused = any(OF_OTHER_CA in problem for problem in confirmed.problems or ())
+        authority = self._issued.get(self._sealing_ca)
+        has_all = is_published or is_refused or (confirmed.release or 0) == last
+        return has_all and not (authority and authority.reason == SAME_KEY)
 
     def reads_copy(self, compared_robot: _ComparedRobot, last_heard: datetime | None) -> bool:
         """Return whether a robot fetched long after the publication, and got an earlier release.
@@ -1090,8 +1148,11 @@ def _status(
         and bool(compared_robot.enclaves)
         and received is not None
         and state not in (State.REFUSED, State.LATER)
-        and counts.get("crl") == {State.CURRENT: len(compared_robot.enclaves)}
+        and compared_robot.has_all("identity_ca")
+        and compared_robot.has_all("crl", records.is_list_equal)
     )
+    fetches = bool(received and received.message)
+    has_release = bool(different) and records.has_release(compared_robot)
     validity = records.validity(compared_robot)
     certificates = {*counts.get("certificate", ())}
     status = RobotStatus(
@@ -1102,7 +1163,7 @@ def _status(
         unrecorded,
         received.time if received else None,
         confirmed.time if confirmed else None,
-        bool(received and received.message),
+        fetches,
         confirmed.release if confirmed else None,
         records.published.get(compared_robot.robot.name),
         stages.of(compared_robot),
@@ -1117,7 +1178,8 @@ def _status(
         confirmed.dds if confirmed else None,
         problems,
         compared_robot.notes,
-        has_release=bool(different) and records.has_release(compared_robot),
+        has_release=has_release,
+        lacks_ca=fetches and records.lacks_ca(compared_robot, is_published=has_release),
         short_lived=records.short_lived(validity),
         has_list=has_list,
         renew_from=min(
@@ -1169,6 +1231,11 @@ class _Stages:
             for kind in (f"{role}_ca" for role in roles):
                 self._new[kind] = new[0] if new else certificates[0]
                 self._of_kind[kind] = certificates, self.of_keystore if new else self.COMPLETE
+
+    @property
+    def sealing_ca(self) -> str:
+        """The SHA-256 of the permissions CA that seals releases now."""
+        return self._of_kind["permissions_ca"][0][0]
 
     def of(self, compared_robot: _ComparedRobot) -> str:
         """Return the stage of the robot's least advanced CA file; "" if it confirmed no CA file."""

@@ -547,6 +547,35 @@ def test_other_permissions_leave_the_revocation_list_in_force(home: Home, r1: Ro
     assert r1.message().crl_restart is None
 
 
+@pytest.mark.parametrize("seen", [True, False])
+def test_a_list_that_was_signed_again_is_lacked_by_no_process(
+    seen: bool, home: Home, r1: Robot, tmp_path: Path
+) -> None:
+    """But a list that revokes something else is, and a process from before the first list."""
+    r1.release, r1.unseen = home.revoked, not seen
+    r1.round()
+    r1.restarted = True
+    r1.round()
+    r1.restarted = False
+    time.sleep(0.04)
+    if seen:
+        r1.started = {"/r1/b": datetime.now(UTC)}
+    time.sleep(0.04)
+    root = copy_of(home.root, tmp_path / "home")
+    sros("crl", root, "--refresh").ok()
+    r1.release = release_of(files_of(root), 4, home.authority)
+    assert "/r1/b" in r1.round(datetime.now(UTC)).restart
+    assert r1.message().crl_restart == ()
+    if seen:
+        r1.started = {"/r1/b": moment() - timedelta(hours=1)}
+        r1.round(datetime.now(UTC))
+        assert r1.message().crl_restart is None
+    sros("renew", root, "/r1/c", "--revoke-old").ok()
+    r1.release = release_of(files_of(root), 5, home.authority)
+    r1.round(datetime.now(UTC))
+    assert r1.message().crl_restart is None
+
+
 def test_a_look_at_the_processes_has_its_own_time(r1: Robot) -> None:
     """A process seems to start earlier by what passes between the time and the look."""
     before, now = time.monotonic(), moment()

@@ -442,6 +442,40 @@ def test_a_rotation_goes_on_without_robots_if_that_is_chosen(field: Field) -> No
     assert json.loads(told)["unconfirmed"] is None
 
 
+def test_a_robot_that_missed_a_stage_gets_its_files_by_hand(field: Field) -> None:
+    """It refuses what the new CA seals, whether it is off, on, or its message is refused."""
+
+    def to_do() -> str:
+        found: str = field.status()["robots"]["r2"]["to_do"]
+        return found
+
+    field.run("fleet", "publish", "ks", "pub")
+    for robot in ROBOTS:
+        field.send(robot, release=1)
+    field.run("rotate_ca", "ks", "--next")
+    field.run("fleet", "publish", "ks", "pub")
+    assert to_do() == "wait: it fetches"
+    said = field.run("rotate_ca", "ks", "--next", "--allow-unconfirmed").err
+    assert (
+        "refuses all later releases: `sros distribute_key ks --robot NAME FOLDER --force`" in said
+    )
+    assert to_do() == "wait: it fetches", "the published release is that of the earlier stage"
+    field.run("fleet", "publish", "ks", "pub")
+    assert to_do() == "deliver"
+    refused = "Release 3 is not sealed by a CA that this robot trusts: it is not."
+    field.send("r2", release=1, problems=(refused,))
+    assert to_do() == "deliver"
+    said = field.run("fleet", "status", "ks", "--robot", "r2", status=1).out
+    assert "does not trust the CA that seals releases, so fetching cannot help" in said
+    for days in (1 / 24, 2):
+        field.age("r2", timedelta(days=days))
+        assert to_do() == "deliver"
+    field.run("rotate_ca", "ks", "--next", "--allow-unconfirmed")
+    field.run("fleet", "publish", "ks", "pub")
+    field.send("r2", release=1)
+    assert field.states()["r2"] == "refused" and to_do() == "deliver"
+
+
 def test_a_restart_that_is_due(field: Field) -> None:
     """The files are current, but processes run with those of before: that is not green."""
     assert field.status()["robots"]["r1"]["restart"] is None, "not said"
@@ -623,6 +657,35 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     assert "\nthe revocation list is in force on all 3 robots; robots need it until " in said
     said = field.run("fleet", "status", "ks", "--robot", "r3").out
     assert "\nthe revocation list is in force on 1 robot; robots need it until " in said
+
+
+def test_an_earlier_list_that_revokes_the_same_stays_in_force(field: Field) -> None:
+    """Also if it was signed again twice, but not if something was revoked since, or it expired."""
+
+    def in_force() -> list[bool | None]:
+        return [field.status()["robots"][robot]["crl_in_force"] for robot in ROBOTS]
+
+    field.run("crl", "ks", "--refresh")
+    field.deliver("r3", restart=[])
+    field.run("revoke", "ks", "/dispatcher")
+    field.deliver("r1", restart=[])
+    field.run("crl", "ks", "--refresh")
+    field.deliver("r2", restart=[])
+    assert in_force() == [True, True, False]
+    field.run("crl", "ks", "--refresh")
+    assert in_force() == [True, True, False]
+    keystore = OpenedKeystore(field.root)
+    later = datetime.now(UTC) + timedelta(days=4000)
+    found = fleet_status(keystore).with_overdue(later)
+    assert not any(robot.crl_in_force for robot in found.robots), "it has expired"
+    copied = copy_of(field.root, field.folder / "copy")
+    field.run("revoke", "ks", "/r3/base")
+    assert in_force() == [False, False, None]
+    (copied / "public/identity_ca.crl.pem").write_bytes(
+        (field.root / "public/identity_ca.crl.pem").read_bytes()
+    )
+    copied_status = fleet_status(OpenedKeystore(copied))
+    assert not copied_status.robots[0].crl_in_force, "its ledger does not know what is revoked"
 
 
 def test_a_list_that_the_keystore_does_not_export_is_not_in_force(field: Field) -> None:

@@ -59,6 +59,7 @@ from sros_tool.distributions import Distribution, find_distribution
 from sros_tool.errors import SrosError
 from sros_tool.faults import NEEDS_CA_KEYS, ORIGINAL_KEYSTORE, remedy_in_original_keystore
 from sros_tool.fleet.robots import Fleet
+from sros_tool.keystore.expiry import renewal_command
 from sros_tool.keystore.fleet import publish_command, stated_distributions
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
@@ -408,7 +409,7 @@ def _with_cause_of_expiry(findings: Sequence[Finding], root: Path) -> list[Findi
         EXPIRES_SOON.title.replace("a certificate", "certificates"),
         f"{counted(len(soon), 'file')} of {counted(enclaves, 'enclave')}, the first of "
         f"{first.subject}: {first.text}. {EXPIRES_SOON.why}",
-        f"Run `sros renew {quote(str(root))} --all-expiring 30d`, then "
+        f"Run `{renewal_command(root)}`, then "
         f"{published or 'export the enclaves again'}, and restart their processes.",
     )
 
