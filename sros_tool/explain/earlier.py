@@ -12,6 +12,7 @@ from sros_tool.keystore.known_keys import revoked_serials
 from sros_tool.keystore.layout import LEDGER
 from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.validity import iso
 from sros_tool.wording import first_few
 
@@ -56,6 +57,45 @@ def note_on_earlier_permissions(
             f"renew {root} {which} --revoke-old`."
         )
         yield Note("explain.earlier-permissions", text)
+
+
+def note_on_revoked_enclaves(keystore: OpenedKeystore, now: datetime) -> Iterator[Note]:
+    """Yield a note on revoked enclaves, which processes without the revocation list still accept.
+
+    Only enclaves count of which a certificate and permissions have not expired.  The note does not
+    say whether an enclave had the right that is asked about.
+    """
+    if not keystore.has(LEDGER):
+        return
+    try:
+        revocations = keystore.ledger_with("what", "revocation").entries
+        ends = {
+            entry.enclave: entry.not_after
+            for entry in sorted(revocations, key=lambda entry: entry.not_after)
+            if entry.what == "revocation"
+            and entry.reason != SUPERSEDED
+            and entry.not_after > iso(now)
+            and entry.enclave
+            and not keystore.has_enclave(entry.enclave)
+        }
+        issued = keystore.ledger_file.with_values("enclave", ends).entries if ends else ()
+    except SrosError:  # which the note on earlier permissions reports
+        return
+    permissions_until: dict[str, str] = {}
+    for entry in issued:
+        if entry.what == "permissions" and entry.not_after > iso(now):
+            last = permissions_until.get(entry.enclave, "")
+            permissions_until[entry.enclave] = max(last, entry.not_after)
+    names = sorted(ends.keys() & permissions_until.keys())
+    if names:
+        until = max(min(ends[name], permissions_until[name]) for name in names)
+        text = (
+            f"revoked enclaves do not count: {first_few(names, 3)}. A process without the current "
+            "revocation list still accepts them, with the rights that they had, until "
+            f"{until}: each process has to load the list at a restart (with a fleet, `sros fleet "
+            f"status {quote(str(keystore.root))}` says where it is in force)."
+        )
+        yield Note("explain.revoked-enclaves", text)
 
 
 def _unknown(reason: str) -> Note:

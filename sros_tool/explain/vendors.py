@@ -722,7 +722,8 @@ class VendorOfKeystore(NamedTuple):
 
     def notes(self, outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
         """Yield notes on an export, which may lack enclaves, and on a copy without keys."""
-        from sros_tool.explain.earlier import note_on_earlier_permissions  # as in `outcomes`
+        # As in `outcomes`.
+        from sros_tool.explain.earlier import note_on_earlier_permissions, note_on_revoked_enclaves
         from sros_tool.explain.who import note_on_export
 
         yield from note_on_export(self.keystore.root)
@@ -730,5 +731,7 @@ class VendorOfKeystore(NamedTuple):
         yield from _note_on_anybody((outcome.opened for outcome in outcomes), refuse)
         denied = {outcome.enclave for outcome in outcomes if not outcome.allowed}
         yield from note_on_earlier_permissions(self.keystore, denied, self.asking.at)
+        if self.names is None:
+            yield from note_on_revoked_enclaves(self.keystore, self.asking.at)
         if not all(outcome.stopped for outcome in outcomes):
             yield from note_on_lacking_keys(self.keystore)

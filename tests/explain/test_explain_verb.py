@@ -760,6 +760,18 @@ def test_who(keystore: Path) -> None:
     }
 
 
+def test_a_revoked_enclave_that_processes_without_the_list_still_accept(keystore: Path) -> None:
+    asked = ("--who", "publish", "/chatter")
+    assert "revoked" not in explain(keystore, *asked).err
+    sros("revoke", keystore, ENCLAVE).ok()
+    found = explain(keystore, *asked)
+    assert found.out == "0 of 1 enclave may publish topic /chatter\n"
+    note = f"note [explain.revoked-enclaves]: revoked enclaves do not count: {ENCLAVE}. A process "
+    assert note in found.err
+    later = explain(keystore, *asked, "--at", "2090-01-01").err
+    assert "explain.revoked-enclaves" not in later
+
+
 def test_earlier_permissions_that_still_allow_it(keystore: Path, tmp_path: Path) -> None:
     policy = tmp_path / "robot.xml"
     policy.write_text(policy_text({ENCLAVE: publish("/other")}))
