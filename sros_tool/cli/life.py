@@ -101,7 +101,7 @@ def renew(
     Example:
       $ sros renew keystore /talker
       renewed enclave /talker
-      the replaced certificate works until 2027-11-21T09:00:00Z, unless ...
+      the replaced certificate works until 2027-05-20T09:00:00Z, when ...
       $ sros renew keystore --all-expiring 30d --revoke-old
     """
     from sros_tool.keystore.expiry import parse_threshold
@@ -144,15 +144,19 @@ def _replaced_lines(result: Changed, *, has_new_keys: bool) -> Iterator[str]:
         yield "no enclave needs to be renewed"
     if result.works_until:
         end = iso(result.works_until)
-        validity = f"the replaced certificates work until {end} at the latest"
-        if result.may_work_longer:
-            validity = (
-                f"the replaced certificates work at least until {end} (the keystore was restored "
-                "from a backup, and its ledger may lack later certificates)"
-            )
-        elif len(result.outcomes) == 1:
-            validity = f"the replaced certificate works until {end}"
-        yield f"{validity}, unless revoked: see --revoke-old"
+        which = (
+            "replaced certificate works"
+            if len(result.outcomes) == 1
+            else "last of the replaced certificates works"
+        )
+        others = (
+            "; the ledger may lack certificates that work longer, because the keystore was "
+            "restored from a backup"
+        )
+        yield (
+            f"the {which} until {end}, when it or its last permissions expire, unless revoked: see "
+            f"--revoke-old{others * result.may_work_longer}"
+        )
     if result.outcomes and not result.restart:
         published = publish_command(result.root)
         deliver = f"publish ({published}) or export again" if published else "export again"

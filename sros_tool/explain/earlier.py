@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Collection, Container, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator
 from datetime import datetime
 from shlex import quote
 
 from sros_tool.errors import Note, SrosError
-from sros_tool.keystore.known_keys import revoked_serials
+from sros_tool.keystore.known_keys import IssuedEarlier
 from sros_tool.keystore.layout import LEDGER
-from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.validity import iso
@@ -31,22 +29,16 @@ def note_on_earlier_permissions(
         return
     ends: dict[str, str] = {}
     try:
-        ledger = keystore.ledger_file.with_values("enclave", denied)
-        revoked = revoked_serials(keystore)
+        issued = IssuedEarlier(keystore, denied)
     except SrosError as error:
         yield _unknown(error.what)
         return
-    if ledger.gaps:
-        yield _unknown(f"{LEDGER}: {first_few(ledger.gaps, 1)}")
-    for name, entries in _issued(ledger, denied, revoked).items():
-        permissions = [entry for entry in entries if entry.what == "permissions"]
-        expiry: dict[str, str] = {}
-        for certificate in (entry for entry in entries if entry.what == "certificate"):
-            last = max(certificate.not_after, expiry.get(certificate.subject, ""))
-            expiry[certificate.subject] = last
-        for earlier in permissions:
-            end = min(earlier.not_after, expiry.get(earlier.subject, ""))
-            if earlier.policy != permissions[-1].policy and end > iso(now):
+    if issued.ledger.gaps:
+        yield _unknown(f"{LEDGER}: {first_few(issued.ledger.gaps, 1)}")
+    for name in denied:
+        permissions = issued.permissions(name)
+        for earlier, end in permissions:
+            if earlier.policy != permissions[-1][0].policy and end > iso(now):
                 ends[name] = max(end, ends.get(name, ""))
     if ends:
         names, root = sorted(ends), quote(str(keystore.root))
@@ -101,14 +93,3 @@ def note_on_revoked_enclaves(keystore: OpenedKeystore, now: datetime) -> Iterato
 def _unknown(reason: str) -> Note:
     text = f"whether earlier permissions may still allow it is not known: {reason}."
     return Note("explain.earlier-permissions", text)
-
-
-def _issued(
-    ledger: Ledger, names: Collection[str], revoked: Container[int]
-) -> Mapping[str, Sequence[Entry]]:
-    """Return what the ledger has of each of the enclaves, except for revoked certificates."""
-    issued: defaultdict[str, list[Entry]] = defaultdict(list)
-    for entry in ledger.entries:
-        if entry.enclave in names and not (entry.serial and int(entry.serial, 16) in revoked):
-            issued[entry.enclave].append(entry)
-    return issued

@@ -1,4 +1,5 @@
-"""The public keys that a keystore knows: the keys of its enclaves, and revoked keys.
+"""What a keystore knows of its keys: the keys of its enclaves, revoked keys, and until when
+certificates and permissions that it issued for them work.
 
 A revocation list names certificates, so a new certificate for a revoked key would undo its
 revocation.  Two enclaves with one key are one identity: each can act as the other.  Keys are
@@ -7,9 +8,11 @@ compared by the SHA-256 of their SubjectPublicKeyInfo (DER).
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from datetime import datetime
 from functools import cached_property
 from shlex import quote
 
@@ -40,6 +43,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.pki.keys import PublicKey, load_key
+from sros_tool.validity import parse_iso
 
 
 def revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
@@ -63,6 +67,69 @@ def restored_at(keystore: OpenedKeystore) -> str:
     return ""
 
 
+class IssuedEarlier:
+    """The certificates and permissions of enclaves in the ledger, without revoked certificates.
+
+    Permissions work with a certificate for their subject, until one of the two expires.
+    """
+
+    def __init__(self, keystore: OpenedKeystore, names: Collection[str]) -> None:
+        self.ledger = keystore.ledger_file.with_values("enclave", names)
+        self._permissions: defaultdict[str, list[Entry]] = defaultdict(list)
+        self._certificates: defaultdict[str, dict[str, str]] = defaultdict(dict)
+        revoked = revoked_serials(keystore)
+        for entry in self.ledger.entries:
+            if entry.what == "permissions":
+                self._permissions[entry.enclave].append(entry)
+            elif entry.what == "certificate" and int(entry.serial, 16) not in revoked:
+                expiry = self._certificates[entry.enclave]
+                last = expiry.get(entry.subject, "")
+                expiry[entry.subject] = max(last, entry.not_after)
+
+    def permissions(self, name: str) -> Sequence[tuple[Entry, str]]:
+        """Return the permissions of an enclave, each with the moment until which they work.
+
+        The moment is "" if no certificate has their subject.
+        """
+        expiry = self._certificates[name]
+        return [
+            (entry, min(entry.not_after, expiry.get(entry.subject, "")))
+            for entry in self._permissions[name]
+        ]
+
+    def permissions_until(self, name: str) -> datetime | None:
+        """Return until when the last permissions of an enclave work; None for none."""
+        last = max((until for _, until in self.permissions(name)), default="")
+        return parse_iso(last) if last else None
+
+    def certificates_until(self, replaced: Entry, signed_for: str | None) -> datetime:
+        """Return until when the ``replaced`` certificate and earlier ones of its enclave work.
+
+        The ledger has the last permissions that fit a certificate, unless the certificate has the
+        subject ``signed_for`` of the enclave's new one, or a subject without a unique part, which
+        Cyclone DDS finds in others.  With None, certificates need no permissions.
+        """
+        last: defaultdict[str, str] = defaultdict(str)
+        for entry in self._permissions[replaced.enclave]:
+            # Those that ros2/sros2 signed are recorded without subject and expiry.
+            last[entry.subject] = max(last[entry.subject], entry.not_after or _NEVER)
+        certificates = self._certificates[replaced.enclave].items()
+        return parse_iso(
+            max(
+                min(expiry, last[subject])
+                if last[subject]
+                and signed_for not in (None, subject)
+                and not last[""]
+                and _UNIQUE_PART.search(subject)
+                else expiry
+                for subject, expiry in [*certificates, (replaced.subject, replaced.not_after)]
+            )
+        )
+
+
+_UNIQUE_PART = re.compile(r"(?:^|,)OU=[0-9a-f]{16}(?:,|$)")
+_NEVER = "9999"
+"""A moment after every moment of the ledger."""
 _MOST_NAMES = 200
 """Number of enclaves up to which keys are looked up one by one; for more, the files of all enclaves
 are read.

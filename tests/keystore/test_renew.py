@@ -8,6 +8,7 @@ import shutil
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -25,6 +26,7 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import validity_of
 from sros_tool.policy.document import read_policy
 from sros_tool.validity import Window
+from sros_tool.zenoh.configuration import ZenohNetwork
 from tests.support.harness import (
     certificate,
     check_whole,
@@ -43,7 +45,7 @@ LEDGERS = {"ledger.jsonl", "ledger.p7s"}
 RENEWED = {"cert.pem", "permissions.p7s", "permissions.xml"}
 
 
-def made(root: Path, *names: str, template: str = "production", **more: timedelta | bool) -> Path:
+def made(root: Path, *names: str, template: str = "production", **more: object) -> Path:
     def make(root: Path) -> None:
         choices = replace(load_template(template), **more)  # type: ignore[arg-type]
         create_keystore(root, template=choices, now=NOW)
@@ -113,6 +115,24 @@ def test_the_rights_stay(template: str, tmp_path: Path) -> None:
         assert grant.not_before > old.not_before
         # In development they end with their CA already.
         assert (grant.not_after > old.not_after) is (template == "production")
+
+
+@pytest.mark.parametrize(
+    ("settings", "days"),
+    [({}, 180), ({"unique_subject": False}, 365), ({"zenoh": ZenohNetwork()}, 365)],
+    ids=["unique subjects", "one subject", "Zenoh"],
+)
+def test_until_when_the_replaced_certificate_works(
+    settings: dict[str, Any], days: int, tmp_path: Path
+) -> None:
+    """On DDS, a certificate needs permissions that fit it; sros signs no more for its subject."""
+    root = made(tmp_path / "ks", "/a", "/b", **settings)
+    done = renew(root, ["/a", "/b"], now=LATER)
+    assert done.works_until == NOW + timedelta(days=days)
+    assert (done.revoked, done.restart) == (0, ())
+    assert not (root / "public/identity_ca.crl.pem").exists()
+    long_after = NOW + timedelta(days=500)  # the certificates of LATER have ended then
+    assert renew(root, ["/a"], now=long_after).works_until is None
 
 
 def test_the_subject_is_unique_in_production_only(tmp_path: Path) -> None:
@@ -356,16 +376,6 @@ def revoked(root: Path) -> dict[int, str]:
     return {each.serial: each.reason for each in crl.revoked} if crl else {}
 
 
-def test_the_old_certificate_works_until_it_ends(tmp_path: Path) -> None:
-    root = made(tmp_path / "ks", "/a", "/b")
-    end = validity_of(certificate(enclave_path(root, "/a") / "cert.pem")).not_after
-    done = renew(root, ["/a", "/b"], now=LATER)
-    assert (done.works_until, done.revoked, done.restart) == (end, 0, ())
-    assert not (root / "public/identity_ca.crl.pem").exists()
-    long_after = NOW + timedelta(days=500)  # the certificates of LATER have ended then
-    assert renew(root, ["/a"], now=long_after).works_until is None
-
-
 def test_all_earlier_certificates_of_the_renewed_are_revoked(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a", "/b", "/c")
     first = serials(root, "/a", "/b", "/c")
@@ -470,7 +480,9 @@ def test_the_program(tmp_path: Path) -> None:
     assert every == "renewed enclave /a\nrenewed enclave /b\n"
     again = sros("renew", root, "--all-expiring", "9000d").ok().err
     assert "the new files expire within 9000d again" in again
-    assert "the replaced certificates work until" in sros("renew", root, "/a", "/b").ok().err
+    assert "the last of the replaced certificates works until" in (
+        sros("renew", root, "/a", "/b").ok().err
+    )
     told = sros("renew", root, "/a", "--revoke-old").ok()
     assert "restart the processes of 2 enclaves" in told.err
     assert "the replaced" not in told.err

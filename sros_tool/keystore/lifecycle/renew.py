@@ -28,7 +28,7 @@ from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.issuing.tokens import EnclaveTokens, token_notes, token_places
 from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path, has_enclave, has_key
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
-from sros_tool.keystore.lifecycle.replaced import IssuedEarlier, Superseded
+from sros_tool.keystore.lifecycle.replaced import Superseded, certificates_until, lacks_some
 from sros_tool.keystore.rights import RecordedRights, SignedRights
 from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.names import check_enclave_name
@@ -124,14 +124,15 @@ def renew(
         if replaced:
             change.keep_zenoh(writer.signed, replaced=renewed if change.revoked else ())
         change.record()
-        issued = None if change.revoked else IssuedEarlier(change.keystore, renewed)
+        lasting = () if change.revoked else replaced
+        until = certificates_until(change.keystore, lasting, change.template)
+        may_work_longer = bool(lasting) and lacks_some(change.keystore)
         change.finish(command="renew with --revoke-old" if revoke_old else "")
-    ends = [issued.until(old.name, old.not_after, "certificate") for old in replaced if issued]
     return change.result(
         Changed,
         outcomes=dict.fromkeys(renewed, "renewed"),
-        works_until=max((end for end in ends if end >= now), default=None),
-        may_work_longer=bool(ends and issued and issued.lacks_some),
+        works_until=until if until and until >= now else None,
+        may_work_longer=may_work_longer,
     )
 
 

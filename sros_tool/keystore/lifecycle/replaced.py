@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import datetime, timedelta
+from datetime import datetime
 from pathlib import Path
 from shlex import quote
 
@@ -20,14 +20,15 @@ from sros_tool.dds.permissions import Grant
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import Fleet, folded
 from sros_tool.keystore.delivery.published import may_have_later_releases
-from sros_tool.keystore.known_keys import restored_at, revoked_serials
+from sros_tool.keystore.known_keys import IssuedEarlier, restored_at
 from sros_tool.keystore.ledger import Entry, certificate_entry
 from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.keystore.template import Template
 from sros_tool.pki.certificates import key_digest, subject_text, validity_of
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, compare
 from sros_tool.translate import grant_rights
-from sros_tool.validity import iso, parse_iso
+from sros_tool.validity import iso
 from sros_tool.wording import first_few
 
 
@@ -135,32 +136,6 @@ def replaced_rights(
     )
 
 
-class IssuedEarlier:
-    """The expiries of certificates and permissions that were issued before a change.
-
-    ``lacks_some`` says whether the keystore is older than its robots, or was restored from a
-    backup, so that its ledger may lack some of these files.
-    """
-
-    def __init__(self, keystore: OpenedKeystore, names: Collection[str]) -> None:
-        self.lacks_some = bool(restored_at(keystore) or may_have_later_releases(keystore))
-        self._expiry: dict[tuple[str, str], str] = {}
-        revoked = revoked_serials(keystore)
-        for entry in keystore.ledger_file.with_values("enclave", names).entries:
-            if not (entry.serial and int(entry.serial, 16) in revoked):
-                kind = entry.enclave, entry.what
-                self._expiry[kind] = max(self._expiry.get(kind, ""), entry.not_after)
-
-    def until(self, name: str, known: datetime, *kinds: str) -> datetime:
-        """Return until when files of all ``kinds`` of an enclave work: ``known`` or later.
-
-        ``kinds`` are "certificate" and "permissions"; revoked certificates do not work.
-        """
-        with suppress(ValueError):  # the ledger has no such file
-            return max(known, parse_iso(min(self._expiry.get((name, kind), "") for kind in kinds)))
-        return known
-
-
 def with_ledger(
     keystore: OpenedKeystore, replaced_rights: Collection[ReplacedRights], now: datetime
 ) -> tuple[ReplacedRights, ...]:
@@ -172,31 +147,62 @@ def with_ledger(
     if not replaced_rights:
         return ()
     issued = IssuedEarlier(keystore, {rights.enclave for rights in replaced_rights})
+    may_work_longer = lacks_some(keystore)
     return tuple(
         replace(
             rights,
-            works_until=until if until >= now else None,
-            may_work_longer=issued.lacks_some,
+            works_until=until if until and until >= now else None,
+            may_work_longer=may_work_longer,
         )
         for rights in replaced_rights
         for until in (
-            issued.until(
-                rights.enclave,
-                rights.works_until or now - timedelta(seconds=1),
-                *("certificate", "permissions"),
+            max(
+                filter(None, (rights.works_until, issued.permissions_until(rights.enclave))),
+                default=None,
             ),
         )
     )
 
 
+def certificates_until(
+    keystore: OpenedKeystore, superseded: Collection[Superseded], template: Template
+) -> datetime | None:
+    """Return until when the last replaced certificate works; None if none was replaced.
+
+    A certificate needs permissions for its subject.  If the new certificate of the enclave has
+    another subject, no more permissions for the replaced one are signed, and it works until the
+    last ones expire.  Zenoh, and a domain into which everybody may join, need no permissions.
+    """
+    needs_permissions = False
+    with suppress(SrosError):
+        rules = keystore.governance.domain_access_rules
+        needs_permissions = template.zenoh is None and all(
+            rule.enable_join_access_control for rule in rules
+        )
+    issued = IssuedEarlier(keystore, {replaced.name for replaced in superseded})
+    ends = (
+        issued.certificates_until(replaced.old, replaced.new_subject if needs_permissions else None)
+        for replaced in superseded
+    )
+    return max(ends, default=None)
+
+
+def lacks_some(keystore: OpenedKeystore) -> bool:
+    """Return whether the ledger may lack certificates and permissions that the keystore issued.
+
+    The keystore is then older than its robots, or was restored from a backup.
+    """
+    return bool(restored_at(keystore) or may_have_later_releases(keystore))
+
+
 @dataclass(frozen=True, slots=True)
 class Superseded:
-    """A certificate that was replaced, and the digest of the key of the new certificate."""
+    """A replaced certificate, and the digest of the key and the subject of the new certificate."""
 
     name: str
     old: Entry
-    not_after: datetime
     new_key: str
+    new_subject: str
 
     @classmethod
     def record(
@@ -205,7 +211,7 @@ class Superseded:
         """Return the record that the certificate ``new`` replaced ``old`` at ``now``."""
         entry = certificate_entry(now, "certificate", old, name)
         key = key_digest(new.public_key())  # type: ignore[arg-type]
-        return cls(name, entry, validity_of(old).not_after, key)
+        return cls(name, entry, key, subject_text(new.subject))
 
 
 _RIGHTS_SHOWN = 6

@@ -279,8 +279,9 @@ class RenewedEnclaves(NamedTuple):
     ]
     """The renewed enclaves."""
     replaced_work_until: datetime | None
-    """Last expiry of the certificates of these enclaves that the ledger has, in UTC; null if they
-    have expired or were revoked."""
+    """Until when the last earlier certificate of these enclaves that the ledger has works, in UTC:
+    until it expires, or the last permissions that fit it; null if they have expired or were
+    revoked."""
     may_work_longer: bool
     """Whether the keystore is older than its robots, or was restored from a backup, so that
     certificates that the ledger lacks may work longer."""
