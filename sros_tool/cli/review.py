@@ -429,9 +429,11 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
         folded_differences,
         unanswered_lines,
     )
-    from sros_tool.proof.review import AccessChange, DroppedRequirements, RightsChange
+    from sros_tool.proof.review import AccessChange, DroppedRequirements, Facts, RightsChange
 
     match step.content:
+        case Facts(lines=facts) if len(facts) > 1 and step.status:
+            return [f"'{name}' {text}" for text, name in facts]
         case AccessChange(before=before, after=after, growth=growth, dropped=dropped):
             return [*added_lines(before, after, growth), *dropped_lines(after, dropped)]
         case RightsChange(before=before, after=after, compared=compared):

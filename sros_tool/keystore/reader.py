@@ -205,11 +205,12 @@ class OpenedKeystore:
         root: its folder.
         locked: whether this process has locked the keystore, so that links of a transaction in
             progress are not followed.
+        lacks_keys: whether it is a copy that should have no keys, so that `has_keys` is false.
     """
 
-    def __init__(self, root: Path, *, locked: bool = False) -> None:
+    def __init__(self, root: Path, *, locked: bool = False, lacks_keys: bool = False) -> None:
         self.root = root
-        self._locked = locked
+        self._locked, self._lacks_keys = locked, lacks_keys
         self.forget()
 
     def __repr__(self) -> str:
@@ -447,7 +448,7 @@ class OpenedKeystore:
     @_Part
     def has_keys(self) -> bool:
         """Whether any enclave has its key, or says where it is; copies may have none."""
-        return any(
+        return not self._lacks_keys and any(
             os.path.lexists(enclave_path(self.root, name) / file)
             for name in enclave_names(self.root, hidden=True)
             for file in (KEY_FILE, KEY_URI_FILE)

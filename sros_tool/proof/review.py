@@ -8,6 +8,7 @@ result names what was not compared.
 from __future__ import annotations
 
 import os
+import re
 import secrets
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -85,6 +86,12 @@ _LONGEST = 200  # characters of the target of a link that are shown
 _NOT_USED = (
     "changes and is not reviewed: no reviewed policy uses it. Name it with --policy, leave it out "
     "with"
+)
+_PRIVATE_KEY = re.compile(rb"-----BEGIN (?:[A-Z0-9]+ )*PRIVATE KEY-----\s+[\w+/]")
+"""A private key in PEM; a text that only mentions the first line does not match."""
+_IS_KEY = (
+    "has a private key, which whoever can read the repository has now: replace the key, because "
+    "its history keeps it"
 )
 _OK, _FOUND, _UNDECIDED = 0, 1, 2
 
@@ -370,6 +377,7 @@ class _Review:
         for path, keystore in keystores.items():
             yield from self._keystore(path, keystore)
         yield from self._step_result("files", "", self._converted_step)
+        yield from self._step_result("keystore", " ".join(asked.keystores), self._keys_step)
         if self.base:
             yield from self._step_result(
                 "files", "", partial(self._unreviewed_step, of_head, head_fleet)
@@ -525,6 +533,34 @@ class _Review:
                 if attribute := next(matching, ""):
                     text = f"git may change it in a checkout or archive ({attribute} in {path})"
                     lines.append((text, file))
+        return (_FOUND, Facts(tuple(lines))) if lines else None
+
+    def _keys_step(self) -> tuple[int, Content] | None:
+        """Return the step on private keys in keystores of HEAD, and in files that change.
+
+        Whether options allow new access does not matter: whoever reads the repository has them.
+        """
+        repository = self.request.repository
+        entries = dict(self._changed_files(self.head, self.base)) if self.base else {}
+        entries |= {
+            path: entry
+            for path, entry in self.head.files.items()
+            if _is_below(path, self.request.keystores)
+        }
+        files = {path: entry.id for path, entry in entries.items() if entry.mode in FILES}
+        sizes = repository.sizes(dict.fromkeys(files.values()))
+        small = [digits for digits in files.values() if sizes.get(digits, 0) <= _MOST_OUTSIDE]
+        keys = {
+            digits
+            for part in repository.contents_in_parts(small, _MOST_BYTES)
+            for digits, content in part.items()
+            if _PRIVATE_KEY.search(content)
+        }
+        lines = [
+            (_IS_KEY, path)
+            for path, digits in sorted(files.items())
+            if digits in keys and not _is_below(path, self.request.left_out)
+        ]
         return (_FOUND, Facts(tuple(lines))) if lines else None
 
     def _unreviewed_step(
@@ -818,7 +854,13 @@ class _Review:
             base_files = yield from self._requirement_files(self.base)
         at, zone = self.request.at, self.request.zone
         systems: dict[str, Callable[[], System]] = {
-            path: partial(load_system, folder, moment=at, zone=zone)
+            path: partial(
+                load_system,
+                folder,
+                moment=at,
+                zone=zone,
+                keystore=OpenedKeystore(folder, lacks_keys=True),
+            )
             for path, folder in keystores.items()
         }
         if self.request.policies:

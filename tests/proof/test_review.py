@@ -753,6 +753,24 @@ def test_a_keystore_fails_for_a_finding_an_expiry_and_a_link_out_of_it(
     assert (linked.status, "cert.pem' is a link out of 'ks'" in linked.out) == (2, True), linked
 
 
+def test_private_keys_in_a_commit_are_named(change: Change, made_keystores: Path) -> None:
+    """They fail the review, also outside of the keystore, and are expected of no other enclave."""
+    copy_of(made_keystores / "before", change.folder / "ks")
+    must = '[[must]]\nenclave = "/b"\npublish = ["/y"]\n'
+    change.base = change.commit({"robot.toml": ONLY + must})
+    begin = "-----BEGIN EC PRIVATE KEY-----"
+    words = ("--policy", "robot.xml", "--requirements", "robot.toml", "--keystore", "ks")
+    change.commit({"mention.py": f'KEY = "{begin}\\n"\n'})
+    change.review(*words).ok()
+    keys = ("ks/enclaves/a/key.pem", "ks/private/permissions_ca.key.pem", "old/ca.key")
+    change.commit(dict.fromkeys(keys, f"{begin}\nMHcCAQEE\n"))
+    ended = change.review(*words, "--new-access", "allow")
+    assert ended.status == 1
+    for key in keys:
+        assert f"  '{key}' has a private key, which whoever can read" in ended.out, ended
+    assert "cannot start" not in ended.out, ended
+
+
 def test_what_is_new_included_or_cannot_fail(change: Change) -> None:
     included = (change.folder / "common/node.xml").read_text()
     change.commit({"common/node.xml": f"{included}<!-- more -->\n"})
