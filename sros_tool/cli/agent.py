@@ -316,9 +316,7 @@ def _round_lines(folder: Path, finished_round: Round, *, restarted: bool) -> Ite
         if finished_round.removed
         else []
     )
-    no_change = "nothing could be fetched"
-    if finished_round.fetched:
-        no_change = "nothing changed" if finished_round.problems else "nothing new"
+    no_change = "nothing changed" if finished_round.fetched else "nothing could be fetched"
     yield f"{release}: {', '.join(changes) or no_change}"
     if restarted and finished_round.unseen:
         yield (

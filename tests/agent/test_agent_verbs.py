@@ -97,7 +97,7 @@ def test_from_home_to_the_robot_and_back(world: World) -> None:
     assert world.run("agent", "status", "robot").status == 1, "it has not run yet"
     first = world.agent("--restarted").ok()
     said, sent = first.out.splitlines()
-    assert said.startswith("release ") and said.endswith(": nothing new")
+    assert said.startswith("release ") and said.endswith(": nothing changed")
     assert sent == "message sent"
     assert world.collected()["outcome"] == "kept"
     assert world.status()["state"] == "current"

@@ -475,7 +475,12 @@ def test_the_program(tmp_path: Path) -> None:
     done = sros("renew", root, "/a").ok()
     assert done.out == "renewed enclave /a\n"
     assert "the replaced certificate works until" in done.err
-    assert sros("renew", root, "--all-expiring", "30d").ok().out == ""
+    (root / "private").rename(tmp_path / "unplugged")
+    for dry_run in ((), ("--dry-run",)):
+        found = sros("renew", root, "--all-expiring", "30d", *dry_run).ok()
+        assert "renewed" not in found.out, "no CA key is needed"
+    assert sros("renew", root, "--all-expiring", "200d").status == 2
+    (tmp_path / "unplugged").rename(root / "private")
     every = sros("renew", root, "--all-expiring", "200d").ok().out
     assert every == "renewed enclave /a\nrenewed enclave /b\n"
     again = sros("renew", root, "--all-expiring", "9000d").ok().err

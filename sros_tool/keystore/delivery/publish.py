@@ -12,7 +12,7 @@ import json
 import os
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache, partial
 from itertools import islice
@@ -220,6 +220,7 @@ def publish(
             stack.callback(lock.release)
             lock.acquire()
         run = _Run(keystore, folder, now, expiry or MetadataExpiry(), dry_run)
+        stack.enter_context(run.reporting_restore())
         run.check_restored(restored, new_folder, keyring)
         keys = _Keys(run.roots, root, root_key)
         keys.recover(dry_run)
@@ -585,6 +586,19 @@ class _Run:
         self._least = 0
         self._changes: Sequence[FileChange] = ()
         self._notes: list[Note] = []
+        self._restored_texts: list[str] = []
+
+    @contextmanager
+    def reporting_restore(self) -> Iterator[None]:
+        """Say in an error what `check_restored` has changed in the keystore before."""
+        try:
+            yield
+        except SrosError as error:
+            if self._restored_texts:
+                why = f"{error.why.rstrip('.')}. " if error.why else ""
+                done = " ".join(self._restored_texts)
+                error.why = f"{why}The keystore was changed already: {done}"
+            raise
 
     def check_restored(self, restored: bool, new_folder: bool, keyring: Keyring) -> None:
         """Refuse a folder that has, or may have had, later releases than the keystore knows.
@@ -762,16 +776,19 @@ class _Run:
             dry_run=self._dry_run,
         )
         self.keystore = OpenedKeystore(self.keystore.root)
-        done = ""
         if forgotten_lists.lists:
             whence = f"the last release in '{self._folder}' has"
             self._notes.append(restored_note(revocation, whence))
-            done = f"In the keystore, {self._notes[-1].text} "
+        if revocation.changes and not self._dry_run:
+            notes = (*self._notes, *revocation.notes)
+            self._restored_texts += [
+                note.text for note in notes if note.id != REPLACED_AFTER_BACKUP
+            ]
         for note in revocation.notes:
             if note.id == REPLACED_AFTER_BACKUP:
                 raise KeystoreError(
                     f"'{self._folder}' cannot be published yet: {note.text[:-1]}",
-                    f"Robots would refuse these enclaves. {done}".rstrip(),
+                    "Robots would refuse these enclaves.",
                     "Then repeat this command, with --restored.",
                 )
         self._notes += revocation.notes

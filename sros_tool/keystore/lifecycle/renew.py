@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Iterator, Sequence
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
@@ -16,6 +16,7 @@ from sros_tool.keystore.expiry import (
     UnreadableEnclave,
     read_credentials,
     refuse_unreadable,
+    survey,
 )
 from sros_tool.keystore.issuing.authority import Authorities
 from sros_tool.keystore.issuing.ca_service import CaServiceError
@@ -85,18 +86,22 @@ def renew(
         for name in names:
             if not has_enclave(root, check_enclave_name(name)):
                 raise missing_enclave_error(change.keystore, name, change.names)
-        writer = change.writer(keys_on_token=bool(places), revoke_old=revoke_old)
-        thresholds: dict[str, Threshold | None] = dict.fromkeys(names)
+        wanted = dict.fromkeys(names)
         if expiring is not None:
             # A short-lived enclave, such as a person's, ends unless somebody renews it by its name.
-            others = [name for name in change.names if name not in thresholds]
+            others = [name for name in change.names if name not in wanted]
             short_lived = [
                 name for name in others if change.template.longest_validity(name) is not None
             ]
-            thresholds |= {name: expiring for name in others if name not in short_lived}
+            wanted |= dict.fromkeys(_due(change, {*others}.difference(short_lived), expiring))
             if short_lived:
                 text = f"short-lived, and renewed only if named: {first_few(short_lived, 3)}"
                 change.notes.append(Note("renew.short-lived", text))
+        if not wanted:  # no CA key is asked for
+            with suppress(SrosError):
+                change.notes += change.edit_notes()
+            return change.result(Changed)
+        writer = change.writer(keys_on_token=bool(places), revoke_old=revoke_old)
         renewer = _Renewer(
             change,
             writer,
@@ -104,7 +109,7 @@ def renew(
             tokens=change.tokens(places),
             unique=change.template.unique_subject or revoke_old,
         )
-        replaced = renewer.renew(thresholds, progress)
+        replaced = renewer.renew(tuple(wanted), progress)
         renewed = tuple(certificate.name for certificate in replaced)
         change.notes += (*writer.notes, *renewer.notes) if replaced else ()
         left = writer.expiry - now
@@ -136,6 +141,19 @@ def renew(
     )
 
 
+def _due(change: KeystoreChange, names: Container[str], threshold: Threshold) -> Iterator[str]:
+    """Yield those of the enclaves ``names`` that are due for renewal.
+
+    Raises:
+        KeystoreError: enclaves cannot be read; the error names all of them.
+    """
+    lifetimes, unreadable = survey(change.keystore)
+    refuse_unreadable(tuple(enclave for enclave in unreadable if enclave.name in names), "renewed")
+    for lifetime in lifetimes:
+        if lifetime.name in names and lifetime.due(threshold, change.now):
+            yield lifetime.name
+
+
 class _Renewer:
     """Renewer of enclaves, one at a time; ``notes`` are about their keys."""
 
@@ -156,33 +174,21 @@ class _Renewer:
         self._tokens = tokens
         self._unique = unique
 
-    def renew(
-        self, thresholds: Mapping[str, Threshold | None], progress: Progress | None
-    ) -> list[Superseded]:
-        """Renew the enclaves that are due; return the replaced certificates.
-
-        ``thresholds`` maps enclaves to the limit from which they are due; None: always.
+    def renew(self, names: Sequence[str], progress: Progress | None) -> list[Superseded]:
+        """Renew the enclaves ``names``; return the replaced certificates.
 
         Raises:
             KeystoreError: enclaves cannot be read; the error names all of them.
         """
-
-        def renew_one(name: str) -> Superseded | UnreadableEnclave | None:
-            return self._renew_if_due(name, thresholds[name])
-
-        done = self._writer.for_each(list(thresholds), renew_one, progress).values()
+        done = self._writer.for_each(names, self._renew_one, progress).values()
         unreadable = tuple(result for result in done if isinstance(result, UnreadableEnclave))
         refuse_unreadable(unreadable, "renewed")
         return [result for result in done if isinstance(result, Superseded)]
 
-    def _renew_if_due(
-        self, name: str, threshold: Threshold | None
-    ) -> Superseded | UnreadableEnclave | None:
+    def _renew_one(self, name: str) -> Superseded | UnreadableEnclave:
         now = self._change.now
         try:
             state = read_credentials(self._change.keystore, name)
-            if threshold and not state.lifetime().due(threshold, now):
-                return None
             issued = self._writer.write(self._issuance(state))
         except CaServiceError:
             raise
