@@ -443,7 +443,7 @@ _UNCLEAR = (
 )
 _TOOLS = (
     "left out, because these nodes are tools that observe the robot; on the secured robot they "
-    "need an enclave such as the one in policies/operator.xml"
+    "need an enclave such as the one in operator_look.xml (`sros policies --copy`)"
 )
 _SILENT = "not judged, because these nodes were announced but had no endpoint"
 _STRAYS = "not judged, because the writers or readers of these topics belong to no ROS node"

@@ -15,7 +15,7 @@ from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.policy.document import read_policy
 from sros_tool.validity import BACKDATE
-from tests.support.harness import sros
+from tests.support.harness import policy_text, publish, sros
 
 DAY = timedelta(days=1)
 SHORT, LONG = "/operator/look", "/robot"
@@ -133,3 +133,14 @@ def test_a_short_lived_enclave_is_renewed_by_its_name_alone(tmp_path: Path) -> N
     assert f"[renew.short-lived]: short-lived, and renewed only if named: {SHORT}" in renewed.err
     renewed = sros("renew", root, SHORT, "--all-expiring", "30d").ok()
     assert renewed.out == f"renewed enclave {SHORT}\n"
+
+
+def test_a_robot_with_a_name_of_people_is_noted(tmp_path: Path) -> None:
+    (tmp_path / "p.xml").write_text(policy_text({"/{robot}/base": publish("/{robot}/x")}))
+    for name in ("operator", "r1"):
+        (tmp_path / "fleet.toml").write_text(f"[robots.{name}]\n")
+        words = ("generate_artifacts", "-k", name, "-p", "p.xml", "--fleet", "fleet.toml")
+        said = sros(*words, cwd=tmp_path).ok().err
+        note = "[fleet.short-lived]: the settings of the keystore make enclaves of operator short-"
+        assert (note in said) == (name == "operator")
+        assert ("such as /operator/base" in said) == (name == "operator")

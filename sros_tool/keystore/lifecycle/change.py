@@ -26,7 +26,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import KeystoreError, Note, SrosError
-from sros_tool.fleet.robots import Fleet
+from sros_tool.fleet.robots import Fleet, enclaves_of
 from sros_tool.keystore.fleet import (
     checked_fleet,
     load_fleet,
@@ -83,7 +83,7 @@ from sros_tool.pki.token import TokenUri
 from sros_tool.policy.model import Enclave
 from sros_tool.translate import protection_for
 from sros_tool.validity import iso, parse_iso, window
-from sros_tool.wording import counted
+from sros_tool.wording import counted, first_few
 from sros_tool.zenoh.configuration import ZenohNetwork, check_network
 
 if TYPE_CHECKING:
@@ -284,6 +284,7 @@ class KeystoreChange:
         fleet, entries = write_fleet(self.transaction, self.keystore, fleet, patterns, self.now)
         self.fleet = fleet
         self.entries += entries
+        self.notes += _short_lived_notes(fleet, self.template)
         if self.template.zenoh:
             self.set_network(self.with_routers_of_robots(self.template.zenoh, before))
         elif any(robot.router for robot in fleet.robots.values()):
@@ -571,6 +572,23 @@ class KeystoreChange:
             "notes": tuple(self.notes),
         }
         return kind(**shared | more)
+
+
+def _short_lived_notes(fleet: Fleet, template: Template) -> Iterator[Note]:
+    """Yield a note on robots whose enclaves the settings let expire early, such as a person's."""
+    short_lived: dict[str, str] = {}
+    for robot in fleet.robots.values() if template.short_lived else ():
+        names = enclaves_of(fleet, robot)
+        if short := [name for name in names if template.longest_validity(name) is not None]:
+            short_lived[robot.name] = short[0]
+    if short_lived:
+        text = (
+            f"the settings of the keystore make enclaves of {first_few(tuple(short_lived), 3)} "
+            f"short-lived, such as {next(iter(short_lived.values()))}, and `sros renew "
+            "--all-expiring` leaves them out: give the robot another name or namespace, or change "
+            "`[[enclaves]]` in the settings."
+        )
+        yield Note("fleet.short-lived", text)
 
 
 def _no_network_note(root: Path) -> Note:
