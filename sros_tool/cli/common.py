@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from click.core import ParameterSource
 
-from sros_tool.errors import DocumentError, PkiError, SrosError, UsageError
+from sros_tool.errors import DocumentError, Note, PkiError, SrosError, UsageError
 from sros_tool.terminal import (
     Colored,
     ask_secret,
@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from sros_tool.dds.advisories import Advisory
     from sros_tool.distributions import Distribution
     from sros_tool.enclave_environment import EnclaveEnvironment
-    from sros_tool.errors import Note
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.fleet.robots import Fleet
     from sros_tool.keystore.issuing.keyring import Keyring
@@ -195,7 +194,6 @@ def advisories_of(file: Path | None) -> tuple[Advisory, ...] | None:
     if file is None:
         return None
     from sros_tool.dds.advisories import read_advisories
-    from sros_tool.errors import Note
 
     advisories = read_advisories(file)
     unread = list(dict.fromkeys(text for advisory in advisories for text in advisory.unread))
@@ -710,6 +708,8 @@ def domain_of(text: str | None) -> int | None:
 _PASSPHRASE, _PASSPHRASE_FILE = "SROS_CA_PASSPHRASE", "SROS_CA_PASSPHRASE_FILE"
 _PIN = "SROS_PKCS11_PIN"
 _taken: dict[str, str] = {}
+_noted: set[Note] = set()
+"""Notes on secrets that were printed already."""
 _KEY_PLACES = {"identity": "SROS_IDENTITY_KEY", "permissions": "SROS_PERMISSIONS_KEY"}
 
 
@@ -727,6 +727,7 @@ def without_secrets() -> Iterator[None]:
     finally:
         os.environ.update(_taken)
         _taken.clear()
+        _noted.clear()
 
 
 def taken_secrets() -> tuple[str, ...]:
@@ -787,6 +788,8 @@ class _Secrets:
         file = "" if is_pin else _taken.get(_PASSPHRASE_FILE, "")
         if not value and file:
             if file not in self._lines:  # a pipe can be read once, and there may be two CAs
+                with without_progress():
+                    print_notes(_new_notes(passphrase_file_notes(Path(file))))
                 self._lines[file] = _first_line(Path(file))
             value = self._lines[file]
         if not value and sys.stdin.isatty():
@@ -803,6 +806,24 @@ class _Secrets:
         except UnicodeEncodeError:
             raise PkiError(f"{name} is not UTF-8 text", "", "Choose another one.") from None
         return value
+
+
+def passphrase_file_notes(path: Path) -> Iterator[Note]:
+    """Yield a note if others can read a passphrase file on this machine."""
+    with suppress(OSError):  # reading it says why
+        mode = path.stat().st_mode
+        if stat.S_ISREG(mode) and mode & 0o077:
+            text = (
+                f"others can access the passphrase file '{path}' (mode {stat.S_IMODE(mode):04o}): "
+                f"run `chmod 600 {quote(str(path))}`. If anybody read it, replace the CAs."
+            )
+            yield Note("keystore.passphrase-readable", text)
+
+
+def _new_notes(notes: Iterable[Note]) -> list[Note]:
+    new = [note for note in notes if note not in _noted]
+    _noted.update(new)
+    return new
 
 
 def _first_line(path: Path) -> str:

@@ -28,6 +28,7 @@ from sros_tool.cli.common import (
     json_option,
     keystore_arguments,
     now,
+    passphrase_file_notes,
     print_json,
     print_notes,
     progress,
@@ -575,6 +576,8 @@ def units(
             )
     elif command:
         raise UsageError("COMMAND is for nodes, and no enclave is named")
+    if passphrase:
+        notes = [*notes, *passphrase_file_notes(Path(passphrase))]
     limit = SOON
     with suppress(SrosError, OSError):  # a robot's folder has no settings
         limit = OpenedKeystore(root).template.renewal_limit

@@ -162,7 +162,13 @@ def test_the_program_takes_secrets_from_the_environment_or_a_file(tmp_path: Path
     assert refused.status == 2
     assert "SROS_CA_PASSPHRASE" in refused.err
     by_file = none | {"SROS_CA_PASSPHRASE_FILE": str(file)}
-    sros("create_enclave", root, "/a", env=by_file).ok()
+    file.chmod(0o644)
+    told = sros("create_enclave", root, "/a", env=by_file).ok().err
+    assert told.count(f"(mode 0644): run `chmod 600 {file}`") == 1
+    words = ("--job", "renew", "--passphrase-file", file, "--sros", "/usr/bin/sros")
+    assert "(mode 0644)" in sros("units", root, tmp_path / "units", *words).ok().err
+    file.chmod(0o600)
+    assert "mode" not in sros("create_enclave", root, "/b", env=by_file).ok().err
 
 
 @pytest.mark.parametrize(
@@ -222,6 +228,7 @@ def test_a_pipe_without_a_writer_is_not_waited_for(
 def test_a_passphrase_that_is_no_text_is_refused_in_one_line(where: str, tmp_path: Path) -> None:
     secret = b"correct horse \xff battery"
     (tmp_path / "file").write_bytes(secret + b"\n")
+    (tmp_path / "file").chmod(0o600)
     env = {"SROS_CA_PASSPHRASE": os.fsdecode(secret)}
     if where == "file":
         env = {"SROS_CA_PASSPHRASE_FILE": str(tmp_path / "file")}
