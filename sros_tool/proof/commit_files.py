@@ -361,15 +361,15 @@ def _make_folders(folder: Folder, path: str) -> None:
 # ── attributes of git ──────────────────────────────────────────────────────────────────────
 
 ATTRIBUTES_FILE = ".gitattributes"
-_CONVERTING = ("working-tree-encoding", "ident", "export-subst")
-"""Attributes by which git changes the content of files in a checkout or archive."""
-
-
+EXPORT_IGNORE = "export-ignore"
+"""The attribute by which git leaves a file or folder out of archives."""
+_CONVERTING = ("working-tree-encoding", "ident", "export-subst", EXPORT_IGNORE)
+"""Attributes by which git changes or drops files in a checkout or archive."""
 _MOST_PATTERNS = 100
 
 
 def converting_patterns(content: bytes) -> dict[str, str]:
-    """Map patterns in a file of git attributes to an attribute that converts matching files.
+    """Map patterns in a file of git attributes to an attribute that changes or drops files.
 
     Lines that unset an attribute do not count.
     """
@@ -388,10 +388,12 @@ def converting_patterns(content: bytes) -> dict[str, str]:
 def may_match(pattern: str, path: str) -> bool:
     """Return whether a pattern of gitattributes(5) may match a path relative to its file's folder.
 
-    Characters that git reads in a special way stand for any text.
+    Characters that git reads in a special way stand for any text, and a pattern for folders matches
+    files, too.
     """
     if pattern.startswith('"'):
         return True  # can have spaces and any escape
+    pattern = pattern.removesuffix("/")
     wanted = (path if "/" in pattern else PurePosixPath(path).name).lower()
     parts = re.split(r"[*?]+/?|[\[\\].*", pattern.removeprefix("/").lower(), flags=re.DOTALL)
     return has_parts(wanted, parts) if len(parts) > 1 else wanted == parts[0]

@@ -47,6 +47,7 @@ from sros_tool.policy.rights import (
 )
 from sros_tool.proof.commit_files import (
     ATTRIBUTES_FILE,
+    EXPORT_IGNORE,
     CommitFiles,
     converting_patterns,
     includes_files,
@@ -526,12 +527,18 @@ class _Review:
             patterns = converting_patterns(self.request.repository.content(entry.id))
             below = sorted(file for file in self.head.files if Path(file).is_relative_to(folder))
             for file in below if patterns else ():
-                relative = str(Path(file).relative_to(folder))
+                relative = Path(file).relative_to(folder)
                 matching = (
-                    used for pattern, used in patterns.items() if may_match(pattern, relative)
+                    used
+                    for pattern, used in patterns.items()
+                    for place in (relative, *(relative.parents if used == EXPORT_IGNORE else ()))
+                    if may_match(pattern, str(place))
                 )
                 if attribute := next(matching, ""):
-                    text = f"git may change it in a checkout or archive ({attribute} in {path})"
+                    does = "change it in a checkout or archive"
+                    if attribute == EXPORT_IGNORE:  # an include of it may have a fallback
+                        does = "leave it out of an archive"
+                    text = f"git may {does} ({attribute} in {path})"
                     lines.append((text, file))
         return (_FOUND, Facts(tuple(lines))) if lines else None
 

@@ -519,6 +519,7 @@ SAFE_ATTRIBUTES = b"""# *.xml ident
 .git_archival.txt export-subst
 /robot.xml/below ident
 sub/robot.xml ident
+/sub export-ignore
 *.ps1 working-tree-encoding=UTF-16LE
 *.bin filter=lfs diff=lfs merge=lfs -text
 """
@@ -545,6 +546,23 @@ def test_a_checkout_that_is_another_file_is_said(change: Change, line: bytes) ->
     ended = change.review("--policy", "robot.xml", "--requirements", "robot.toml")
     assert ended.status == 1
     assert "git may change it in a checkout or archive (" in ended.out
+
+
+@pytest.mark.parametrize(
+    "line", [b"part.xml export-ignore", b"/parts/ export-ignore", b"part* export-ignore"]
+)
+def test_a_part_that_is_missing_in_archives_is_said(change: Change, line: bytes) -> None:
+    """The fallback of its include then takes its place, such as nothing in place of a DENY."""
+    part = f"<profile>{publish('/secret').replace('ALLOW', 'DENY')}</profile>".encode()
+    include = (
+        '<xi:include href="parts/part.xml" xpointer="xpointer(/profile/*)"><xi:fallback/>'
+        "</xi:include></profile>"
+    )
+    policy = (change.folder / "robot.xml").read_text().replace("</profile>", include)
+    change.commit({"robot.xml": policy.encode(), "parts/part.xml": part})
+    change.commit({".gitattributes": line})
+    ended = change.review("--policy", "robot.xml")
+    assert "'parts/part.xml' git may leave it out of an archive (export-ignore" in ended.out
 
 
 def test_no_policy_hides_behind_an_odd_mode(change: Change) -> None:
