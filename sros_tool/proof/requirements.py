@@ -787,6 +787,8 @@ _READERS: Mapping[str, Callable[[_Table], Requirement]] = {
     NothingBut.KIND: _nothing_but_from,
     NotBoth.KIND: _not_both_from,
 }
+KINDS = tuple(_READERS)
+"""The kinds of requirements, as a file names them."""
 
 
 def _short(value: object) -> str:

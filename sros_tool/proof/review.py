@@ -62,6 +62,7 @@ from sros_tool.proof.findings import requirement_findings
 from sros_tool.proof.growth import DroppedDenial, Growth, compare_access, undenied_name
 from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
 from sros_tool.proof.requirements import (
+    KINDS,
     FleetSource,
     Requirement,
     dropped_findings,
@@ -90,6 +91,12 @@ _NOT_USED = (
 )
 _PRIVATE_KEY = re.compile(rb"-----BEGIN (?:[A-Z0-9]+ )*PRIVATE KEY-----\s+[\w+/]")
 """A private key in PEM; a text that only mentions the first line does not match."""
+_OF_TEMPLATES = ("authorities", "certificates", "permissions", "protection")
+_SETTINGS = re.compile(
+    rf"^[ \t]*\[+(?:{'|'.join((*_OF_TEMPLATES, *KINDS))})\b".encode(), re.MULTILINE
+)
+"""A table of a keystore template or of requirements."""
+_LARGEST_SETTINGS = 1024 * 1024
 _IS_KEY = (
     "has a private key, which whoever can read the repository has now: replace the key, because "
     "its history keeps it"
@@ -760,9 +767,15 @@ class _Review:
         if asked.allow_dropped_requirements:
             yield "dropped requirements do not fail the review, as the options say"
         for path in asked.left_out:
-            yield f"policies in '{path}' are not reviewed, as the options say"
+            named = [f"'{policy}'" for policy in asked.policies if _is_below(policy, (path,))]
+            but = f", except {first_few(named, 3)}," if named else ""
+            yield f"policies in '{path}'{but} are not reviewed, as the options say"
         if asked.keystores:
             yield "private keys of keystores are not reviewed"
+        if asked.keystores and asked.policies:
+            yield "whether keystores are signed for the policies is not reviewed"
+        for path in self._changed_settings():
+            yield f"'{path}' changes and is not reviewed"
         for side in (self.head, self.base):
             for path in dict.fromkeys(side.fell_back if side else ()):
                 assert side
@@ -778,6 +791,24 @@ class _Review:
         elif differing := self.head.differing_files(top):
             files = first_few([f"'{path}'" for path in differing], 3)
             yield f"the checkout differs from the reviewed commit: {files}"
+
+    def _changed_settings(self) -> list[str]:
+        """Return changed TOML files that look like templates or requirements, and are not read."""
+        with suppress(SrosError):  # said by the step on changed files
+            changed = self._changed_files(self.head, self.base) if self.base else ()
+            files = {
+                path: entry.id
+                for path, entry in changed
+                if path.endswith(".toml") and path not in self.head.files and entry.mode in FILES
+            }
+            sizes = self.request.repository.sizes(dict.fromkeys(files.values()))
+            return sorted(
+                path
+                for path, digits in files.items()
+                if sizes.get(digits, 0) <= _LARGEST_SETTINGS
+                and _SETTINGS.search(self.request.repository.content(digits))
+            )
+        return []
 
     # ── policies ───────────────────────────────────────────────────────────────────────────
 

@@ -107,6 +107,8 @@ def test_rights_that_move_to_a_second_policy_are_seen(change: Change) -> None:
     assert left.status == 0
     assert "policies in 'tests' are not reviewed, as the options say" in left.out
     assert change.review("--policy", "robot.xml", "--leave-out", "tests/second.xml").status == 0
+    inside = change.review("--policy", "robot.xml\ntests/second.xml", "--leave-out", "tests").out
+    assert "policies in 'tests', except 'tests/second.xml', are not reviewed" in inside
 
 
 def test_dropping_a_requirement_is_a_consent_of_its_own(change: Change) -> None:
@@ -778,8 +780,16 @@ def test_private_keys_in_a_commit_are_named(change: Change, made_keystores: Path
     change.base = change.commit({"robot.toml": ONLY + must})
     begin = "-----BEGIN EC PRIVATE KEY-----"
     words = ("--policy", "robot.xml", "--requirements", "robot.toml", "--keystore", "ks")
-    change.commit({"mention.py": f'KEY = "{begin}\\n"\n'})
-    change.review(*words).ok()
+    change.commit(
+        {
+            "mention.py": f'KEY = "{begin}\\n"\n',
+            "own.toml": '[protection]\nrtps = "NONE"\n',
+            "pyproject.toml": "[project]\n",
+        }
+    )
+    passed = change.review(*words).ok().out.splitlines()[-1]
+    assert "keystores are signed for the policies is not reviewed; 'own.toml' changes and" in passed
+    assert "pyproject" not in passed
     keys = ("ks/enclaves/a/key.pem", "ks/private/permissions_ca.key.pem", "old/ca.key")
     change.commit(dict.fromkeys(keys, f"{begin}\nMHcCAQEE\n"))
     ended = change.review(*words, "--new-access", "allow")
