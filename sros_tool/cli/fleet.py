@@ -709,7 +709,20 @@ def _lines(
     counts = ", ".join(f"{number} {_state_text(state)}" for state, number in status.counts.items())
     outdated = len(compared_fleet.outdated_dds)
     upgrade = f"; {outdated} with a DDS to upgrade (known vulnerabilities)" if outdated else ""
-    yield f"{counted(len(status.robots), 'robot')}: {counts}{upgrade}"
+    doubt = next(
+        (
+            text
+            for text, is_so in (
+                ("by a keystore that is older than its robots", status.older),
+                ("perhaps not all robots", status.edited),
+                ("by a clock that is behind", status.clock),
+            )
+            if is_so
+        ),
+        "",
+    )
+    doubt = f" ({doubt})" if doubt else ""
+    yield f"{counted(len(status.robots), 'robot')}: {counts}{doubt}{upgrade}"
     yield from _facts(compared_fleet)
     rows = list(_rows(compared_fleet, robots))
     widths = [max(len(row[column]) for row in rows) for column in range(4)] if rows else []

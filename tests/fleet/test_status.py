@@ -1015,6 +1015,7 @@ def test_home_is_older_than_its_robots(field: Field) -> None:
             assert field.send("r1").status == 1
         rows = field.run("fleet", "status", "ks", status=1).out
         why = "robots have files that it signed" if away else "'.*/pub' has later releases"
+        assert " (by a keystore that is older than its robots)\n" in rows[: rows.index("\n") + 1]
         command = rf"`sros fleet publish ks {field.folder}/pub --restored`"
         assert re.search(rf"the keystore is older than its robots: {why}.*{command}", rows), rows
         assert not field.status()["complete"] and in_force() == {False}
