@@ -292,6 +292,10 @@ def test_the_old_key_is_deleted_when_asked(when: RotationStage, root: Path) -> N
         step = rotate_ca(root, stage, now=NOW, delete_old_key=stage is when)
         if stage is when:
             assert "deletes the old key" in str(step.notes)
+        elif when is RotationStage.RETIRE:  # the key stays in the stage reissue
+            kept = stage is RotationStage.REISSUE
+            again = sros("rotate_ca", root, "--to", stage, "--delete-old-key")
+            assert again.status == (2 if kept else 0), again
     assert not list(root.glob("retired/*.key.pem"))
     check(root)
 
@@ -355,6 +359,8 @@ def test_an_encrypted_key_has_an_encrypted_successor(
     make(root := tmp_path / "ks")
     opened = replace(keyring(1), places={})
     create_enclaves(root, NAMES, now=NOW, keyring=opened)
+    mistyped = replace(opened, secrets=lambda what: "open, sesamy")
+    refused(lambda: rotate_ca(root, now=NOW, keyring=mistyped, new_keys=keyring(2)), root, "decr")
     for _ in STAGES:
         rotate_ca(root, now=NOW, keyring=opened, new_keys=keyring(2))
         keys = [path for path in tmp_path.rglob("*.key.pem") if path.parent.name != "enclaves"]

@@ -165,6 +165,12 @@ def rotate_ca(
             if stage in (RotationStage.DISTRIBUTE, RotationStage.REISSUE):
                 change.notes += _no_robot_notes(change.keystore, change.names)
             change.finish()
+        elif delete_old_key and (kept := sorted((root / RETIRED).glob("*.key.pem"))):
+            raise UsageError(
+                "no stage is left to do, so no key is deleted",
+                f"Keys of replaced CAs: {first_few([str(path) for path in kept], _SHOWN)}.",
+                "Delete them yourself, or leave out --delete-old-key.",
+            )
     return _step(
         change,
         stage=stage,
@@ -886,10 +892,12 @@ def _make_successor(
     transaction, template = change.transaction, change.template
     old = change.keystore.certificates_of(file)
     encrypted = change.keyring.is_encrypted(change.keystore, roles[0], template)
-    new_keys = replace(new_keys, encrypt=new_keys.encrypt or encrypted is True)
     place = new_keys.places.get(roles[0], "")
     elsewhere = replace(template, identity_key="", permissions_key="")
     given = new_keys.is_encrypted(change.keystore, roles[0], elsewhere) if place else None
+    if encrypted and given is None and not new_keys.encrypt:
+        change.keyring.open(change.keystore, roles[0], template)  # refuses a mistyped passphrase
+        new_keys = replace(new_keys, encrypt=True, secrets=change.keyring.secrets)
     key = new_keys.make(transaction, at, roles[0], elsewhere, compared=True)
     if same_key(old[0], key):
         raise KeystoreError(
