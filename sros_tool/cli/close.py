@@ -233,7 +233,9 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
         how = "closed"
     elif runs:
         how = f"closed {_EARLIER}: {how}"
-    if process.pid:
+    if process.alike:
+        state = f"{process.pids_text}, which sros cannot tell"
+    elif process.pid:
         state = f"process {process.pid}" + ("" if runs else f", known by its {process.known_by}")
     elif runs:
         state = "started by another command than observed"
@@ -309,7 +311,9 @@ def _show_undone(robot: LocalRobot, closed: CloseState) -> None:
         ask = f"ask again with sros close {shlex.quote(str(robot.folder))} --undo"
         echo(f"the robot is not open yet; next: restart these processes, and {ask}", err=True)
     else:
-        pids = [process.pid for process in closed.observed.processes if process.pid]
+        pids = [
+            process.pid for process in closed.observed.processes if process.pid or process.alike
+        ]
         stopped = not (pids or closed.observed.unknown)
         state = "no process of the robot runs" if stopped else "the robot is open"
         but = ""
@@ -351,6 +355,8 @@ def _started_together(processes: Sequence[ClosedProcess]) -> str:
     if first.launch or first.container:
         names = enumerated([process.enclave for process in processes])
         return f"{'the containers' if first.container else 'the launch'} of {names}"
+    if first.alike:
+        return first.pids_text
     pids = [*dict.fromkeys(str(process.pid) for process in processes if process.pid)]
     return f"process {enumerated(pids)}" if pids else ""
 

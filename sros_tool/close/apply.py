@@ -154,15 +154,13 @@ class _RemainingProcesses:
         """Show how to start, open, processes that do not run or have another command."""
         running, nodes = self._running, ObservedNodes(self._robot)
         known = running.with_later_processes(self._robot.processes)
-        known_commands = {tuple(process.command) for process in known.processes}
         unknown = [
             process
-            for command, process in running.open_processes.items()
-            if command not in known_commands
+            for process in running.open_processes
+            if not any(other.fits(process) for other in known.processes)
         ]
         for process in self._started_by_hand:
-            runs_open = tuple(process.command) in running.open_processes
-            if process.enclave in self._secured or runs_open:
+            if process.enclave in self._secured or running.runs_open(process):
                 continue
             names, old_name = nodes.names_in(process.enclave)
             under = f", under its old name {old_name}" if old_name else ""
@@ -244,7 +242,7 @@ def _restart_units(
 
     Units whose processes ended by themselves are restarted only if they run.
     """
-    idle = {process.unit for process in observed.processes if not process.pid}
+    idle = {process.unit for process in observed.processes if not (process.pid or process.alike)}
     verbs = {"restart": units - idle, "try-restart": units & idle}
     restarts = [[verb, *sorted(names)] for verb, names in verbs.items() if names]
     for words in [["daemon-reload"], *restarts] if units or changed else []:

@@ -19,11 +19,13 @@ from sros_tool.runtime.processes import (
     ProcessOrigin,
     RunningProcesses,
     launch_verb,
+    process_origin,
 )
 from sros_tool.runtime.rmw import RMW
 from sros_tool.runtime.variables import DOMAIN, ENCLAVE
 from sros_tool.terminal import visible
 from sros_tool.values import Words, parse_json
+from sros_tool.wording import enumerated
 from sros_tool.xml import read_bytes
 
 ROUTER = "/router"
@@ -48,7 +50,7 @@ class ClosedProcess(NamedTuple):
     unit: str
     """The systemd unit that starts it alone; empty for a process that is restarted by hand."""
     known_by: Annotated[
-        str, Words(("process id", "node name", "program", "elimination", "enclave"))
+        str, Words(("process id", "node name", "program", "elimination", "enclave", "command"))
     ]
     """How sros knows that this process has the nodes of the enclave."""
     launch: Sequence[str] = ()
@@ -63,6 +65,8 @@ class ClosedProcess(NamedTuple):
     chooses: bool = False
     """Whether the program itself gives the process its enclave, by ROS_SECURITY_ENCLAVE_OVERRIDE.
     """
+    alike: Sequence[int] = ()
+    """The ids of several processes that fit equally; sros does not choose, and `pid` is 0."""
 
     @classmethod
     def from_process(
@@ -70,8 +74,7 @@ class ClosedProcess(NamedTuple):
     ) -> ClosedProcess:
         """Return a running process with its enclave and what started it."""
         start = enclave, *process.program, origin.folder, process.user, origin.unit
-        variable = process.environment.get(RMW, "")
-        rmw = RMW_ZENOH if process.is_zenoh else variable if variable in RMWS else ""
+        rmw = _rmw_to_start(process)
         chooses = process.environment.get(ENCLAVE) == enclave
         return cls(*start, known_by, origin.launch, origin.container, rmw, (), chooses)
 
@@ -81,29 +84,65 @@ class ClosedProcess(NamedTuple):
         return self.rmw == RMW_ZENOH and self.enclave == ROUTER
 
     @property
+    def pids_text(self) -> str:
+        """The process by its id, or those of which it is one, as text; "" if it does not run."""
+        if self.alike:
+            return (
+                f"that of the processes {enumerated([*map(str, self.alike)])} which is this robot's"
+            )
+        return f"process {self.pid}" if self.pid else ""
+
+    @property
     def lacks_enclave_argument(self) -> bool:
         """Whether its command has to name the enclave, which others look for on Zenoh."""
         is_node = self.rmw == RMW_ZENOH and not self.is_router
         return is_node and named_enclave(self.command) != self.enclave
 
-    def with_current_pid(self, running: RunningProcesses) -> ClosedProcess:
-        """Return a copy with the id that a process with this command has now.
+    def fits(self, process: Process) -> bool:
+        """Return whether a process has this command and RMW; all Zenoh routers fit each other.
 
-        The command may have the argument for the enclave that ``sros run`` adds.  A process that
-        may run, but could not be examined, keeps its id, and so does a process that its unit
-        restarts; a process that ended while sros watched has none.
+        The command may have the argument for the enclave that ``sros run`` adds.
         """
-        command = command_without_enclave(self.command, self.enclave)
-        programs = [process.program for process in running.processes]
-        pids = [
-            pid
-            for pid, words in programs
-            if command_without_enclave(words, self.enclave) == command
+        if self.is_router or process.is_router:
+            return self.is_router and process.is_router
+        rmws = {self.rmw, _rmw_to_start(process)}
+        if len(rmws - {""}) > 1 or rmws == {"", RMW_ZENOH}:  # a process without any is on DDS
+            return False
+        words = command_without_enclave(process.program[1], self.enclave)
+        return words == command_without_enclave(self.command, self.enclave)
+
+    def with_current_pid(
+        self, running: RunningProcesses, domain: int, export: Path
+    ) -> ClosedProcess:
+        """Return a copy with the id that the process has now, in its ROS domain and network.
+
+        A process in its enclave of the ``export`` goes before open ones.  A process that may run,
+        but could not be examined, keeps its id, and so does a process that its unit restarts; a
+        process that ended while sros watched has none.
+        """
+        in_domain = [other for other in running.processes if is_in_domain(other, domain)]
+        in_enclave = [
+            other
+            for other in in_domain
+            if (enclave := other.enclave) and enclave.name == self.enclave and enclave.is_of(export)
         ]
+        pids = [
+            *dict.fromkeys(
+                other.program[0] for other in in_enclave or in_domain if self.fits(other)
+            )
+        ]
+        if in_enclave:
+            pids = [self.pid] if self.pid in pids else pids[:1]  # all of them are right
+        elif self.pid not in pids and len(pids) > 1:
+            pids = [pid for pid in pids if process_origin(pid).folder == self.folder] or pids
         unseen = {process.pid for process in running.unseen}
-        if (self.unit and self.pid) or running.hidden or self.pid in unseen or self.pid in pids:
-            return self
-        return self._replace(pid=pids[0] if pids else 0)
+        may_run = (self.unit and self.pid) or running.hidden or self.pid in unseen
+        if self.pid in pids or (may_run and not in_enclave):
+            return self._replace(alike=())
+        if len(pids) > 1:
+            return self._replace(pid=0, alike=pids)
+        known_by = "command" if pids else self.known_by
+        return self._replace(pid=next(iter(pids), 0), known_by=known_by, alike=())
 
     def open_command(self, domain: int) -> str:
         """Return the shell command that starts the process open, in its ROS domain and RMW."""
@@ -134,6 +173,12 @@ class ClosedProcess(NamedTuple):
         elif self.rmw:
             words = ("env", f"{RMW}={self.rmw}", *words)
         return f"cd {_shell_word(self.folder)} && {' '.join(map(_shell_word, words))}"
+
+
+def _rmw_to_start(process: Process) -> str:
+    """Return the RMW that the command of a process has to name; "" if that is not known."""
+    variable = process.environment.get(RMW, "")
+    return RMW_ZENOH if process.is_zenoh else variable if variable in RMWS else ""
 
 
 def _shell_word(word: str) -> str:
@@ -182,19 +227,20 @@ class ObservedProcesses(NamedTuple):
         """The systemd units that start a process alone."""
         return {process.unit for process in self.processes} - {""}
 
-    def with_current_pids(self, running: RunningProcesses) -> ObservedProcesses:
+    def with_current_pids(self, running: RunningProcesses, export: Path) -> ObservedProcesses:
         """Return a copy with the current ids and the current unknown processes."""
         pids = {process.pid for process in self.processes}
-        commands = {tuple(process.command) for process in self.processes}
         unknown = [
             process_text(process)
             for process in running.processes
             if is_in_domain(process, self.domain)
             and not (process.is_daemon or process.asks_for_security)
             and process.program[0] not in pids
-            and process.program[1] not in commands
+            and not any(known.fits(process) for known in self.processes)
         ]
-        processes = [process.with_current_pid(running) for process in self.processes]
+        processes = [
+            process.with_current_pid(running, self.domain, export) for process in self.processes
+        ]
         return self._replace(processes=processes, unknown=unknown)
 
     def belonging_elsewhere(self, names: Iterable[str]) -> ObservedProcesses:
@@ -287,7 +333,7 @@ def read_processes(path: Path) -> ObservedProcesses:
         for process in processes:
             words = (process.enclave, process.folder, process.container, process.rmw)
             texts = (*words, *process.command, *process.launch, *process.shares)
-            _check_types((*texts, process.known_by), (process.pid, process.user))
+            _check_types((*texts, process.known_by), (process.pid, process.user, *process.alike))
             if process.unit and not re.fullmatch(SERVICE_NAME, process.unit, re.A):
                 raise ValueError(f"{process.unit!r} is not a service")
         return observed

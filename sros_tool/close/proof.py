@@ -87,7 +87,7 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     running_now = {enclave.name for _, enclave in running.secured}
     needed = {*missing}.difference(robot.without) | running_now.intersection(missing)
     if needed or expected == {*missing}:
-        observed = state.observed.with_current_pids(running.processes)
+        observed = state.observed.with_current_pids(running.processes, robot.export)
         return [Proof(_STARTED, False, _why_missing(running, sorted(needed) or missing, observed))]
     nodes, not_here = ObservedNodes(robot), robot.not_here
     # A laptop may be away; a computer whose nodes were seen has to be seen again.
@@ -221,9 +221,13 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
         for process, enclave in running.secured
         if enclave.name in missing
     }
-    open_pids = {process.enclave: process.pid for process in observed.processes if process.pid}
+    open_pids = {
+        process.enclave: process.pids_text
+        for process in observed.processes
+        if process.pid or process.alike
+    }
     absent = [name for name in missing if name not in outdated]
-    causes = {name: f"stop process {pid}, which is open" for name, pid in open_pids.items()}
+    causes = {name: f"stop {text}, which is open" for name, text in open_pids.items()}
     causes |= {
         enclave.name: f"{process.label} has the files of '{keystore_text(enclave)}'"
         for process in running.in_domain

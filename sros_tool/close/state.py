@@ -82,18 +82,18 @@ class RunningRobot:
         ]
 
     @cached_property
-    def open_processes(self) -> Mapping[tuple[str, ...], Process]:
-        """The processes in the robot's domain that run without security, by their commands."""
-        return {
-            process.program[1]: process
-            for process in self.in_domain
-            if not process.asks_for_security
-        }
+    def open_processes(self) -> Sequence[Process]:
+        """The processes in the robot's domain that run without security."""
+        return [process for process in self.in_domain if not process.asks_for_security]
+
+    def runs_open(self, process: ClosedProcess) -> bool:
+        """Return whether a process like an observed one runs without security."""
+        return any(process.fits(other) for other in self.open_processes)
 
     def is_open(self, process: ClosedProcess) -> bool:
         """Return whether an observed process runs open, and no process runs in its enclave."""
         is_secured = any(enclave.name == process.enclave for _, enclave in self.secured_everywhere)
-        return not is_secured and tuple(process.command) in self.open_processes
+        return not is_secured and self.runs_open(process)
 
     @cached_property
     def current_enclaves(self) -> Set[str]:
@@ -257,7 +257,8 @@ class CloseState(NamedTuple):
     @property
     def stopped(self) -> set[str]:
         """The enclaves of which no process runs, open or closed."""
-        stopped = {process.enclave for process in self.observed.processes if not process.pid}
+        processes = self.observed.processes
+        stopped = {other.enclave for other in processes if not (other.pid or other.alike)}
         return {*self.new, *stopped} - self.secured.keys()
 
     @property
@@ -280,7 +281,8 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
     }
     observed = ObservedProcesses(robot.domain)
     if robot.observed:
-        observed = running.with_later_processes(robot.observed).with_current_pids(running.processes)
+        observed = running.with_later_processes(robot.observed)
+        observed = observed.with_current_pids(running.processes, robot.export)
     observed = observed.within(policy) if policy else observed
     known = {process.enclave for process in observed.processes} | secured.keys()
     new = set[str]()

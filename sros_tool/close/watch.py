@@ -113,7 +113,7 @@ def _recorded_processes(robot: LocalRobot) -> Iterator[_StartedProcesses]:
     started: _StartedProcesses = {}
 
     def look() -> None:
-        for process in table.look(robot.shell.now()).processes:
+        for process in RunningRobot(robot, table.look(robot.shell.now())).in_domain:
             before, origin = started.get(process.command, (process, None))
             if before.pid != process.pid or origin is None:
                 origin = process_origin(process.pid)
@@ -169,7 +169,7 @@ def _observed_processes(
     started: _StartedProcesses,
 ) -> ObservedProcesses:
     """Return the processes of the observed nodes, also those that ended while sros watched."""
-    processes, domain = running.processes.processes, running.robot.domain
+    processes, domain = running.in_domain, running.robot.domain
     pids = [process.pid for process in processes if "libddsc" in process.libraries]
     stayed = [node for node in nodes if node.participant not in ended_participants]
     observed = assign(stayed, processes, domain, process_ids_of_cyclone(pids, domain))

@@ -10,8 +10,10 @@ from pathlib import Path
 
 from sros_tool.close.processes import ClosedProcess, ObservedProcesses
 from sros_tool.policy.model import Policy
+from sros_tool.runtime.environment import RMW_ZENOH
 from sros_tool.runtime.processes import (
     Process,
+    ProcessEnclave,
     ProcessOrigin,
     RunningProcesses,
     UnseenProcess,
@@ -39,14 +41,31 @@ def test_a_process_to_stop_is_named_by_the_id_that_it_has_now() -> None:
     for processes, pid in (
         (RunningProcesses((process(7, "talk", "a"), again)), 7),
         (RunningProcesses((other, again)), 8),
+        (RunningProcesses((replace(again, environment={"ROS_DOMAIN_ID": "64"}),)), 0),
+        (RunningProcesses((replace(again, network="net:[1]"),)), 0),
+        (RunningProcesses((replace(again, environment={"RMW_IMPLEMENTATION": RMW_ZENOH}),)), 0),
         (RunningProcesses((process(9, "talk", "a", "--ros-args", "--enclave", "/talker"),)), 9),
         (RunningProcesses((process(9, "talk", "a", "--ros-args", "--enclave", "/other"),)), 0),
         (RunningProcesses((other,)), 0),
         (RunningProcesses((other,), hidden="those of other users"), 7),
         (RunningProcesses(unseen=(unseen,)), 7),
     ):
-        assert talker.with_current_pid(processes).pid == pid
-    assert talker._replace(unit="talker.service").with_current_pid(RunningProcesses()).pid == 7
+        assert talker.with_current_pid(processes, 0, Path("/export")).pid == pid
+    of_unit = talker._replace(unit="talker.service")
+    assert of_unit.with_current_pid(RunningProcesses(), 0, Path("/export")).pid == 7
+
+
+def test_sros_does_not_choose_among_processes_that_fit_equally() -> None:
+    """A process in the enclave fits best: an open one of the same command is not closed."""
+    talker = ClosedProcess("/talker", 7, ("talk",), "/opt", 0, "", "process id")
+    twins = process(8, "talk"), process(9, "talk")
+    now = talker.with_current_pid(RunningProcesses(twins), 0, Path("/export"))
+    assert (now.pid, [*now.alike]) == (0, [8, 9])
+    assert now.pids_text == "that of the processes 8 and 9 which is this robot's"
+    secured = replace(twins[1], enclave=ProcessEnclave("/export", "/talker"))
+    for seen in ((twins[0], secured), (secured, process(7, "talk"))):
+        now = now.with_current_pid(RunningProcesses(seen), 0, Path("/export"))
+        assert (now.pid, now.known_by, now.alike) == (9, "command", ())
 
 
 def test_commands_name_the_rmw_and_on_zenoh_the_enclave() -> None:
