@@ -742,14 +742,27 @@ def _missing_common_part_cause(lacking: Sequence[_Lacking]) -> Cause:
     first = "Put" if copied else f"Run `sros policies --copy {target}`, and put"
     place = "the <profile> of every node" if plural else "its <profile>"
     at = f"line{'s' * (len(lines) > 1)} {names_text([str(line) for line in lines])}"
+    remedy = f"{first} this line into {place} ({at}): {_INCLUDE}"
+    if any(_is_any_node(node) for node in nodes):
+        remedy = f"{_NAME_FIRST} {remedy}"
     return Cause(
         f"{counted(len(nodes), 'node')} lack the common part"
         if plural
         else "a node lacks the common part",
         _denied_at_start(lacking),
-        f"{first} this line into {place} ({at}): {_INCLUDE}",
+        remedy,
         len(lacking),
     )
+
+
+_NAME_FIRST = (
+    "First write the name of the node in place of '*': with the line, a process could serve the "
+    "parameters of every node."
+)
+
+
+def _is_any_node(node: str) -> bool:
+    return node.rpartition("/")[2] == "*"
 
 
 def _lacking_basics(
@@ -773,7 +786,10 @@ def _lacking_basics(
             kind = NO_PARAMETERS
         lacks_others = True
         text = f"node {node} may not {right} {', '.join(missing)}"
-        finding = kind.found(enclave.path, text, profile.source.file, profile.source.line)
+        remedy = f"{_NAME_FIRST} {kind.remedy}" if _is_any_node(node) else ""
+        finding = kind.found(
+            enclave.path, text, profile.source.file, profile.source.line, remedy=remedy
+        )
         yield _Lacking(finding, node, listener, _common_folder(profile))
 
 

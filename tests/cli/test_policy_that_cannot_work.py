@@ -123,6 +123,21 @@ def test_a_cause_of_which_a_finding_is_left_out_is_not_one_paragraph(tmp_path: P
     assert len(part.out.splitlines()) == 9
 
 
+def test_the_parameters_of_every_node_are_not_opened_by_a_remedy(tmp_path: Path) -> None:
+    """`generate_policy --from-log` writes node="*" where it does not know the node."""
+    topics = '<topics publish="ALLOW"><topic>/x</topic></topics>'
+    for node, named in (("*", True), ("eye", False)):
+        (tmp_path / "robot.xml").write_text(
+            '<policy version="0.2.0"><enclaves><enclave path="/eye"><profiles>'
+            f'<profile ns="/" node="{node}">{topics}</profile>'
+            "</profiles></enclave></enclaves></policy>"
+        )
+        text = " ".join(sros("check", "robot.xml", cwd=tmp_path).out.split())
+        assert ("First write the name of the node in place of '*'" in text) is named
+        remedies = sros("check", "robot.xml", "--json", cwd=tmp_path).out
+        assert ("First write the name" in remedies) is named
+
+
 def test_nodes_that_lack_less_are_counted(tmp_path: Path) -> None:
     log = '<topics publish="ALLOW"><topic>/rosout</topic></topics>'
     policy = write_policy(tmp_path / "robot.xml", ("arm", "base"))
