@@ -333,7 +333,7 @@ def renew(
 
     Returns:
         ``names("renewed")``, ``restart`` (the enclaves whose processes have to be restarted) and
-        ``works_until`` (when the last replaced file expires).
+        ``works_until`` (until when the last replaced certificate works).
 
     Raises:
         KeystoreError: An enclave does not exist or cannot be renewed.

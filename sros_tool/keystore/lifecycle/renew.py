@@ -63,10 +63,10 @@ def renew(
 
     The new certificate is for the same key; with ``new_key``, for a new key; with ``key``, for the
     key on a token, as in `create_enclaves`.  The signed rights do not change.  All files are
-    replaced at once.  Whoever has the key can use a replaced certificate until it expires or is
-    revoked; ``revoke_old`` revokes all earlier certificates of the renewed enclaves, and gives them
-    subjects that no earlier permissions fit.  The nodes of the vendors in ``allow_refusal`` may
-    stop working.
+    replaced at once.  Whoever has the key can use a replaced certificate until it or its last
+    permissions expire, or it is revoked; ``revoke_old`` revokes all earlier certificates of the
+    renewed enclaves, and gives them subjects that no earlier permissions fit.  The nodes of the
+    vendors in ``allow_refusal`` may stop working.
 
     Raises:
         KeystoreError: enclaves cannot be renewed (the error names all of them), or vendors would
