@@ -85,6 +85,9 @@ def test_a_key_that_an_export_closes_to_others_is_named(keystore: Path, tmp_path
     robot = tmp_path / "robot"
     sros("distribute_key", keystore, "/a", robot).ok()
     (robot / "enclaves/a" / "key.pem").chmod(0o644)
+    for words in ((), ("--force",)):  # which changes nothing
+        said = sros("distribute_key", keystore, "/a", robot, *words).ok().err
+        assert f"[export.key-readable]: others can read '{robot}/enclaves/a/key.pem'" in said
     (robot / "enclaves/a" / "governance.p7s").write_text("x")
     said = sros("distribute_key", keystore, "/a", robot, "--force").ok().err
     assert stat.S_IMODE((robot / "enclaves/a" / "key.pem").stat().st_mode) == 0o600

@@ -151,7 +151,8 @@ def distribute(
     if target.name.endswith(_ARCHIVE_SUFFIXES):
         return Export(target, tuple(names), _write_archive(target, files, force, dry_run), notes)
     changes = _write_folder(keystore, target, files, force, dry_run)
-    return Export(target, tuple(names), changes, (*notes, *_notes(keystore, target)))
+    notes += (*_readable_key_notes(target, names), *_notes(keystore, target))
+    return Export(target, tuple(names), changes, notes)
 
 
 def _token_notes(files: Mapping[str, bytes]) -> Iterator[Note]:
@@ -165,6 +166,20 @@ def _token_notes(files: Mapping[str, bytes]) -> Iterator[Note]:
                 f"{place.object} on the token {place.token}, which has to be in the robot."
             )
             yield Note("export.key-on-token", text)
+
+
+def _readable_key_notes(target: Path, names: Sequence[str]) -> Iterator[Note]:
+    """Yield a note for each private key that others can read in an export that did not change."""
+    for name in names:
+        with suppress(OSError):
+            key = enclave_path(target, name) / KEY_FILE
+            if key.stat().st_mode & 0o077:
+                yield Note(
+                    "export.key-readable",
+                    f"others can read '{key}': run `chmod 600 {quote(str(key))}`, and replace the "
+                    "key if somebody may have copied it: `sros renew KEYSTORE ENCLAVE --new-key "
+                    "--revoke-old`.",
+                )
 
 
 def _notes(keystore: OpenedKeystore, target: Path) -> Iterator[Note]:
