@@ -504,7 +504,7 @@ def _link_label(picture: Picture, link: Link) -> str:
     if link.qualifier is not ALLOW:
         text = f"DENY {text}"
     if link.wildcard:
-        text += " by *"
+        text += " by a wildcard"
     if link.violates:
         text += ": breaks a requirement"
     if link.differs:

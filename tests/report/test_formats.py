@@ -162,6 +162,8 @@ def test_graphs_hold_every_card_and_link_once() -> None:
     assert mermaid.count('|"') == len(scene.links)
     assert "DENY subscribe" in dot and "DENY subscribe" in mermaid
     assert "arrowhead=tee" in dot and "--x" in mermaid
+    # The rule is seldom "*" itself; the table names it.
+    assert "subscribe by a wildcard" in dot and "subscribe by a wildcard" in mermaid
 
 
 def test_svg_draws_every_name_of_the_scene() -> None:
