@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from itertools import chain
+from typing import NamedTuple
 
 from sros_tool.close.robot import OBSERVER, LocalRobot
 from sros_tool.errors import DocumentError, SrosError
@@ -28,6 +29,15 @@ from sros_tool.policy.patterns import overlap
 from sros_tool.runtime.rmw import chosen_vendor
 from sros_tool.values import parse_json
 from sros_tool.xml import read_bytes
+
+
+class MovedEndpoint(NamedTuple):
+    """An endpoint of a renamed node that has another name now."""
+
+    old_node: str
+    new_node: str
+    old: Endpoint
+    new: Endpoint
 
 
 class ObservedNodes:
@@ -61,13 +71,18 @@ class ObservedNodes:
         """The policy of the robot."""
         return read_policy(self.robot.policy)
 
+    @property
+    def policy_enclaves(self) -> set[str]:
+        """The names of the enclaves in the policy."""
+        return {enclave.path for enclave in self.policy.enclaves}
+
     def in_their_enclaves(self) -> Iterator[ObservedNode]:
         """Yield the nodes with their old names, in the enclaves that the policy gives them now.
 
         A node whose profile was moved is in the enclave of its profile; a node without a profile
         keeps its old enclave.
         """
-        names = {enclave.path for enclave in self.policy.enclaves}
+        names = self.policy_enclaves
         enclave_of = {
             (profile.ns, profile.node): (enclave.path,)
             for enclave in self.policy.enclaves
@@ -87,7 +102,7 @@ class ObservedNodes:
         If the policy allows several names for an endpoint of a renamed node, the result has the
         name that the node uses in the ``current`` graph.
         """
-        names, nodes = {enclave.path for enclave in self.policy.enclaves}, []
+        names, nodes = self.policy_enclaves, []
         for node in self.in_their_enclaves():
             if new := self.renamed.get(node_name(node)):
                 endpoints = frozenset(self._current_endpoints(node, current).values())
@@ -171,10 +186,12 @@ class ObservedNodes:
             for endpoint, names in self._allowed_endpoints[node].items()
         }
 
-    def moved_endpoints(self, current: Observation | None = None) -> Set[tuple[Endpoint, Endpoint]]:
-        """Return pairs of old and new endpoint, for the endpoints that renaming a node changes."""
+    def moved_endpoints(self, current: Observation | None = None) -> Set[MovedEndpoint]:
+        """Return the endpoints of renamed nodes whose names change, too."""
         return {
-            (before, after)
+            MovedEndpoint(
+                node_name(node), expand("~", *self.renamed[node_name(node)]), before, after
+            )
             for node in self._allowed_endpoints
             for before, after in self._current_endpoints(node, current).items()
             if before != after

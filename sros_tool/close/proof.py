@@ -12,7 +12,7 @@ from typing import Any
 from sros_tool.checks.keystores.issued import STALE
 from sros_tool.checks.kind import NOTE, Finding
 from sros_tool.checks.processes import PROCESS_NOT_SEEN, process_findings
-from sros_tool.close.nodes import ObservedNodes, node_name, ros_use
+from sros_tool.close.nodes import MovedEndpoint, ObservedNodes, node_name, ros_use
 from sros_tool.close.processes import ObservedProcesses
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot
 from sros_tool.close.state import (
@@ -33,6 +33,7 @@ from sros_tool.graph.observation import (
     Endpoint,
     Observation,
     ObservedNode,
+    make_observation,
     observation_from_json,
 )
 from sros_tool.keystore.layout import list_enclaves
@@ -305,7 +306,10 @@ class _TalkComparison:
         ended, nodes = _ended_since(self._running), self._nodes
         unseen = [node for node in self._audited["unseen"] if node["enclave"] not in self._away]
         before, expected = nodes.compared(self._away, self.current), nodes.expected(self.current)
-        moved = nodes.moved_endpoints(self.current)
+        moved, enclaves = nodes.moved_endpoints(self.current), nodes.policy_enclaves
+        observed = [
+            node for node in nodes.in_their_enclaves() if enclaves.issuperset(node.enclaves)
+        ]
         return {
             "denied": [
                 f"{right['enclave']} {right['right']} {right['name']}: {right['reason']}"
@@ -322,7 +326,15 @@ class _TalkComparison:
                 _unseen_text(self._running, node["node"], node["enclave"]) for node in unseen
             ],
             "gone": _lost_endpoints(before, self.current, self._denied),
-            "left alone": _abandoned_names(before, expected, moved, self._denied),
+            "left alone": [
+                *_abandoned_names(before, expected, moved, self._denied),
+                *_lonely_endpoints(
+                    make_observation(observed),
+                    make_observation([*expected.nodes, *self.current.nodes]),
+                    [pair for pair in moved if pair.new_node in map(node_name, before.nodes)],
+                    self._denied,
+                ),
+            ],
         }
 
     def summary(self) -> str:
@@ -351,7 +363,7 @@ def _renamed_text(nodes: ObservedNodes, current: Observation | None, *, fails: b
         names = [f"{old} as {expand('~', *renamed[old])}" for old in sorted(renamed)]
         text = f"; compared under a new name: {first_few(names, MOST_NAMES)}"
         pairs = nodes.moved_endpoints(current)
-        topics = sorted({(ros_use(old)[1], ros_use(new)[1]) for old, new in pairs})
+        topics = sorted({(ros_use(pair.old)[1], ros_use(pair.new)[1]) for pair in pairs})
         private = tuple(f"{name}/" for name in renamed)
         if moved := [f"{old} as {new}" for old, new in topics if not old.startswith(private)]:
             text += f", with {enumerated(moved)} (a name that does not move: write it absolute)"
@@ -413,7 +425,7 @@ def _lost_endpoints(
 def _abandoned_names(
     before: Observation,
     expected: Observation,
-    moved: Collection[tuple[Endpoint, Endpoint]],
+    moved: Collection[MovedEndpoint],
     denied: Iterable[DeniedRight],
 ) -> list[str]:
     """Return clauses on names that nodes still use, though all peers ``moved`` to another name.
@@ -425,11 +437,8 @@ def _abandoned_names(
     robot_nodes = [node for node in expected.nodes if not is_tool(node)]
     kept = {endpoint for _, endpoint in {*_endpoints_of(robot_nodes)} - refused}
     uses = {*_endpoints_of(node for node in before.nodes if not is_tool(node))} - refused
-    opposite = {PUBLISH: SUBSCRIBE, SUBSCRIBE: PUBLISH}
     new_names = {
-        old._replace(direction=opposite[old.direction]): ros_use(new)[1]
-        for old, new in moved
-        if old not in kept
+        _opposite(pair.old): ros_use(pair.new)[1] for pair in moved if pair.old not in kept
     }
     abandoned = {
         (node, *ros_use(endpoint), new_names[endpoint])
@@ -439,6 +448,41 @@ def _abandoned_names(
     return [
         f"{node} {right} {name}, which is {new} now" for node, right, name, new in sorted(abandoned)
     ]
+
+
+def _lonely_endpoints(
+    before: Observation,
+    now: Observation,
+    moved: Iterable[MovedEndpoint],
+    denied: Iterable[DeniedRight],
+) -> list[str]:
+    """Return moved endpoints, as text, that no other node talks to under their new name.
+
+    Of the nodes ``before``, another one talked to them; ``denied`` endpoints are left out.
+    """
+    refused = _denied_endpoints(denied)
+    talked, talks = (
+        {*_endpoints_of(node for node in seen.nodes if not is_tool(node))} for seen in (before, now)
+    )
+    lonely = {
+        (pair.new_node, *ros_use(pair.new))
+        for pair in moved
+        if (pair.new_node, pair.new) not in refused
+        and any(
+            node != pair.old_node and endpoint == _opposite(pair.old) for node, endpoint in talked
+        )
+        and not any(
+            node != pair.new_node and endpoint == _opposite(pair.new)
+            for node, endpoint in talks - refused
+        )
+    }
+    return [f"{node} {right} {name}" for node, right, name in sorted(lonely)]
+
+
+def _opposite(endpoint: Endpoint) -> Endpoint:
+    """Return the endpoint that can talk to an endpoint."""
+    direction = SUBSCRIBE if endpoint.direction == PUBLISH else PUBLISH
+    return endpoint._replace(direction=direction)
 
 
 def _denied_endpoints(denied: Iterable[DeniedRight]) -> set[tuple[str, Endpoint]]:

@@ -7,7 +7,8 @@ from datetime import UTC, datetime
 from types import SimpleNamespace
 from typing import Any
 
-from sros_tool.close.proof import _abandoned_names, _unseen_text
+from sros_tool.close.nodes import MovedEndpoint
+from sros_tool.close.proof import _abandoned_names, _lonely_endpoints, _unseen_text
 from sros_tool.explain.audit import DeniedRight
 from sros_tool.graph.observation import Endpoint, make_observation
 from sros_tool.policy.model import ALLOW
@@ -23,13 +24,39 @@ def test_a_name_that_moved_leaves_nobody_alone() -> None:
     planner = replace(node("planner", ns="/nav"), endpoints=frozenset({new}))
     base = replace(node("base"), endpoints=frozenset({heard}))
     joystick = replace(node("joystick"), endpoints=frozenset({old}))
-    seen, moved = make_observation([planner, base]), {(old, new)}
+    seen, moved = (
+        make_observation([planner, base]),
+        {MovedEndpoint("/planner", "/nav/planner", old, new)},
+    )
     alone = "/base subscribe /cmd_vel, which is /nav/cmd_vel now"
     assert _abandoned_names(seen, seen, moved, ()) == [alone]
     assert not _abandoned_names(seen, make_observation([planner, base, joystick]), moved, ())
     right = Right("/base", ALLOW, "subscribe", "/cmd_vel")
     denied = DeniedRight(right, ("/base",), "no rule", False, False, (heard,))
     assert not _abandoned_names(seen, seen, moved, [denied])
+
+
+def test_a_moved_node_is_left_alone_if_nobody_is_at_its_new_name() -> None:
+    """The old publisher may have another listener; the node itself is nobody, either."""
+    old, new = Endpoint("rt/wheel", "subscribe"), Endpoint("rt/safe/wheel", "subscribe")
+    sends, own = old._replace(direction="publish"), new._replace(direction="publish")
+    tracks, diary = (
+        replace(node(name), endpoints=frozenset({endpoint}))
+        for name, endpoint in (("tracks", sends), ("diary", old))
+    )
+    before = make_observation([tracks, diary, replace(node("guard"), endpoints=frozenset({old}))])
+    guard = replace(node("guard", ns="/safe"), endpoints=frozenset({new, own}))
+    moved = [MovedEndpoint("/guard", "/safe/guard", old, new)]
+    now = make_observation([tracks, diary, guard])
+    alone = ["/safe/guard subscribe /safe/wheel"]
+    assert _lonely_endpoints(before, now, moved, ()) == alone
+    other = replace(node("other"), endpoints=frozenset({own}))
+    assert not _lonely_endpoints(before, make_observation([*now.nodes, other]), moved, ())
+    silent = make_observation([diary])
+    assert not _lonely_endpoints(silent, now, moved, ()), "nobody talked to it before"
+    right = Right("/guard", ALLOW, "subscribe", "/safe/wheel")
+    denied = DeniedRight(right, ("/safe/guard",), "no rule", False, False, (new,))
+    assert not _lonely_endpoints(before, now, moved, [denied])
 
 
 def test_a_node_that_others_do_not_see_on_zenoh_needs_its_enclave_in_its_command() -> None:
