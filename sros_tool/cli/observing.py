@@ -591,6 +591,7 @@ def _propose(
 
     Raises: SrosError: rights were proposed, and not accepted.
     """
+    from sros_tool.explain.denials import lines_asking_for
     from sros_tool.files import policies_dir
     from sros_tool.graph.learn import common_parts, draft, render, write
     from sros_tool.graph.observation import Observation
@@ -618,7 +619,7 @@ def _propose(
         print_json(value._replace(accepted=accept, denials=lines))
     else:
         _show(plan, learned, written=written)
-        _show_lines(lines if plan.changes else ())
+        _show_lines(lines_asking_for(plan.added, lines) if plan.changes else ())
     if plan.changes and not accept and not dry_run:
         raise SrosError(
             f"the rights were not written to '{file}'",

@@ -43,9 +43,9 @@ from sros_tool.names import (
     right_to_use,
     service_of,
 )
-from sros_tool.policy.model import Policy
+from sros_tool.policy.model import ALLOW, Policy
 from sros_tool.policy.patterns import covers
-from sros_tool.policy.rights import profile_rights
+from sros_tool.policy.rights import Right, Rules, profile_rights
 from sros_tool.runtime.vendor_log import (
     ENDPOINT_KINDS,
     REMOTE_ENDPOINT,
@@ -273,6 +273,24 @@ def learned_from_logs(
         if propose([denial]).rights and (denial.enclave or enclave) in asked
     ]
     return learned, lines, any(denials.values())
+
+
+def lines_asking_for(added: Iterable[Right], lines: Iterable[AskingLine]) -> list[AskingLine]:
+    """Return the log lines that ask for any of the rights ``added``.
+
+    A policy may state the right of a line already, and deny it.
+    """
+    rules = Rules(added)
+
+    def asks(line: AskingLine) -> bool:
+        asked = propose([Denial(line.topic, line.direction, line.enclave or "")]).rights
+        return any(
+            rules.overlaps(Right(enclave, ALLOW, right.right, right.name))
+            for enclave, rights in asked.items()
+            for right in rights
+        )
+
+    return list(filter(asks, lines))
 
 
 def as_learned(

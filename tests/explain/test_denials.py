@@ -13,6 +13,7 @@ from sros_tool.files import policies_dir
 from sros_tool.graph.learn import NodeRight, common_parts
 from sros_tool.policy.model import ALLOW, Enclave, Group, Policy, Profile, Profiles
 from sros_tool.runtime.vendor_log import plain_text
+from tests.support.harness import sros
 
 LOGS = Path(__file__).with_name("denial_logs")
 
@@ -275,3 +276,21 @@ def secured_log(name: str) -> str:
 
 def the_talker(profile: Profile) -> Policy:
     return Policy((Enclave("/talker_listener/talker", (Profiles((profile,)),)),))
+
+
+def test_only_lines_that_ask_for_an_added_right_are_shown(tmp_path: Path) -> None:
+    """A line of an older start may ask for what the policy allows now, and denies as well."""
+    names = "<topic>/drive</topic>"
+    (tmp_path / "robot.xml").write_text(
+        '<policy version="0.2.0"><enclaves><enclave path="/eye"><profiles>'
+        f'<profile ns="/" node="eye"><topics publish="ALLOW">{names}</topics>'
+        f'<topics publish="DENY">{names}</topics></profile>'
+        "</profiles></enclave></enclaves></policy>"
+    )
+    (tmp_path / "eye.log").write_text(
+        "[SECURITY Error] rt/drive topic not found in allow rule. -> check_create_datawriter\n"
+        "[SECURITY Error] rr/homeReply topic not found in allow rule. -> check_create_datareader\n"
+    )
+    asked = ("robot.xml", "--from-log", "eye.log", "--enclave", "/eye", "--dry-run")
+    out = sros("generate_policy", *asked, cwd=tmp_path).out
+    assert "eye.log:2:" in out and "eye.log:1:" not in out
