@@ -150,7 +150,7 @@ PROCESS_NOT_SEEN = FindingKind(
     "proc(5), ptrace(2) (PTRACE_MODE_READ_FSCREDS).",
     "Run the check as root, outside of containers: `sudo sros check runtime`.",
 )
-_ROOT_MAY_NOT = (
+ROOT_IS_NOT_ENOUGH = (
     "Being root is not enough here: the processes are in another container or user namespace, or "
     "sros lacks the capability CAP_SYS_PTRACE. Run the check on the host, outside of containers."
 )
@@ -972,7 +972,7 @@ def _different_security_findings(
 
 def _unseen_process_findings(running: RunningProcesses) -> Iterator[Finding]:
     """Yield a finding for each node that could not be examined, and one with their count."""
-    remedy = _ROOT_MAY_NOT if running.by_root else ""
+    remedy = ROOT_IS_NOT_ENOUGH if running.by_root else ""
     for process in running.unseen:
         if process.speaks:
             text = f"it speaks ROS 2, and cannot be looked at: {process.why}"

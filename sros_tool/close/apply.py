@@ -10,6 +10,7 @@ from collections.abc import Collection, Iterator
 from itertools import chain
 from pathlib import Path
 
+from sros_tool.checks.processes import ROOT_IS_NOT_ENOUGH
 from sros_tool.close.nodes import ObservedNodes
 from sros_tool.close.processes import ClosedProcess, ObservedProcesses, process_text
 from sros_tool.close.proof import proofs_of
@@ -197,9 +198,10 @@ class _RemainingProcesses:
             if unseen.speaks:
                 yield f"{unseen.label} speaks ROS 2, and cannot be looked at: {unseen.why}"
         if running.processes.hidden or any(not unseen.speaks for unseen in unseen_processes):
-            self._robot.shell.say(
-                "some processes cannot be looked at: to be sure of them, ask as root"
-            )
+            why = "some processes cannot be looked at"
+            by_root = running.processes.by_root
+            remedy = f". {ROOT_IS_NOT_ENOUGH}" if by_root else ": to be sure of them, ask as root"
+            self._robot.shell.say(f"{why}{remedy}")
 
 
 def _is_like(process: Process, observed: ClosedProcess, nodes: Collection[str]) -> bool:

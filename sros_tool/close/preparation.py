@@ -19,7 +19,7 @@ from sros_tool.close.nodes import ObservedNodes
 from sros_tool.close.processes import ROUTER, ClosedProcess, ObservedProcesses, run_words
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, TEMPLATE, LocalRobot
 from sros_tool.close.start_files import write_start_files
-from sros_tool.close.state import CloseState, CloseStep, current_state
+from sros_tool.close.state import CloseState, CloseStep, RunningRobot, current_state
 from sros_tool.close.watch import check_watchable, watch
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.files import replace_file
@@ -361,12 +361,23 @@ def _shared_program_problems(robot: LocalRobot) -> Iterator[str]:
 
 def _shared_node_problems(robot: LocalRobot) -> Iterator[str]:
     """Yield a text for processes with nodes of the same name, which would share an enclave."""
-    by_enclave: dict[str, list[ClosedProcess]] = {}
-    for process in robot.processes.processes:
-        by_enclave.setdefault(process.enclave, []).append(process)
+    observed = robot.processes
+    is_signed = robot.keystore.exists()
+    if is_signed:  # otherwise the policy was learned of them, whether they run or not
+        observed = observed.with_current_pids(RunningRobot(robot).processes, robot.export)
+    by_enclave: dict[str, dict[int, str]] = {}
+    for process in observed.processes:
+        # Whoever was started in the enclave did not choose it by its name.
+        if process.known_by != "enclave":
+            twins = by_enclave.setdefault(process.enclave, {})
+            twins |= dict.fromkeys(process.alike or [process.pid], shlex.join(process.command))
     for enclave, twins in by_enclave.items():
-        if len({twin.pid for twin in twins}) > 1:
-            commands = [f"process {twin.pid} ({shlex.join(twin.command)})" for twin in twins]
+        commands = [
+            f"process {pid} ({command})" if pid else f"a process that ended ({command})"
+            for pid, command in twins.items()
+            if pid or not is_signed
+        ]
+        if len(commands) > 1:
             yield (
                 f"{enumerated(commands)} call themselves {enclave}, and the enclave of this "
                 "name would have the rights of all; nothing was signed; if one is not of the "

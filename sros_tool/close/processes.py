@@ -141,7 +141,7 @@ class ClosedProcess(NamedTuple):
             return self._replace(alike=())
         if len(pids) > 1:
             return self._replace(pid=0, alike=pids)
-        known_by = "command" if pids else self.known_by
+        known_by = "command" if pids and self.known_by != "enclave" else self.known_by
         return self._replace(pid=next(iter(pids), 0), known_by=known_by, alike=())
 
     def open_command(self, domain: int) -> str:

@@ -341,7 +341,7 @@ class _TalkComparison:
         """Return what was compared, what the policy denies now, and which nodes are new."""
         before = self._nodes.compared(self._away)
         number = counted(len(before.nodes), "node")
-        text = f"{number} with {before.endpoint_count} endpoints as before"
+        text = f"{number} with {before.endpoint_count} endpoints as before (types are not compared)"
         text += f", without {', '.join(sorted(self._away))}" if self._away else ""
         if denied := self._denied:
             text += f", but for {counted(len(denied), 'right')} that the policy denies now: "

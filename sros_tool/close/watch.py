@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 import threading
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -33,14 +34,17 @@ from sros_tool.runtime.environment import RMW_ZENOH
 from sros_tool.runtime.processes import Process, ProcessOrigin, ProcessTable, process_origin
 from sros_tool.runtime.rmw import RMW
 from sros_tool.runtime.variables import DOMAIN
-from sros_tool.wording import counted, first_few
+from sros_tool.wording import counted, enumerated, first_few
 
 _LOOK_SECONDS = 1.0
 """How often processes are looked at while the robot is watched; shorter ones can be missed."""
 _MOST_COMMANDS = 10_000
 """Number of commands of processes that are kept; of others, the start command is not known."""
-_SHELL_VARIABLES = ("_", "SHLVL", "PWD", "OLDPWD", "COLUMNS", "LINES", DOMAIN)
-"""Variables that differ between shells, or that the commands set."""
+_SHELL_VARIABLES = re.compile(
+    r"_|SHLVL|PWD|OLDPWD|COLUMNS|LINES|PS[0-4]|PROMPT_COMMAND|HIST\w+|TERM\w*|COLORTERM|LS_COLORS"
+    rf"|LESS(OPEN|CLOSE)|debian_chroot|VIRTUAL_ENV_PROMPT|{DOMAIN}"
+)
+"""Matches variables that differ between shells, are of interactive shells, or that commands set."""
 
 _StartedProcesses = dict[tuple[str, ...], tuple[Process, ProcessOrigin]]
 """Processes by their commands, with what started them."""
@@ -187,15 +191,19 @@ def _observed_processes(
 def _say_variables(running: RunningRobot, observed: ObservedProcesses) -> None:
     """Print variables of the processes that neither their commands nor this shell set."""
     robot, rmws = running.robot, {process.pid: process.rmw for process in observed.processes}
+    by_variables: dict[tuple[str, ...], list[str]] = {}
     for process in running.processes.processes:
-        unset = process.environment.keys() - {*robot.shell.environment, *_SHELL_VARIABLES}
+        unset = process.environment.keys() - robot.shell.environment.keys()
         unset -= {RMW} if rmws.get(process.pid) else set()
-        if process.pid in rmws and unset:
-            robot.shell.say(
-                f"{process.label} has variables that this shell does not have, and that its "
-                f"command in {robot.commands_file} does not set: "
-                f"{first_few(sorted(unset), MOST_NAMES)}"
-            )
+        names = tuple(sorted(name for name in unset if not _SHELL_VARIABLES.fullmatch(name)))
+        if process.pid in rmws and names:
+            by_variables.setdefault(names, []).append(process.label)
+    for names, labels in by_variables.items():
+        robot.shell.say(
+            "variables that this shell does not have, and that the start commands in "
+            f"{robot.commands_file} do not set: {first_few(names, MOST_NAMES)}; "
+            f"of {enumerated(labels)}"
+        )
 
 
 def _lacking_text(robot: LocalRobot, nodes: Sequence[ObservedNode]) -> str:

@@ -20,7 +20,7 @@ from sros_tool.cli import close
 from sros_tool.close import apply, assignment, nodes, proof, state, watch
 from sros_tool.close.assignment import with_command_of_unit
 from sros_tool.close.preparation import steps
-from sros_tool.close.processes import ClosedProcess, ObservedProcesses
+from sros_tool.close.processes import ClosedProcess, ObservedProcesses, read_processes
 from sros_tool.close.robot import LocalRobot, Shell
 from sros_tool.explain.audit import audit
 from sros_tool.graph import observe
@@ -271,7 +271,7 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     robot.close()
     robot.remaining = (TALKER, ros_node("listener", "04"))
     said = robot.close("--apply").out
-    assert "36 endpoints as before, but for 1 right that the policy denies now: " in said
+    assert "(types are not compared), but for 1 right that the policy denies now: " in said
     assert "denies now: /listener subscribe topic /chatter\n" in said
 
 
@@ -352,7 +352,8 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
         "domain 0",
         "yes: the files have no error: sros check finds none: robot/export",
         "yes: the requirements hold: all of them: robot/requirements.toml",
-        "yes: everything that talked can still talk: 2 nodes with 36 endpoints as before",
+        "yes: everything that talked can still talk: 2 nodes with 36 endpoints as before "
+        "(types are not compared)",
         "yes: an open listener finds nothing: the observer that saw 2 nodes before sees none",
     ]
     assert "; next: bring robot/keystore to another machine: it has the CA keys\n" in closed.err
@@ -390,7 +391,9 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
 
 
 @sometimes("what_systemd_does_not_start_is_done_by_hand", 1 / 2)
-def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
+def test_what_systemd_does_not_start_is_done_by_hand(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
     robot.close()
     ended = robot.close("--apply", status=1)
     assert robot.restarts == []
@@ -487,6 +490,10 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     )
     assert "\nsome processes cannot be looked at: to be sure of them, ask as " in undone.err
     assert "the robot is open: " in undone.err
+    looked = replace(robot.look(None, datetime.now(UTC)), by_root=True)
+    monkeypatch.setattr(ProcessTable, "look", lambda _table, _now: looked)
+    undone = robot.close("--undo")
+    assert "\nsome processes cannot be looked at. Being root is not enough here: " in undone.err
 
 
 @sometimes("processes_that_started_after_the_watch", 1 / 2)
@@ -566,7 +573,10 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
         "domain 0; "
         "not running: /listener\n"
     ) in ended.out
-    assert "talk: 1 node with 18 endpoints as before, without /listener\n" in ended.out
+    assert (
+        "talk: 1 node with 18 endpoints as before (types are not compared), without /listener\n"
+        in ended.out
+    )
     assert "the robot is closed, without a process of /listener; the files are" in ended.err
     robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
     assert "; not seen: /listener\n" in robot.close(*without, "--partial").out
@@ -801,7 +811,8 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     said = robot.close("--apply").out
     talk = "everything that talked can still talk: "
     assert (
-        f"yes: {talk}3 nodes with 57 endpoints as before, but for 1 right that the policy " in said
+        f"yes: {talk}3 nodes with 57 endpoints as before (types are not compared), "
+        "but for 1 right that the policy " in said
     )
     assert f"{denied}; new, without a profile: /ghost_node in /listener; compared " in said
     renamed = "compared under a new name: /rear_camera as /nav/stern_camera, with /odom as /nav/o"
@@ -864,7 +875,9 @@ def test_a_node_whose_enclave_the_graph_does_not_show_is_named(robot: Robot) -> 
     assert "/ghost: the identifier of the participant is that of a secured one, so 'rob" in said
     robot.by_hand = set(PID)
     robot.nodes = (TALKER, LISTENER)
-    assert "2 nodes with 36 endpoints as before" in robot.close("--proof").out
+    assert (
+        "2 nodes with 36 endpoints as before (types are not compared)" in robot.close("--proof").out
+    )
 
 
 def test_a_node_that_was_restarted_without_its_namespace(robot: Robot) -> None:
@@ -897,6 +910,15 @@ def test_a_process_with_the_name_of_another_is_not_signed(robot: Robot) -> None:
     (robot.folder / "robot/policy.xml").unlink()
     robot.close()
     assert "cmd_vel" not in (robot.folder / "robot/policy.xml").read_text()
+    remembered = read_processes(robot.folder / "robot/processes.json")
+    talker = next(one for one in remembered.processes if one.enclave == "/talker")
+    runs = Process(7, ("talk",), {}, datetime.now(UTC), libraries=library)
+    for known_by, robot.more in (("program", ()), ("enclave", (runs,))):
+        same = talker._replace(pid=7, command=("talk",), known_by=known_by)
+        twins = remembered._replace(processes=[*remembered.processes, same])
+        content = json.dumps(as_plain(twins))
+        (robot.folder / "robot/processes.json").write_text(content)
+        assert "call themselves" not in robot.close().out, "one has ended, or ran in the enclave"
 
 
 def test_a_program_that_starts_its_nodes_has_one_enclave(
@@ -927,7 +949,10 @@ def test_a_program_that_starts_its_nodes_has_one_enclave(
     robot.by_hand, in_one = {"/listener"}, lambda *nodes: [("/listener", *of[1:]) for of in nodes]
     robot.absent = {"/talker"}
     monkeypatch.setattr("tests.cli.test_close.secured", in_one)
-    assert "talk: 2 nodes with 36 endpoints as before\n" in robot.close("--proof").out
+    assert (
+        "talk: 2 nodes with 36 endpoints as before (types are not compared)\n"
+        in robot.close("--proof").out
+    )
     robot.remaining = (LISTENER,)
     said = robot.close("--proof", status=1).out
     assert "no: everything that talked can still talk: not seen: /talker (if it" in said
@@ -1183,14 +1208,17 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     said = "1 enclave, and no open process in domain 0; of other machines: /listener\n"
     assert said in ended.out
     assert "differs from the signed permissions" not in ended.err
-    assert "talk: 2 nodes with 36 endpoints as before\n" in ended.out
+    assert "talk: 2 nodes with 36 endpoints as before (types are not compared)\n" in ended.out
     robot.remaining = (TALKER,)
     said = robot.close("--proof", status=1).out
     assert (
         "not seen: /listener" in said and "; if they may be away, add --without /listener\n" in said
     )
     ended = robot.close("--proof", "--without", "/listener")
-    assert "talk: 1 node with 18 endpoints as before, without /listener\n" in ended.out
+    assert (
+        "talk: 1 node with 18 endpoints as before (types are not compared), without /listener\n"
+        in ended.out
+    )
     sros("create_enclave", "robot/keystore", "/operator/look", cwd=robot.folder).ok()
     robot.close("--elsewhere", "/operator/look")
     assert list_enclaves(robot.folder / "robot/export") == ("/sros_observer", "/talker")

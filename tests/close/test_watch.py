@@ -13,11 +13,16 @@ from sros_tool.runtime.processes import Process, ProcessOrigin, RunningProcesses
 
 def test_variables_that_a_command_does_not_set_are_named() -> None:
     variables = {"HOME": "/", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp", "GAIN": "2"}
-    talker = Process(1, ("talk",), variables, datetime.now(UTC))
-    closed = ClosedProcess.from_process(talker, "/talker", ProcessOrigin("", "/opt"), "program")
+    talkers = tuple(
+        Process(pid, ("talk",), {**variables, "PS1": "$ ", "HISTSIZE": "1"}, datetime.now(UTC))
+        for pid in (1, 2)
+    )
+    origin = ProcessOrigin("", "/opt")
+    closed = [ClosedProcess.from_process(of, "/talker", origin, "program") for of in talkers]
     shown: list[str] = []
     shell = SimpleNamespace(environment={"HOME": "/root"}, say=shown.append)
     robot = SimpleNamespace(shell=shell, commands_file="commands.txt")
-    running: Any = SimpleNamespace(robot=robot, processes=RunningProcesses((talker,)))
-    watch._say_variables(running, ObservedProcesses(0, [closed]))
-    assert len(shown) == 1 and shown[0].endswith("its command in commands.txt does not set: GAIN")
+    running: Any = SimpleNamespace(robot=robot, processes=RunningProcesses(talkers))
+    watch._say_variables(running, ObservedProcesses(0, closed))
+    assert len(shown) == 1 and shown[0].startswith("variables that this shell does not have")
+    assert shown[0].endswith("do not set: GAIN; of process 1 (talk) and process 2 (talk)")
