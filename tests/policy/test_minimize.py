@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
+from sros_tool.keystore.issuing.size import SizeEstimator, minimized_policy, right_bytes
 from sros_tool.names import is_expression
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.minimize import EnclaveUse, minimize, propose_wildcards
@@ -247,3 +247,18 @@ def test_a_wildcard_over_hidden_services_of_an_action_is_not_safe() -> None:
     action = Right("/b", ALLOW, "execute", "/fleet/x/f")
     found = propose_wildcards("/a", own, [*own, action], needed=10**6, size=right_bytes)
     assert not any(each.adds == () for each in found if each.rule.name == "/fleet/*")
+
+
+def test_an_enclave_that_does_not_change_has_one_size(tmp_path: Path) -> None:
+    """Signatures of the same permissions differ in length."""
+    topic = '<topics publish="ALLOW"><topic>/x</topic></topics>'
+    node = f'<profiles><profile ns="/" node="n">{topic}</profile></profiles>'
+    enclaves = "".join(f'<enclave path="/e{n}">{node}</enclave>' for n in range(12))
+    file = tmp_path / "robot.xml"
+    file.write_text(f'<policy version="0.2.0"><enclaves>{enclaves}</enclaves></policy>')
+    used = tmp_path / "used.xml"
+    used.write_text(
+        f'<policy version="0.2.0"><enclaves><enclave path="/e0">{node}</enclave></enclaves></policy>'
+    )
+    for enclave in minimized_policy(file, [used]).enclaves:
+        assert enclave.bytes.before == enclave.bytes.after

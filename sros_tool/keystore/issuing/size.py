@@ -221,12 +221,13 @@ def _measured_enclaves(
     for before, after, use in zip(
         policy.enclaves, result.policy.enclaves, result.uses, strict=True
     ):
-        sizes = PermissionsBytes(
-            *(
-                estimator.signed_bytes(_longest_enclave(Policy((enclave,)), fleet))
-                for enclave in (before, after)
-            )
-        )
+        was, now = (Policy((enclave,)) for enclave in (before, after))
+        size = estimator.signed_bytes(_longest_enclave(was, fleet))
+        # Another signature of the same permissions can have another length.
+        if policy_rights(was) == policy_rights(now):
+            sizes = PermissionsBytes(size, size)
+        else:
+            sizes = PermissionsBytes(size, estimator.signed_bytes(_longest_enclave(now, fleet)))
         proposals: tuple[WildcardProposal, ...] = ()
         if sizes.after > MAX_SIGNED_BYTES - _MARGIN:
             proposals = propose_wildcards(
