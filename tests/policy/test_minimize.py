@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -249,16 +250,23 @@ def test_a_wildcard_over_hidden_services_of_an_action_is_not_safe() -> None:
     assert not any(each.adds == () for each in found if each.rule.name == "/fleet/*")
 
 
-def test_an_enclave_that_does_not_change_has_one_size(tmp_path: Path) -> None:
+def test_an_enclave_that_does_not_change_has_one_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Signatures of the same permissions differ in length."""
-    topic = '<topics publish="ALLOW"><topic>/x</topic></topics>'
-    node = f'<profiles><profile ns="/" node="n">{topic}</profile></profiles>'
-    enclaves = "".join(f'<enclave path="/e{n}">{node}</enclave>' for n in range(12))
-    file = tmp_path / "robot.xml"
-    file.write_text(f'<policy version="0.2.0"><enclaves>{enclaves}</enclaves></policy>')
-    used = tmp_path / "used.xml"
-    used.write_text(
-        f'<policy version="0.2.0"><enclaves><enclave path="/e0">{node}</enclave></enclaves></policy>'
-    )
-    for enclave in minimized_policy(file, [used]).enclaves:
-        assert enclave.bytes.before == enclave.bytes.after
+    sizes = count(4000)
+    monkeypatch.setattr(SizeEstimator, "signed_bytes", lambda *_: next(sizes))
+    topics = '<topics publish="ALLOW"><topic>/x</topic>{}</topics>'
+    paths = {}
+    for name, more in (("robot", "<topic>/y</topic>"), ("used", "")):
+        node = f'<profiles><profile ns="/" node="n">{topics.format(more)}</profile></profiles>'
+        enclaves = "".join(f'<enclave path="{e}">{node}</enclave>' for e in ("/a", "/b"))
+        paths[name] = tmp_path / f"{name}.xml"
+        paths[name].write_text(
+            f'<policy version="0.2.0"><enclaves>{enclaves}</enclaves></policy>'.replace(
+                "/b" if name == "used" else "never", "/other"
+            )
+        )
+    first, second = minimized_policy(paths["robot"], [paths["used"]]).enclaves
+    assert first.bytes.before != first.bytes.after
+    assert second.bytes.before == second.bytes.after
