@@ -919,7 +919,10 @@ class _Review:
                 base_files, partial(_without_left_robots, before, system.fleet)
             )
             yield from self._step_result(
-                "requirements", subject, partial(_decided_requirements, wanted, system)
+                "requirements",
+                subject,
+                partial(_decided_requirements, wanted, system),
+                only_with_result=bool(files),
             )
             if dropped_requirements(earlier, wanted):
                 decide = partial(self._dropped_step, earlier, wanted, system)

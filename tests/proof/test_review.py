@@ -131,6 +131,10 @@ def test_dropping_a_requirement_is_a_consent_of_its_own(change: Change) -> None:
     steps = {step["step"]: step for step in json.loads(allowed.out)["steps"]}
     assert steps["requirements-before"]["allowed"] and steps["new-access"]["allowed"]
     assert all(line.strip() in str(steps["requirements-before"]) for line in lines)
+    change.commit({"robot.toml": None})
+    gone = change.review(*words)
+    assert "requirements robot.toml: 'robot.toml' is not in the commit" in gone.out
+    assert "nothing found" not in gone.out.replace("policy robot.xml: nothing found", ""), gone
 
 
 def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) -> None:
