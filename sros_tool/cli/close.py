@@ -255,6 +255,8 @@ def _nodes(policy: Policy, enclave: str) -> str:
 
 def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool) -> None:
     """Print the answer, its reasons, and what to do next."""
+    from sros_tool.close.preparation import rmws_without_security
+
     folder, observed = shlex.quote(str(robot.folder)), closed.observed
     ask = f"sros close {folder} --proof"
     idle = closed.stopped if closed.secured else {*observed.ended}
@@ -298,6 +300,8 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
             following = f"sros close {folder} --apply"
         else:
             following = f"{steps}, and ask {ask}"
+        if not closed.secured and rmws_without_security(robot, observed):
+            following = "sros doctor, to find an RMW that enforces security, and set it"
         echo(f"{_state(closed, apply=apply)}{_until(closed)}; next: {following}", err=True)
 
 

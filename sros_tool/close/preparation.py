@@ -64,6 +64,8 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
         SrosError: the robot cannot be watched, or the keystore was brought to another machine.
     """
     _check_folder(robot)
+    if not duration:
+        robot.check_rmw()
     if robot.observed and robot.named_elsewhere:
         robot.check_elsewhere()
         robot.observed = robot.observed.belonging_elsewhere(robot.named_elsewhere)
@@ -84,7 +86,12 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     newly_denied = [right for right in denied if right not in denied_before]
     problems += _problems_of(robot, state, partial=partial)
     if not state.secured:
-        _warn_of_rmw(robot, state.observed)
+        for rmw in rmws_without_security(robot, state.observed):
+            robot.shell.say(
+                f"WARNING: {rmw} is built without security here: no node starts in an enclave "
+                "with it. Before you stop the robot, find an RMW that enforces security: "
+                "sros doctor"
+            )
     return state._replace(
         denied=denied, newly_denied=newly_denied, problems=problems, changes=changes
     )
@@ -205,17 +212,12 @@ def _do(robot: LocalRobot, step: CommandStep) -> tuple[str, list[str]]:
     return "done", []
 
 
-def _warn_of_rmw(robot: LocalRobot, observed: ObservedProcesses) -> None:
-    """Warn if an RMW that the processes use was built without security."""
+def rmws_without_security(robot: LocalRobot, observed: ObservedProcesses) -> list[str]:
+    """Return the RMWs that the processes use and that were built without security."""
     environment = robot.shell.environment
     default = environment.get(RMW) or next(iter(rmw_implementations(environment)), "")
-    for rmw in sorted({process.rmw or default for process in observed.processes}):
-        if built_without_security(rmw, environment):
-            robot.shell.say(
-                f"WARNING: {rmw} is built without security here: no node starts in an enclave "
-                "with it. Before you stop the robot, find an RMW that enforces security: "
-                "sros doctor"
-            )
+    rmws = sorted({process.rmw or default for process in observed.processes})
+    return [rmw for rmw in rmws if built_without_security(rmw, environment)]
 
 
 def _enclaves_to_export(robot: LocalRobot) -> Sequence[str]:
@@ -321,6 +323,13 @@ def _unknown_process_problems(robot: LocalRobot, state: CloseState) -> Iterator[
             f"sros saw no node of {counted(len(observed.unknown), 'process', 'processes')}: "
             f"{processes}; {undo}watch again while they run: {close} --for 1m; "
             f"otherwise {silent}"
+        )
+    routers = [process for process in RunningRobot(robot).open_processes if process.is_router]
+    if routers and not any(process.is_router for process in observed.processes):
+        yield (
+            f"{routers[0].label} is a Zenoh router that did not run when sros watched, or is not "
+            f"of the robot; watch again while it runs, or stop it: {close} --for 1m; otherwise "
+            "closed nodes do not reach each other by it (accept: --partial)"
         )
     pids = {process.enclave: process.pid for process in observed.processes}
     if twice := sorted(pids.keys() & {*observed.elsewhere}):

@@ -73,7 +73,10 @@ class ClosedProcess(NamedTuple):
         cls, process: Process, enclave: str, origin: ProcessOrigin, known_by: str
     ) -> ClosedProcess:
         """Return a running process with its enclave and what started it."""
-        start = enclave, *process.program, origin.folder, process.user, origin.unit
+        pid, command = process.program
+        if process.is_demo_router:  # what it was started with fits this one start
+            command = ("sros", "demo", "router")
+        start = enclave, pid, command, origin.folder, process.user, origin.unit
         rmw = _rmw_to_start(process)
         chooses = process.environment.get(ENCLAVE) == enclave
         return cls(*start, known_by, origin.launch, origin.container, rmw, (), chooses)
@@ -234,7 +237,7 @@ class ObservedProcesses(NamedTuple):
             process_text(process)
             for process in running.processes
             if is_in_domain(process, self.domain)
-            and not (process.is_daemon or process.asks_for_security)
+            and not (process.is_daemon or process.is_router or process.asks_for_security)
             and process.program[0] not in pids
             and not any(known.fits(process) for known in self.processes)
         ]

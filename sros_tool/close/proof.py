@@ -55,6 +55,7 @@ _TRIES = 3
 def prove(robot: LocalRobot) -> CloseState:
     """Prove that the robot is closed."""
     robot.shell.check_open()
+    robot.check_rmw()
     state = current_state(robot, robot.read_policy())
     proofs = proofs_of(robot, state, _START_SECONDS)
     fails = any(proof.fails for proof in proofs)

@@ -28,6 +28,8 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
+from sros_tool.runtime.environment import RMW_ZENOH
+from sros_tool.runtime.rmw import RMW
 from sros_tool.runtime.variables import domain_of
 from sros_tool.values import as_plain
 from sros_tool.wording import first_few
@@ -204,6 +206,16 @@ class LocalRobot:
         """Raise `UsageError` if neither the policy nor the keystore has an enclave elsewhere."""
         known = (self.keystore_enclaves() - {OBSERVER}) | self.policy_enclaves()
         check_enclaves(self.named_elsewhere, known, "--elsewhere")
+
+    def check_rmw(self) -> None:
+        """Raise `UsageError` if the robot was watched on Zenoh, and this shell is not on Zenoh."""
+        is_on_zenoh = any(process.rmw == RMW_ZENOH for process in self.processes.processes)
+        if is_on_zenoh and self.shell.environment.get(RMW) != RMW_ZENOH:
+            raise UsageError(
+                f"this robot runs on {RMW_ZENOH}",
+                "An observer that this shell starts would look for it on DDS.",
+                f"Set {RMW}={RMW_ZENOH}.",
+            )
 
     def variables(self, enclave: str, rmw: str = "") -> dict[str, str]:
         """Return the environment of an enclave of the export."""

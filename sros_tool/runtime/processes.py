@@ -165,7 +165,14 @@ class Process:
     @property
     def is_router(self) -> bool:
         """Whether the process is a Zenoh router."""
-        return any(Path(word).name in _ROUTERS for word in self.command[:3])
+        return self.is_demo_router or any(Path(word).name in _ROUTERS for word in self.command[:3])
+
+    @property
+    def is_demo_router(self) -> bool:
+        """Whether the process is the router that `sros demo router` starts."""
+        return ("-m", "sros_tool.demo.zenoh_node", "router") in zip(
+            self.command, self.command[1:], self.command[2:], strict=False
+        )
 
     @property
     def is_daemon(self) -> bool:

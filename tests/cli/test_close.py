@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from sros_tool.cli import close
-from sros_tool.close import apply, assignment, nodes, proof, state, watch
+from sros_tool.close import apply, assignment, nodes, preparation, proof, state, watch
 from sros_tool.close.assignment import with_command_of_unit
 from sros_tool.close.preparation import steps
 from sros_tool.close.processes import ClosedProcess, ObservedProcesses, read_processes
@@ -180,6 +180,9 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
             robot.units.get(units.get(pid, ""), ""), "/opt", robot.launch, robot.container
         ),
     )
+    # The RMWs of this machine may lack security.
+    lacking = tmp_path / "lacking"
+    monkeypatch.setattr(preparation, "built_without_security", lambda *_: lacking.exists())
     monkeypatch.setattr(apply, "_SYSTEMD", tmp_path / "systemd")
     monkeypatch.setattr(apply, "_RESTART_SECONDS", 0.1)
     monkeypatch.setattr(proof, "_START_SECONDS", 0.1)
@@ -215,14 +218,11 @@ def test_everything_is_prepared_and_nothing_is_closed(robot: Robot) -> None:
     mine = robot.folder / "robot/base.py"
     mine.parent.mkdir()
     mine.touch()
-    index = robot.folder / "ros/share/ament_index/resource_index/rmw_typesupport"
-    index.mkdir(parents=True)
-    (index / "rmw_fastrtps_cpp").touch()
-    (robot.folder / "ros/lib").mkdir()
-    library = robot.folder / "ros/lib/librmw_fastrtps_shared_cpp.so"
-    library.write_bytes(b"this Fast DDS version doesn't have the security libraries")
-    ended = robot.close(AMENT_PREFIX_PATH=str(robot.folder / "ros"))
+    lacking = robot.folder / "lacking"  # as the fixture has it
+    lacking.touch()
+    ended = robot.close(RMW_IMPLEMENTATION="rmw_fastrtps_cpp")
     assert "\nWARNING: rmw_fastrtps_cpp is built without security here: " in ended.err
+    lacking.unlink()
     mine.unlink()
     assert ended.err.startswith("'robot' has files of yours: sros adds its own to them\n")
     assert made(robot.folder) == MADE
@@ -238,7 +238,11 @@ def test_everything_is_prepared_and_nothing_is_closed(robot: Robot) -> None:
     drop_in = robot.folder / "robot/start/units/talker.service.d/sros-close.conf"
     assert 'Environment="ROS_SECURITY_ENCLAVE_OVERRIDE=/talker"\n' in drop_in.read_text()
     assert not robot.restarts and not [*(robot.folder / "systemd").iterdir()]
-    assert ended.err.endswith("nothing is closed yet; next: sros close robot --apply\n")
+    assert ended.err.endswith(
+        "next: sros doctor, to find an RMW that enforces security, and set it\n"
+    )
+    said = robot.close().err
+    assert said.endswith("nothing is closed yet; next: sros close robot --apply\n")
 
 
 @sometimes("a_policy_that_was_changed_stays_and_is_followed", 1 / 2)
@@ -1082,6 +1086,11 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
     other_user = re.sub(r'"user": \d+', '"user": "a"', text, count=1)
     other_name = text.replace('"ended": []', '"ended": [{}]')
     number = text.replace('"enclave": "/talker"', '"enclave": 5')
+    file.write_text(text.replace('"rmw": ""', '"rmw": "rmw_zenoh_cpp"'))
+    for words in ((), ("--proof",), ("--apply",)):
+        said = robot.close(*words, status=2).err
+        assert "this robot runs on rmw_zenoh_cpp. " in said
+        assert "Set RMW_IMPLEMENTATION=rmw_zenoh_cpp." in said
     for wrong in (other_unit, other_user, other_name, number, "{}", "[" * 100_000):
         file.write_text(wrong)
         assert "is not a list of processes" in robot.close(status=2).err
@@ -1223,7 +1232,7 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     robot.close("--elsewhere", "/operator/look")
     assert list_enclaves(robot.folder / "robot/export") == ("/sros_observer", "/talker")
     robot.remaining = (TALKER, LISTENER)
-    assert "as before, without /operator/look\n" in robot.close("--proof").out
+    assert "(types are not compared), without /operator/look\n" in robot.close("--proof").out
     robot.by_hand = set()
     there = "start /listener and /operator/look, on other machines, without sros run, too"
     assert f"sros sees no process in an enclave of this folder; {there}\n" in (

@@ -8,6 +8,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+from sros_tool.close.assignment import assign
 from sros_tool.close.processes import ClosedProcess, ObservedProcesses
 from sros_tool.policy.model import Policy
 from sros_tool.runtime.environment import RMW_ZENOH
@@ -94,3 +95,15 @@ def test_commands_name_the_rmw_and_on_zenoh_the_enclave() -> None:
     assert talker.open_command(7) == in_domain
     observed = ObservedProcesses(7, [talker])
     assert observed.command_of_new(Path("export"), "/horn") == f"{run.format('/horn')} COMMAND"
+
+
+def test_a_router_has_no_node_and_is_no_unknown_process() -> None:
+    """Also `sros demo router`, whose own command is for one start only."""
+    words = ("-P", "-m", "sros_tool.demo.zenoh_node", "router", "--report", "/proc/self/fd/7")
+    demo = replace(process(7, "python3", *words), libraries=frozenset({"zenoh"}))
+    observed = assign([], [demo], 0, origins={7: ProcessOrigin("", "/opt")})
+    assert [known.command for known in observed.processes] == [("sros", "demo", "router")]
+    assert not observed.unknown and observed.processes[0].is_router
+    for router in (replace(demo, pid=8), process(8, "/opt/rmw_zenohd")):
+        later = observed.with_current_pids(RunningProcesses((router,)), Path("/export"))
+        assert ([known.pid for known in later.processes], later.unknown) == ([8], [])
