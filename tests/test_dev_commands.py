@@ -497,3 +497,44 @@ def test_nothing_is_installed_that_is_there(
     apt.provide_for_tests()
     assert asked == [["chromium"]]
     assert "a browser (chromium) cannot be installed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SetupError, None])
+def test_apt_works_meanwhile_and_is_waited_for_only_without_an_error(
+    venv: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException] | None
+) -> None:
+    begun, may_end, ended = (threading.Event() for _ in range(3))
+
+    def install(*_: object) -> bool:
+        assert begun.wait(PATIENCE), "apt works at the same time"
+        if error:
+            raise error
+        may_end.set()
+        return True
+
+    def meanwhile() -> None:
+        begun.set()
+        may_end.wait(PATIENCE)
+        ended.set()
+
+    monkeypatch.setattr(environment, "current", Record)
+    monkeypatch.setattr(environment, "distributions_now", dict)
+    for name in ("_usable", "whole"):
+        monkeypatch.setattr(environment, name, lambda *_: True)
+    monkeypatch.setattr(environment, "_install", install)
+    if error:
+        with pytest.raises(error):
+            environment.prepare(["package"], Record(), 0, meanwhile=meanwhile)
+        assert not ended.is_set()
+        may_end.set()
+    else:
+        done = environment.prepare(["package"], Record(), 0, meanwhile=meanwhile)
+        assert ended.is_set() and done.groups == ["package"]
+
+
+def test_what_fails_meanwhile_is_said() -> None:
+    def fail() -> None:
+        raise OSError("no space")
+
+    with pytest.raises(OSError, match="no space"):
+        environment._started(fail).result(PATIENCE)

@@ -14,8 +14,9 @@ import platform
 import shutil
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import replace
+from threading import Thread
 
 from tools import apt
 from tools.record import (
@@ -94,6 +95,7 @@ def prepare(
     """Create the environment if needed, and install ``groups`` of `GROUPS`; return the record.
 
     ``meanwhile`` runs in a thread while the groups are installed, and has ended at the return.
+    After an error or Ctrl-C nobody waits for it: its installer keeps ``lock`` as long as it runs.
 
     Raises:
         SetupError: something cannot be installed; its text has the end of the log.
@@ -117,8 +119,8 @@ def prepare(
     if not is_current:
         record = Record()
     done = list(record.groups)
-    with _unfinished(), ThreadPoolExecutor(1) as threads:
-        others = threads.submit(meanwhile)
+    with _unfinished():
+        others = _started(meanwhile)
         for group in groups:
             if group not in done and _install(group, now, lock):
                 done.append(group)
@@ -130,6 +132,22 @@ def prepare(
         dds=record.dds,
         rmw=record.rmw,
     )
+
+
+def _started(work: Callable[[], None]) -> Future[None]:
+    """Start ``work`` in a thread that does not outlive the program; return its future result."""
+    result: Future[None] = Future()
+
+    def run() -> None:
+        try:
+            work()
+        except BaseException as error:
+            result.set_exception(error)
+        else:
+            result.set_result(None)
+
+    Thread(target=run, daemon=True).start()
+    return result
 
 
 def _usable(record: Record, now: Record) -> bool:
