@@ -191,8 +191,10 @@ class _Round:
         if self._machine.restarted or before.boot != boot:
             # After a start of the machine no process has files of before; what is seen counts.
             self._state = replace(before, due=(), list_due=(), boot=boot)
+        # Before files are replaced: processes may have started with those that are here now.
+        self._note_due((), self._enclaves())
         if self._machine.restarted:
-            self._state = replace(self._state, files=self._digests(self._enclaves()))
+            self._state = replace(self._state, due=(), list_due=())
         proven = self._proven_moment()
         clock = self._clock(proven)
         # Documents that were verified prove that this moment has passed, whatever the clock shows.

@@ -318,7 +318,8 @@ def _show_undone(robot: LocalRobot, closed: CloseState) -> None:
         pids = [
             process.pid for process in closed.observed.processes if process.pid or process.alike
         ]
-        stopped = not (pids or closed.observed.unknown)
+        # Without the list of processes, nobody knows whether they run.
+        stopped = robot.observed is not None and not (pids or closed.observed.unknown)
         state = "no process of the robot runs" if stopped else "the robot is open"
         but = ""
         if other_machines := closed.observed.not_here:

@@ -56,7 +56,9 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
     if not proofs:
         return state
     running = current_state(robot, robot.read_policy())
-    return state._replace(proofs=proofs, secured=running.secured, new=running.new)
+    return state._replace(
+        proofs=proofs, observed=running.observed, secured=running.secured, new=running.new
+    )
 
 
 def _write_drop_ins(

@@ -292,7 +292,7 @@ def _user_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[s
         barred = [path for path in export.parents if not _may_enter(user, path.stat())]
         if barred and user:
             yield f"user {user}, who runs processes, cannot enter '{barred[-1]}'"
-        if user != owner:
+        if user not in (0, owner):
             yield (
                 f"processes run as user {user}, and only user {owner} can read the enclaves: "
                 f"chown -R {user} {shlex.quote(str(robot.export))}"

@@ -211,7 +211,9 @@ class RobotStatus:
     brings.  ``is_ahead`` says that, by its message, its files are newer than the backup of the
     keystore. ``reads_copy`` says that it fetched after the publication and got an earlier release,
     and ``is_locked_out`` that all its certificates are revoked.  ``lacks_ca`` says that it refuses
-    releases, because it does not trust the CA that seals them.  The first ``reported`` problems
+    releases, because it does not trust the CA that seals them.  ``is_doubtful`` says that what it
+    has is not known, whatever it confirmed: its last message was refused, its release was never
+    published, or two computers have its keys.  The first ``reported`` problems
     are in the words of the robot.
     """
 
@@ -279,6 +281,7 @@ class RobotStatus:
     has_release: bool = False
     short_lived: tuple[str, ...] = ()
     has_list: bool = False
+    is_doubtful: bool = False
     renew_from: datetime | None = None
     lacks_key: tuple[str, ...] = ()
     reads_copy: bool = False
@@ -476,7 +479,7 @@ class FleetStatus:
                 robot.received is None
                 or robot.restart
                 or robot.robot in self.overdue
-                or robot.state in (State.LATER, State.REFUSED)
+                or robot.is_doubtful
                 or any(file.kind in self.awaited and not file.surplus for file in robot.pending)
             )
         )
@@ -1123,7 +1126,8 @@ def _status(
     if is_later:
         state = max(state, State.LATER, key=_BADNESS.__getitem__)
     refusal = records.refusals.get(compared_robot.robot.name) if compared_robot.enclaves else None
-    if refusal and (received is None or received.time <= refusal.time):
+    is_refused = bool(refusal and (received is None or received.time <= refusal.time))
+    if refusal and is_refused:
         state = max(state, State.REFUSED, key=_BADNESS.__getitem__)
         refusal_note = f"its last message was refused since {iso(refusal.time)}: {refusal.why}"
         compared_robot = compared_robot._replace(notes=(*compared_robot.notes, refusal_note))
@@ -1147,7 +1151,7 @@ def _status(
         and not two_computers
         and bool(compared_robot.enclaves)
         and received is not None
-        and state not in (State.REFUSED, State.LATER)
+        and not (is_refused or is_later)  # whichever state is shown
         and compared_robot.has_all("identity_ca")
         and compared_robot.has_all("crl", records.is_list_equal)
     )
@@ -1182,6 +1186,7 @@ def _status(
         lacks_ca=fetches and records.lacks_ca(compared_robot, is_published=has_release),
         short_lived=records.short_lived(validity),
         has_list=has_list,
+        is_doubtful=bool(is_refused or is_later or two_computers),
         renew_from=min(
             (file.window.expires_soon_from() for file in validity.values()), default=None
         ),
