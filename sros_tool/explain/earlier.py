@@ -71,7 +71,9 @@ def note_on_revoked_enclaves(keystore: OpenedKeystore, now: datetime) -> Iterato
             and not keystore.has_enclave(entry.enclave)
         }
         issued = keystore.ledger_file.with_values("enclave", ends).entries if ends else ()
-    except SrosError:  # which the note on earlier permissions reports
+    except SrosError as error:
+        text = f"whether processes still accept revoked enclaves is not known: {error.what}."
+        yield Note("explain.revoked-enclaves", f"{text} {error.remedy}".rstrip())
         return
     permissions_until: dict[str, str] = {}
     for entry in issued:

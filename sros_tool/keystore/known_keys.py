@@ -81,7 +81,9 @@ class IssuedEarlier:
         for entry in self.ledger.entries:
             if entry.what == "permissions":
                 self._permissions[entry.enclave].append(entry)
-            elif entry.what == "certificate" and int(entry.serial, 16) not in revoked:
+            elif entry.what == "certificate" and not (
+                entry.serial and int(entry.serial, 16) in revoked
+            ):
                 expiry = self._certificates[entry.enclave]
                 last = expiry.get(entry.subject, "")
                 expiry[entry.subject] = max(last, entry.not_after)

@@ -363,7 +363,7 @@ def _make_folders(folder: Folder, path: str) -> None:
 ATTRIBUTES_FILE = ".gitattributes"
 EXPORT_IGNORE = "export-ignore"
 """The attribute by which git leaves a file or folder out of archives."""
-_CONVERTING = ("working-tree-encoding", "ident", "export-subst", EXPORT_IGNORE)
+_CONVERTING = (EXPORT_IGNORE, "working-tree-encoding", "ident", "export-subst")
 """Attributes by which git changes or drops files in a checkout or archive."""
 _MOST_PATTERNS = 100
 
@@ -378,8 +378,8 @@ def converting_patterns(content: bytes) -> dict[str, str]:
         pattern, *attributes = map(os.fsdecode, line.split() or [b""])
         named = {attribute.partition("=")[0] for attribute in attributes}
         converting = next((attribute for attribute in _CONVERTING if attribute in named), "")
-        if converting and not pattern.startswith("#"):
-            patterns[pattern] = converting
+        if converting and not pattern.startswith("#") and patterns.get(pattern) != EXPORT_IGNORE:
+            patterns[pattern] = converting  # only export-ignore counts for all files of a folder
         if len(patterns) > _MOST_PATTERNS:
             return {"*": converting}
     return patterns

@@ -555,7 +555,13 @@ def test_a_checkout_that_is_another_file_is_said(change: Change, line: bytes) ->
 
 
 @pytest.mark.parametrize(
-    "line", [b"part.xml export-ignore", b"/parts/ export-ignore", b"part* export-ignore"]
+    "line",
+    [
+        b"part.xml export-ignore",
+        b"/parts/ ident export-ignore",
+        b"part* export-ignore",
+        b"/parts/ export-ignore\n/parts/ ident",
+    ],
 )
 def test_a_part_that_is_missing_in_archives_is_said(change: Change, line: bytes) -> None:
     """The fallback of its include then takes its place, such as nothing in place of a DENY."""

@@ -165,12 +165,9 @@ def rotate_ca(
             if stage in (RotationStage.DISTRIBUTE, RotationStage.REISSUE):
                 change.notes += _no_robot_notes(change.keystore, change.names)
             change.finish()
-        elif delete_old_key and (kept := sorted((root / RETIRED).glob("*.key.pem"))):
-            raise UsageError(
-                "no stage is left to do, so no key is deleted",
-                f"Keys of replaced CAs: {first_few([str(path) for path in kept], _SHOWN)}.",
-                "Delete them yourself, or leave out --delete-old-key.",
-            )
+        elif delete_old_key:
+            kept = sorted((root / RETIRED).glob("*.key.pem"))
+            _refuse_late_deletion(root, rotation.stage, [str(path) for path in kept])
     return _step(
         change,
         stage=stage,
@@ -224,6 +221,22 @@ def _no_robot_notes(keystore: OpenedKeystore, names: Iterable[str]) -> Iterator[
             "keystore.of-no-robot",
             f"{first_few(without, _ENCLAVES_SHOWN)} {verb} to no robot, so it is unknown whether "
             "their files are at this stage: check that before the next stage.",
+        )
+
+
+def _refuse_late_deletion(root: Path, stage: RotationStage, kept: Sequence[str]) -> None:
+    """Raise `UsageError` if the keystore is at ``stage`` already, and no old key is deleted."""
+    if stage is RotationStage.DISTRIBUTE or (kept and stage is not RotationStage.NONE):
+        raise UsageError(
+            f"the keystore is already at the stage {stage}, so no key is deleted",
+            "`sros revoke` may need the key of the old identity CA until the stage retire.",
+            f"Run `sros rotate_ca {quote(str(root))} --next --delete-old-key` for that stage.",
+        )
+    if kept:
+        raise UsageError(
+            "no stage is left to do, so no key is deleted",
+            f"Keys of replaced CAs: {first_few(kept, _SHOWN)}.",
+            "Delete them yourself, or leave out --delete-old-key.",
         )
 
 
@@ -440,6 +453,7 @@ class _Rotator:
         the list is distributed, and the stage stays DISTRIBUTE: as soon as a list exists, Fast DDS
         2.9.1 refuses every enclave of a CA without a list (tested).
         """
+        self._refuse_deletion(stage)  # before a key is made on a token
         if self._rotation.stage is RotationStage.REISSUE:
             self._retire_old_cas()
             self._refuse_deletion(stage)
@@ -895,7 +909,7 @@ def _make_successor(
     place = new_keys.places.get(roles[0], "")
     elsewhere = replace(template, identity_key="", permissions_key="")
     given = new_keys.is_encrypted(change.keystore, roles[0], elsewhere) if place else None
-    if encrypted and given is None and not new_keys.encrypt:
+    if encrypted and given is None and not (new_keys.encrypt or is_token_uri(place)):
         change.keyring.open(change.keystore, roles[0], template)  # refuses a mistyped passphrase
         new_keys = replace(new_keys, encrypt=True, secrets=change.keyring.secrets)
     key = new_keys.make(transaction, at, roles[0], elsewhere, compared=True)
