@@ -991,6 +991,21 @@ def test_a_robot_whose_last_message_was_refused_is_not_current(field: Field) -> 
     assert "[keystore." not in sros("check", "ks", cwd=field.folder).out
 
 
+def test_a_refused_message_counts_also_in_a_worse_state(field: Field) -> None:
+    field.run("rotate_ca", "ks", "--next")
+    field.deliver(*ROBOTS)
+    permissions = field.folder / "r1/enclaves/r1/base/permissions.p7s"
+    permissions.write_bytes(permissions.read_bytes() + b"\n")
+    field.send("r1")
+    assert field.states()["r1"] == "unknown"
+    field.run("rotate_ca", "ks", "--next", "--dry-run")
+    file = field.folder / "inbox/r1" / MESSAGE_FILE
+    file.write_bytes(file.read_bytes()[:-1000])
+    field.run("fleet", "collect", "ks", "inbox", status=1)
+    assert field.states()["r1"] == "unknown"
+    assert ": r1. " in field.run("rotate_ca", "ks", "--next", "--dry-run", status=2).err
+
+
 def test_home_is_older_than_its_robots(field: Field) -> None:
     """By what a robot has, and by what is published next to the keystore."""
 
