@@ -21,6 +21,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.fleet import deliver_first
 from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
     IDENTITY,
     PERMISSIONS,
     PERMISSIONS_FILE,
@@ -219,16 +220,20 @@ def _count(
     """Count the enclaves of each CA, by its index in ``authorities``.
 
     An enclave belongs to the identity CA that issued its certificate, and to the permissions CA
-    that signed its permissions.
+    that signed its permissions.  A folder without a certificate belongs to none: it waits for one,
+    or is the rest of a removal that was interrupted.
     """
     counts: Counter[int] = Counter()
     for name in keystore.names:
+        folder = keystore.folder(name)
+        if not (folder / CERTIFICATE_FILE).exists():
+            continue
         try:
             if role == IDENTITY:
                 own_certificate = keystore.certificate_of(name)
                 fits = [issued_by(own_certificate, authority) for authority in authorities]
             else:
-                message = keystore.read(keystore.folder(name) / PERMISSIONS_FILE, "permissions")
+                message = keystore.read(folder / PERMISSIONS_FILE, "permissions")
                 signer = keystore.files.signed(message).signer()
                 fits = [signer == authority for authority in authorities]
         except SrosError:  # `sros inspect` reports the error
