@@ -33,6 +33,8 @@ from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from sros_tool.values import Words, shows
 
 if TYPE_CHECKING:
+    from sros_tool.dds.governance import Governance
+    from sros_tool.dds.permissions import Grant
     from sros_tool.fleet.robots import Fleet
     from sros_tool.policy.model import Enclave, Policy
     from sros_tool.policy.rights import Right
@@ -56,6 +58,24 @@ class AskingContext(NamedTuple):
         if domain is None:
             domain = domains.preferred() if domains else 0
         return JoinContext(domain, self.at, self.zone)
+
+
+def domains_decided_alike(
+    joined: DomainSet, governance: Governance | None, grant: Grant | None, domain: int | None
+) -> Sequence[DomainSet]:
+    """Divide the ROS domains that an enclave may join by the rules for them.
+
+    With ``domain``, only that domain is returned.
+    """
+    if domain is not None:
+        return (DomainSet.of((domain, domain)),)
+    sets = [joined]
+    sets += [
+        rule.domains.closed() for rule in (governance.domain_access_rules if governance else ())
+    ]
+    sets += [rule.domains.closed() for rule in (grant.rules if grant else ())]
+    parts = DomainSet.parts(sets)
+    return [part for part in parts if (part & joined).ranges]
 
 
 def fleet_of(file: Path | None, keystore: OpenedKeystore | None) -> Fleet | None:

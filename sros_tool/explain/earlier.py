@@ -1,16 +1,26 @@
-"""Whether earlier permissions of an enclave may allow what its present ones deny."""
+"""Whether earlier permissions, or revoked certificates, may allow what is denied now."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+import hashlib
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from datetime import datetime
+from pathlib import Path
 from shlex import quote
+from typing import NamedTuple
 
+from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import Note, SrosError
-from sros_tool.keystore.known_keys import IssuedEarlier
-from sros_tool.keystore.layout import LEDGER
+from sros_tool.explain.answer import Evaluator, Question, acting_parts
+from sros_tool.explain.asking import AskingContext, domains_decided_alike
+from sros_tool.keystore.known_keys import IssuedEarlier, revoked_issues
+from sros_tool.keystore.layout import LEDGER, PERMISSIONS_FILE, REVOKED, ROUTER_FILE
+from sros_tool.keystore.ledger import Entry
+from sros_tool.keystore.participant import LoadedEnclave
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.validity import iso
 from sros_tool.wording import first_few
 
@@ -51,45 +61,148 @@ def note_on_earlier_permissions(
         yield Note("explain.earlier-permissions", text)
 
 
-def note_on_revoked_enclaves(keystore: OpenedKeystore, now: datetime) -> Iterator[Note]:
-    """Yield a note on revoked enclaves, which processes without the revocation list still accept.
+def note_on_revoked_enclaves(
+    keystore: OpenedKeystore,
+    question: Question,
+    vendor: Vendor | None,
+    asking: AskingContext,
+    named: Collection[str],
+) -> Iterator[Note]:
+    """Yield notes on revoked certificates that are still accepted, and have the right.
 
-    Only enclaves count of which a certificate and permissions have not expired.  The note does not
-    say whether an enclave had the right that is asked about.
+    DDS accepts them in processes without the current revocation list; Zenoh (``vendor`` None) has
+    no revocation list.  ``named`` are the enclaves that have the right now.
     """
-    if not keystore.has(LEDGER):
-        return
+    unknown = "whether processes still accept revoked certificates is not known"
     try:
-        revocations = keystore.ledger_with("what", "revocation").entries
-        ends = {
-            entry.enclave: entry.not_after
-            for entry in sorted(revocations, key=lambda entry: entry.not_after)
-            if entry.what == "revocation"
-            and entry.reason != SUPERSEDED
-            and entry.not_after > iso(now)
-            and entry.enclave
-            and not keystore.has_enclave(entry.enclave)
-        }
-        issued = keystore.ledger_file.with_values("enclave", ends).entries if ends else ()
+        if not keystore.has(LEDGER):  # an export, or a keystore of ros2/sros2, has no list here
+            if keystore.revocation_list:
+                yield Note("explain.revoked-enclaves", f"{unknown}: {LEDGER} is missing.")
+            return
+        if gaps := keystore.ledger_with("what", "revocation").gaps:
+            yield Note("explain.revoked-enclaves", f"{unknown}: {LEDGER}: {first_few(gaps, 1)}.")
+        revoked = tuple(_revoked_with_right(keystore, question, vendor, asking))
     except SrosError as error:
-        text = f"whether processes still accept revoked enclaves is not known: {error.what}."
-        yield Note("explain.revoked-enclaves", f"{text} {error.remedy}".rstrip())
+        yield Note("explain.revoked-enclaves", f"{unknown}: {error.what}. {error.remedy}".rstrip())
         return
-    permissions_until: dict[str, str] = {}
-    for entry in issued:
-        if entry.what == "permissions" and entry.not_after > iso(now):
-            last = permissions_until.get(entry.enclave, "")
-            permissions_until[entry.enclave] = max(last, entry.not_after)
-    names = sorted(ends.keys() & permissions_until.keys())
-    if names:
-        until = max(min(ends[name], permissions_until[name]) for name in names)
+    root = quote(str(keystore.root))
+    if vendor:
+        old = "the current revocation list"
+        remedy = "the list at a restart (with a fleet, `sros fleet status "
+        remedy += f"{root}` says where it is in force)"
+    else:
+        old = "the current Zenoh files"
+        remedy = "the files at a restart: Zenoh has no revocation list"
+    for decided, has_right in (
+        (True, "have the right"),
+        (False, "may have the right, by permissions that are not here"),
+    ):
+        gone = {of.name: of.until for of in revoked if of.decided is decided}
+        if gone := {name: until for name, until in gone.items() if name not in named}:
+            text = (
+                f"revoked certificates of {first_few(sorted(gone), 3)} {has_right}. A process "
+                f"without {old} still accepts them, until {max(gone.values())}: each process has "
+                f"to load {remedy}."
+            )
+            yield Note("explain.revoked-enclaves", text)
+    again = {of.name: of.until for of in revoked if of.name in named}
+    if again and vendor is None:
         text = (
-            f"revoked enclaves do not count: {first_few(names, 3)}. A process without the current "
-            "revocation list still accepts them, with the rights that they had, until "
-            f"{until}: each process has to load the list at a restart (with a fleet, `sros fleet "
-            f"status {quote(str(keystore.root))}` says where it is in force)."
+            f"whoever kept a revoked certificate of {first_few(sorted(again), 3)} and its key may "
+            f"do it, too, until {max(again.values())}: Zenoh has no revocation list. Give the "
+            f"enclave another name, or run `sros rotate_ca {root}`."
         )
         yield Note("explain.revoked-enclaves", text)
+
+
+class _RevokedEnclave(NamedTuple):
+    """An enclave whose revoked certificate and permissions for it work ``until`` a moment.
+
+    ``decided`` is False if the keystore lacks permissions, which may give the right.
+    """
+
+    name: str
+    decided: bool
+    until: str
+
+
+def _revoked_with_right(
+    keystore: OpenedKeystore, question: Question, vendor: Vendor | None, asking: AskingContext
+) -> Iterator[_RevokedEnclave]:
+    """Yield the enclaves whose revoked certificates may have a right."""
+    permissions: defaultdict[str, list[Entry]] = defaultdict(list)
+    certificates: defaultdict[str, list[Entry]] = defaultdict(list)
+    for entry in revoked_issues(keystore):
+        if entry.what == "permissions":
+            permissions[entry.enclave].append(entry)
+        elif entry.not_after > iso(asking.at):
+            certificates[entry.enclave].append(entry)
+    for name, revoked in certificates.items():
+        folders = [keystore.root / REVOKED / entry.serial for entry in revoked]
+        documents = _documents(keystore, [*folders, keystore.folder(name)])
+        works: list[tuple[bool, str]] = []
+        for certificate, folder in zip(revoked, folders, strict=True):
+            fitting = [of for of in permissions[name] if of.subject in ("", certificate.subject)]
+            if vendor is None:  # it has the rules of the last permissions, which do not expire
+                fitting = [of._replace(not_after="") for of in permissions[name][-1:]]
+                if (folder / ROUTER_FILE).exists():  # sessions trust a router in everything
+                    works.append((True, certificate.not_after))
+            allowed = {
+                of.policy or of.sha256: _allows(
+                    keystore, documents[of.sha256], certificate, question, vendor, asking
+                )
+                for of in fitting
+                if of.sha256 in documents
+            }
+            for of in fitting:
+                until = min(certificate.not_after, of.not_after or certificate.not_after)
+                has_right = allowed.get(of.policy or of.sha256)
+                if has_right is not False and until > iso(asking.at):
+                    works.append((has_right is True, until))
+        if works:
+            decided = any(is_decided for is_decided, _ in works)
+            ends = (until for is_decided, until in works if is_decided is decided)
+            yield _RevokedEnclave(name, decided, max(ends))
+
+
+def _documents(keystore: OpenedKeystore, folders: Iterable[Path]) -> Mapping[str, bytes]:
+    """Map the SHA-256 of each ``permissions.p7s`` in the folders to its content."""
+    documents = {}
+    for folder in folders:
+        with suppress(SrosError):  # it counts as permissions that are not here
+            data = keystore.read(folder / PERMISSIONS_FILE, "permissions document")
+            documents[hashlib.sha256(data).hexdigest()] = data
+    return documents
+
+
+def _allows(
+    keystore: OpenedKeystore,
+    permissions: bytes,
+    certificate: Entry,
+    question: Question,
+    vendor: Vendor | None,
+    asking: AskingContext,
+) -> bool:
+    """Return whether signed permissions give a right, or an acting part of it, to a certificate."""
+    governance, document = keystore.governance, keystore.files.signed(permissions).document
+    grant = parse_permissions(document).grant_of(certificate.subject)
+    if vendor is None and grant:
+        asking = asking._replace(at=grant.validity.not_before)
+    enclave = LoadedEnclave(
+        certificate.enclave,
+        certificate.subject,
+        b"",
+        document,
+        keystore.domains,
+        plain_governance=governance,
+    )
+    questions = (question, *acting_parts(question).values())
+    for domains in domains_decided_alike(keystore.domains, governance, grant, asking.domain):
+        context = asking._replace(domain=next(iter(domains))).context(None)
+        evaluator = Evaluator(vendor or Vendor.STANDARD, enclave, context)
+        if any(evaluator.answer(asked).allowed for asked in questions):
+            return True
+    return False
 
 
 def _unknown(reason: str) -> Note:

@@ -27,6 +27,7 @@ from sros_tool.explain.asking import (
     AskedEnclave,
     AskingContext,
     ZenohInBrief,
+    domains_decided_alike,
     note_on_action,
     note_on_lacking_keys,
     planned_enclave,
@@ -519,22 +520,6 @@ class WhoByVendor(NamedTuple):
         return self.vendor.documented_only
 
 
-def _parts(enclave: LoadedEnclave, domain: int | None) -> Sequence[DomainSet]:
-    """Divide the ROS domains that an enclave may join by the rules for them.
-
-    With ``domain``, only that domain is returned.
-    """
-    if domain is not None:
-        return (DomainSet.of((domain, domain)),)
-    joined = enclave.joined_domains or DomainSet.of((0, 0))
-    state = enclave.state
-    governed = state.governance.domain_access_rules if state and state.governance else ()
-    granted = state.grant.rules if state and state.grant else ()
-    sets = [rule.domains.closed() for rule in governed]
-    sets += [rule.domains.closed() for rule in granted]
-    return [part for part in DomainSet.parts((joined, *sets)) if (part & joined).ranges]
-
-
 def _title(vendor: Vendor, why: str) -> str:
     documented = ", as documented" if vendor.documented_only else ""
     return f"{vendor.title} ({why}{documented})"
@@ -627,7 +612,7 @@ class VendorOfPolicy(NamedTuple):
         """Return the outcomes in the form that ``--json`` prints."""
         return WhoByVendor(str(question), self.vendor, self.why, self.asking.domain, outcomes)
 
-    def notes(self, outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
+    def notes(self, _: Question, outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
         """Yield a note if processes without an identity have the right, too."""
         opened = (outcome.opened for outcome in outcomes)
         return _note_on_anybody(opened, f"Change the template, or run {REFUSE_STRANGERS}.")
@@ -681,7 +666,9 @@ class VendorOfKeystore(NamedTuple):
                 return _outcome(Evaluator(vendor, enclave, context), name, question)
 
             vendor = self.stated(name) or self.vendor
-            parts = _parts(enclave, self.asking.domain)
+            state, joined = enclave.state, enclave.joined_domains or DomainSet.of((0, 0))
+            governance, grant = (state.governance, state.grant) if state else (None, None)
+            parts = domains_decided_alike(joined, governance, grant, self.asking.domain)
             decisions = {domains: decided(next(iter(domains))) for domains in parts}
             decision, domains, in_part = first_allowing_domain(decisions)
             opened = OpenedParts.joined(outcome.opened for outcome in decisions.values())
@@ -720,8 +707,8 @@ class VendorOfKeystore(NamedTuple):
             not is_original_keystore(self.keystore.root),
         )
 
-    def notes(self, outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
-        """Yield notes on an export, which may lack enclaves, and on a copy without keys."""
+    def notes(self, question: Question, outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
+        """Yield notes on an export, which may lack enclaves, and on whoever else may do it."""
         # As in `outcomes`.
         from sros_tool.explain.earlier import note_on_earlier_permissions, note_on_revoked_enclaves
         from sros_tool.explain.who import note_on_export
@@ -732,6 +719,9 @@ class VendorOfKeystore(NamedTuple):
         denied = {outcome.enclave for outcome in outcomes if not outcome.allowed}
         yield from note_on_earlier_permissions(self.keystore, denied, self.asking.at)
         if self.names is None:
-            yield from note_on_revoked_enclaves(self.keystore, self.asking.at)
+            allowed = {outcome.enclave for outcome in outcomes if outcome.allowed}
+            yield from note_on_revoked_enclaves(
+                self.keystore, question, self.vendor, self.asking, allowed
+            )
         if not all(outcome.stopped for outcome in outcomes):
             yield from note_on_lacking_keys(self.keystore)

@@ -100,7 +100,7 @@ class Decider(Protocol):
     def printed(self, question: Question, outcomes: Sequence[Any], /) -> NamedTuple:
         """Return the outcomes in the form that ``--json`` prints."""
 
-    def notes(self, outcomes: Sequence[Any]) -> Iterator[Note]:
+    def notes(self, question: Question, outcomes: Sequence[Any], /) -> Iterator[Note]:
         """Yield notes on the outcomes."""
 
 
@@ -145,7 +145,7 @@ def answer_for_all(decider: Decider, question: Question, kind: str | None) -> An
         if action := about_action(question, rights):
             taken = taken_for_action(question, action)
             question, outcomes = action, decider.outcomes(action)
-    return AnswerForAll(question, outcomes, (*taken, *decider.notes(outcomes)))
+    return AnswerForAll(question, outcomes, (*taken, *decider.notes(question, outcomes)))
 
 
 def callable_action(decider: Decider, question: Question) -> Note | None:

@@ -917,7 +917,8 @@ class ZenohOfKeystore:
     ) -> None:
         self._keystore = keystore
         self._reason_text = why
-        self._domain = asking.domain
+        self._asking, self._domain = asking, asking.domain
+        self._asks_all = names is None
         domains = _domains(keystore, asking.at)
         first = asking.context(domains).domain
         evaluator = ZenohEvaluator(keystore, moment=asking.at, domain=first)
@@ -974,9 +975,10 @@ class ZenohOfKeystore:
         is_export = not is_original_keystore(self._keystore.root)
         return WhoOnZenoh(str(question), "zenoh", self._reason_text, self._domain, shown, is_export)
 
-    def notes(self, outcomes: Sequence[ZenohAnswer]) -> Iterator[Note]:
-        """Yield notes on an export, the router's file and key, and peers that it decided for."""
-        from sros_tool.explain.who import note_on_export  # as in `outcomes`
+    def notes(self, question: Question, outcomes: Sequence[ZenohAnswer]) -> Iterator[Note]:
+        """Yield notes on an export, files, the router's key, and whoever else may do it."""
+        from sros_tool.explain.earlier import note_on_revoked_enclaves  # as in `outcomes`
+        from sros_tool.explain.who import note_on_export
 
         yield from note_on_export(self._keystore.root)
         yield from note_on_lacking_keys(self._keystore)
@@ -990,6 +992,11 @@ class ZenohOfKeystore:
                 "enclave also reads the files at the other end."
             )
             yield Note("explain.zenoh-by-router", text)
+        if self._asks_all:
+            allowed = {outcome.enclave for outcome in outcomes if outcome.allowed}
+            yield from note_on_revoked_enclaves(
+                self._keystore, question, None, self._asking, allowed
+            )
 
 
 # ── one question ───────────────────────────────────────────────────────────────────────────

@@ -56,15 +56,46 @@ def revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
 
 def restored_at(keystore: OpenedKeystore) -> str:
     """Return when a keystore was restored with an identity CA that it trusts; "" if never."""
+    entries = _entries_of_trusted(keystore)
+    return next((entry.time for entry in entries if entry.what == RESTORED), "")
+
+
+def _trusted_since(keystore: OpenedKeystore) -> str:
+    """Return when the first identity CA that a keystore trusts was recorded, or later."""
+    return min((entry.time for entry in _entries_of_trusted(keystore)), default="")
+
+
+def _entries_of_trusted(keystore: OpenedKeystore) -> Iterator[Entry]:
+    """Yield entries of CAs and of restores, the last first, from when a trusted CA was recorded."""
     file = keystore.identity_file
     trusted = {digest(ca) for ca in (keystore.certificates_of(file) if file else ())}
     ledger = keystore.ledger_file.with_values("what", (RESTORED, "ca"))
     for entry in reversed(ledger.entries):
-        if entry.what == RESTORED and trusted:
-            return entry.time
+        if not trusted:
+            return
         if entry.what == "ca" and entry.reason != SAME_KEY:
             trusted.discard(entry.sha256)
-    return ""
+        if entry.what in (RESTORED, "ca"):
+            yield entry
+
+
+def revoked_issues(keystore: OpenedKeystore) -> Iterator[Entry]:
+    """Yield what was issued to enclaves with revoked certificates of CAs that are trusted now.
+
+    Each such certificate is yielded once, by the entry that records it, else by its revocation; and
+    all permissions of its enclave.
+    """
+    serials = {f"{serial:x}" for serial in revoked_serials(keystore)}
+    recorded = keystore.ledger_file.with_values("serial", serials).entries if serials else ()
+    names = {entry.enclave for entry in recorded if entry.serial in serials} - {""}
+    since = _trusted_since(keystore) if names else ""
+    for entry in keystore.ledger_file.with_values("enclave", names).entries if names else ():
+        if entry.enclave in names and entry.what == "permissions":
+            yield entry
+        elif entry.enclave in names and entry.serial in serials:
+            serials.remove(entry.serial)
+            if entry.what == "revocation" or entry.time >= since:
+                yield entry
 
 
 class IssuedEarlier:

@@ -760,16 +760,56 @@ def test_who(keystore: Path) -> None:
     }
 
 
+def revoked_notes(*words: str | Path) -> str:
+    """Return the notes on revoked enclaves that ``explain`` prints."""
+    lines = explain(*words).err.splitlines()
+    return "\n".join(line for line in lines if "explain.revoked-enclaves" in line)
+
+
 def test_a_revoked_enclave_that_processes_without_the_list_still_accept(keystore: Path) -> None:
-    asked = ("--who", "publish", "/chatter")
-    assert "revoked" not in explain(keystore, *asked).err
+    asked = (keystore, "--who", "publish", "/chatter")
+    assert not revoked_notes(*asked)
     sros("revoke", keystore, ENCLAVE).ok()
-    found = explain(keystore, *asked)
-    assert found.out == "0 of 1 enclave may publish topic /chatter\n"
-    note = f"note [explain.revoked-enclaves]: revoked enclaves do not count: {ENCLAVE}. A process "
-    assert note in found.err
-    later = explain(keystore, *asked, "--at", "2090-01-01").err
-    assert "explain.revoked-enclaves" not in later
+    assert explain(*asked).out == "0 of 1 enclave may publish topic /chatter\n"
+    note = f"revoked certificates of {ENCLAVE} have the right. A process without the current rev"
+    assert note in revoked_notes(*asked)
+    assert not revoked_notes(*asked, "--at", "2090-01-01")
+    # What its permissions deny is not said of it, and what they lack is not known.
+    assert not revoked_notes(keystore, "--who", "publish", "/nothing")
+    (permissions,) = (keystore / "revoked").glob("*/permissions.p7s")
+    kept = permissions.read_bytes()
+    permissions.write_bytes(kept + b"changed")
+    other = (keystore, "--who", "publish", "/nothing")
+    assert "may have the right, by permissions that are not here" in revoked_notes(*other)
+    permissions.write_bytes(kept)
+    (keystore / "ledger.jsonl").rename(keystore / "kept")
+    assert "is not known: ledger.jsonl is missing" in revoked_notes(*other)
+
+
+def test_a_revoked_enclave_with_earlier_permissions(keystore: Path, tmp_path: Path) -> None:
+    policy = tmp_path / "robot.xml"
+    policy.write_text(policy_text({ENCLAVE: publish("/other")}))
+    sros("create_permission", keystore, ENCLAVE, policy).ok()
+    sros("revoke", keystore, ENCLAVE).ok()
+    asked = (keystore, "--who", "publish")
+    assert f"certificates of {ENCLAVE} may have the right" in revoked_notes(*asked, "/chatter")
+    assert f"certificates of {ENCLAVE} have the right" in revoked_notes(*asked, "/other")
+
+
+def test_a_revoked_certificate_on_zenoh(keystore: Path) -> None:
+    asked = (keystore, "--who", "publish", "/chatter", "--vendor", "zenoh")
+    sros("zenoh", keystore).ok()
+    assert not revoked_notes(*asked)
+    sros("revoke", keystore, ENCLAVE).ok()
+    note = f"revoked certificates of {ENCLAVE} have the right. A process without the current Zenoh"
+    assert note in revoked_notes(*asked)
+    assert not revoked_notes(keystore, "--who", "publish", "/nothing", "--vendor", "zenoh")
+    sros("generate_artifacts", "-k", keystore, "-e", ENCLAVE, "-p", POLICY).ok()
+    again = f"whoever kept a revoked certificate of {ENCLAVE} and its key may do it, too"
+    assert again in revoked_notes(*asked)
+    assert not revoked_notes(keystore, "--who", "publish", "/chatter")
+    sros("rotate_ca", keystore, "--finish").ok()
+    assert not revoked_notes(*asked)
 
 
 def test_earlier_permissions_that_still_allow_it(keystore: Path, tmp_path: Path) -> None:
