@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import shutil
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -30,6 +32,8 @@ from sros_tool.xml import read_bytes
 
 ROUTER = "/router"
 """The enclave of a Zenoh router."""
+DEMO_ROUTER = ("sros", "demo", "router")
+"""What starts the Zenoh router of the demo."""
 COMPOSE_FILE = "compose.yaml"
 
 
@@ -75,7 +79,7 @@ class ClosedProcess(NamedTuple):
         """Return a running process with its enclave and what started it."""
         pid, command = process.program
         if process.is_demo_router:  # what it was started with fits this one start
-            command = ("sros", "demo", "router")
+            command = DEMO_ROUTER
         start = enclave, pid, command, origin.folder, process.user, origin.unit
         rmw = _rmw_to_start(process)
         chooses = process.environment.get(ENCLAVE) == enclave
@@ -85,6 +89,11 @@ class ClosedProcess(NamedTuple):
     def is_router(self) -> bool:
         """Whether the process is a Zenoh router, which has no node."""
         return self.rmw == RMW_ZENOH and self.enclave == ROUTER
+
+    @property
+    def is_demo_router(self) -> bool:
+        """Whether `sros demo router` starts the process."""
+        return tuple(self.command) == DEMO_ROUTER
 
     @property
     def pids_text(self) -> str:
@@ -164,7 +173,7 @@ class ClosedProcess(NamedTuple):
         if self.container:
             overlay = shlex.quote(str(folder / "start" / COMPOSE_FILE))
             return f"docker compose -f compose.yaml -f {overlay} up -d"
-        words = self.command
+        words = (_sros_word(), *self.command[1:]) if self.is_demo_router else self.command
         if self.launch:
             after = launch_verb(self.launch) + 1
             words = launch_words(folder, self.launch[:after], self.launch[after:])
@@ -198,9 +207,17 @@ def command_without_enclave(command: Sequence[str], enclave: str) -> Sequence[st
     return words[:-3] if words[-3:] == (ROS_ARGS, "--enclave", enclave) else words
 
 
+def _sros_word() -> str:
+    """Return the word that starts the running sros in a shell: its path if `sros` does not."""
+    running, found = shutil.which(sys.argv[0]), shutil.which("sros")
+    if not running or Path(running).name != "sros" or (found and Path(found).samefile(running)):
+        return "sros"
+    return str(Path(running).absolute())
+
+
 def run_words(export: Path, enclave: str, rmw: str) -> Sequence[str]:
     """Return the words before a command that start it in an enclave; ``rmw`` is "" on DDS."""
-    return ("sros", "run", str(export), enclave, *(("--rmw", rmw) if rmw else ()), "--")
+    return (_sros_word(), "run", str(export), enclave, *(("--rmw", rmw) if rmw else ()), "--")
 
 
 def launch_words(folder: Path, before: Sequence[str], after: Sequence[str]) -> Sequence[str]:

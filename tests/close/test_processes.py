@@ -8,8 +8,10 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+import pytest
+
 from sros_tool.close.assignment import assign
-from sros_tool.close.processes import ClosedProcess, ObservedProcesses
+from sros_tool.close.processes import ClosedProcess, ObservedProcesses, run_words
 from sros_tool.policy.model import Policy
 from sros_tool.runtime.environment import RMW_ZENOH
 from sros_tool.runtime.processes import (
@@ -95,6 +97,23 @@ def test_commands_name_the_rmw_and_on_zenoh_the_enclave() -> None:
     assert talker.open_command(7) == in_domain
     observed = ObservedProcesses(7, [talker])
     assert observed.command_of_new(Path("export"), "/horn") == f"{run.format('/horn')} COMMAND"
+
+
+def test_commands_name_the_path_of_sros_where_a_shell_does_not_find_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after a start by `venv/bin/sros`; a link on the path to the same program is enough."""
+    program = tmp_path / "venv" / "sros"
+    program.parent.mkdir()
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr("sys.argv", [str(program)])
+    assert list(run_words(Path("export"), "/talker", ""))[:2] == [str(program), "run"]
+    router = ClosedProcess("/router", 7, ("sros", "demo", "router"), "/opt", 0, "", "program")
+    assert router.secured_command(Path()).endswith(f" -- {program} demo router")
+    (tmp_path / "sros").symlink_to(program)
+    assert list(run_words(Path("export"), "/talker", ""))[:2] == ["sros", "run"]
 
 
 def test_a_router_has_no_node_and_is_no_unknown_process() -> None:
