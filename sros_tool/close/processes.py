@@ -32,7 +32,7 @@ from sros_tool.xml import read_bytes
 
 ROUTER = "/router"
 """The enclave of a Zenoh router."""
-DEMO_ROUTER = ("sros", "demo", "router")
+_DEMO_ROUTER = ("sros", "demo", "router")
 """What starts the Zenoh router of the demo."""
 COMPOSE_FILE = "compose.yaml"
 
@@ -79,7 +79,7 @@ class ClosedProcess(NamedTuple):
         """Return a running process with its enclave and what started it."""
         pid, command = process.program
         if process.is_demo_router:  # what it was started with fits this one start
-            command = DEMO_ROUTER
+            command = _DEMO_ROUTER
         start = enclave, pid, command, origin.folder, process.user, origin.unit
         rmw = _rmw_to_start(process)
         chooses = process.environment.get(ENCLAVE) == enclave
@@ -93,7 +93,7 @@ class ClosedProcess(NamedTuple):
     @property
     def is_demo_router(self) -> bool:
         """Whether `sros demo router` starts the process."""
-        return tuple(self.command) == DEMO_ROUTER
+        return tuple(self.command) == _DEMO_ROUTER
 
     @property
     def pids_text(self) -> str:
