@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from sros_tool.dds.domains import MAX_DOMAIN
 from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.files import parse_toml, templates_dir, toml_error
+from sros_tool.keystore.layout import IDENTITY
 from sros_tool.names import (
     DISTRIBUTIONS,
     check_enclave_name,
@@ -80,6 +81,10 @@ class Template:
     short_lived: tuple[ShortLived, ...] = ()
     zenoh: ZenohNetwork | None = None
     distributions: tuple[str, ...] = ()
+
+    def key_place(self, role: str) -> str:
+        """Return the URI of the key of the identity or permissions CA; "" in the keystore."""
+        return self.identity_key if role == IDENTITY else self.permissions_key
 
     @property
     def renewal_limit(self) -> timedelta:

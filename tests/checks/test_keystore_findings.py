@@ -19,9 +19,9 @@ from sros_tool.keystore.lifecycle.create import create_keystore
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import pem
-from sros_tool.pki.keys import load_key
+from sros_tool.pki.keys import key_pem, load_key
 from sros_tool.policy.document import read_policy
-from tests.checks.bench import SECRET, Bench
+from tests.checks.bench import SECRET, Bench, new_key
 from tests.checks.keystore_cases import CASES, STRANGER, give_away
 from tests.support.harness import copy_of, sros
 from tests.support.long_form import some
@@ -163,8 +163,9 @@ def test_a_ca_key_elsewhere_that_others_can_read(mode: int, found: bool, tmp_pat
     create_keystore(root, template=template, now=NOW, keyring=Keyring(places=places))
     (tmp_path / "permissions.pem").chmod(mode)
     shown = {(each.id, each.file) for each in keystore_findings(OpenedKeystore(root), now=NOW)}
-    wanted = {("keystore.key-readable", str(tmp_path / "permissions.pem"))}
-    assert shown == (wanted if found else set())
+    wanted = {("keystore.key-readable", str(tmp_path / "permissions.pem"))} if found else set()
+    plain = {("keystore.ca-key-plain", place.removeprefix("file:")) for place in places.values()}
+    assert shown == wanted | plain
 
 
 @pytest.mark.parametrize(("mode", "noted"), [(0o755, False), (0o1777, False), (0o777, True)])
@@ -217,19 +218,40 @@ def _present(text: str, changes: tuple[tuple[str, str], ...]) -> str:
     return text
 
 
+def moved_out(bench: Bench, key: Path) -> Path:
+    """Move the key of the identity CA out of the keystore, whose settings name it."""
+    bench.path("private/identity_ca.key.pem").rename(key)
+    settings, names = bench.path("sros.toml"), f'[authorities]\nidentity_key = "file:{key}"'
+    settings.write_text(settings.read_text().replace("[authorities]", names))
+    return key
+
+
+def test_a_ca_key_outside_of_the_keystore_is_checked(bench: Bench, tmp_path: Path) -> None:
+    plain, mismatch = "keystore.ca-key-plain", "keystore.ca-key-mismatch"
+    pem = key_pem(bench.key("identity"))
+    key = moved_out(bench, tmp_path / "key.pem")
+    assert not {plain, mismatch} & ids(bench)
+    key.write_bytes(pem)
+    assert plain in ids(bench)
+    key.write_bytes(key_pem(new_key()))
+    assert mismatch in ids(bench)
+    key.unlink()  # kept offline
+    assert not {plain, mismatch, "keystore.file-unreadable"} & ids(bench)
+    # A copy that was left in the keystore can be taken with it; another key cannot do anything.
+    copy = bench.path("private/identity_ca.key.pem")
+    copy.write_bytes(pem)
+    assert plain in ids(bench)
+    copy.write_bytes(key_pem(new_key()))
+    assert not {plain, mismatch} & ids(bench)
+
+
 @pytest.mark.parametrize("elsewhere", [False, True])
 def test_the_remedy_for_few_rounds_runs(elsewhere: bool, bench: Bench, tmp_path: Path) -> None:
     kind = "keystore.ca-key-few-rounds"
     CASES[kind](bench)
     key = bench.path("private/identity_ca.key.pem")
     if elsewhere:
-        key = key.rename(tmp_path / "the key.pem")
-        settings = bench.path("sros.toml")
-        settings.write_text(
-            settings.read_text().replace(
-                "[authorities]", f'[authorities]\nidentity_key = "file:{key}"'
-            )
-        )
+        key = moved_out(bench, tmp_path / "the key.pem")
     (found,) = (
         each
         for each in keystore_findings(OpenedKeystore(bench.root), now=bench.now)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
-from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
 from shlex import quote
@@ -216,10 +216,11 @@ CA_MISMATCH = FindingKind(
 CA_KEY_PLAIN = FindingKind(
     "keystore.ca-key-plain",
     NOTE,
-    "a CA key is in the keystore without a passphrase",
-    "Anyone who copies the folder can create any enclave, with any rights.",
+    "a CA key without a passphrase",
+    "Anyone who copies the file can create any enclave, with any rights.",
     "ros2/sros2 issue 282; NIST SP 800-57 part 1, 6 (protection of keys).",
-    "Create keystores with --encrypt-ca-keys or with keys on a token, or keep private/ offline.",
+    "Create keystores with --encrypt-ca-keys or with keys on a token, or keep the key offline. To "
+    "encrypt it, run `openssl pkcs8 -topk8 -scrypt -in KEY -out KEY.new && mv KEY.new KEY`.",
 )
 CA_KEY_FEW_ROUNDS = FindingKind(
     "keystore.ca-key-few-rounds",
@@ -449,43 +450,36 @@ def _authority(
 def _ca_key_findings(
     keystore: CheckedKeystore, role: str, certificate: x509.Certificate
 ) -> Iterator[Finding]:
-    path = keystore.root / ca_key(role)
-    if not path.exists():
-        yield from _external_key_findings(keystore, role)
-        return
-    try:
-        pem = keystore.opened.read(path, "key")
-        key = load_key(pem, f"'{path}'", _locked)
-    except _LockedError:
-        yield from _weak_derivation_findings(role, path, pem)
-        return
-    except SrosError as error:
-        yield UNREADABLE.found(f"{role} CA key", f"{error.what}. {error.why}", str(path))
-        return
-    yield CA_KEY_PLAIN.found(f"{role} CA key", "it has no passphrase", str(path))
-    if not same_key(certificate, key):
-        text = f"'{path.name}' is not the key of '{ca_certificate(role)}'"
-        yield CA_MISMATCH.found(f"{role} CA", text, str(path))
-
-
-def _external_key_findings(keystore: CheckedKeystore, role: str) -> Iterator[Finding]:
-    settings = keystore.settings
-    place = (
-        {IDENTITY: settings.identity_key}.get(role, settings.permissions_key) if settings else ""
-    )
-    if place and not is_token_uri(place) and not is_ca_service(place):
-        path = key_path(keystore.root, place)
-        with suppress(OSError):  # it may be on a medium that is not there now
+    """Yield findings about the key that signs as a CA, and about a copy of it in the keystore."""
+    inside, subject = keystore.root / ca_key(role), f"{role} CA key"
+    place = (keystore.settings.key_place(role) if keystore.settings else "") or ca_key(role)
+    is_file = not (is_token_uri(place) or is_ca_service(place))
+    signing = key_path(keystore.root, place) if is_file else inside
+    for path in dict.fromkeys((inside, signing)):
+        if not os.access(path, os.R_OK if path != inside else os.F_OK):
+            continue  # on a medium that is not there now, or for another user only
+        if path != inside:
             yield from key_mode_findings(str(path), path.stat().st_mode)
-        with suppress(SrosError):
-            yield from _weak_derivation_findings(role, path, keystore.opened.read(path, "key"))
+        try:
+            pem = keystore.opened.read(path, "key")
+            key = load_key(pem, f"'{path}'", _locked)
+        except _LockedError:
+            yield from _weak_derivation_findings(subject, path, pem)
+        except SrosError as error:
+            yield UNREADABLE.found(subject, f"{error.what}. {error.why}", str(path))
+        else:
+            if same_key(certificate, key):
+                yield CA_KEY_PLAIN.found(subject, "it has no passphrase", str(path))
+            elif path == signing and is_file:
+                text = f"'{path.name}' is not the key of '{ca_certificate(role)}'"
+                yield CA_MISMATCH.found(f"{role} CA", text, str(path))
 
 
-def _weak_derivation_findings(role: str, path: Path, pem: bytes) -> Iterator[Finding]:
+def _weak_derivation_findings(subject: str, path: Path, pem: bytes) -> Iterator[Finding]:
     if text := few_rounds(pem):
         old, new = quote(str(path)), quote(f"{path}.new")
         remedy = f"Run `openssl pkcs8 -topk8 -scrypt -in {old} -out {new} && mv {new} {old}`."
-        yield CA_KEY_FEW_ROUNDS.found(f"{role} CA key", text, str(path), remedy=remedy)
+        yield CA_KEY_FEW_ROUNDS.found(subject, text, str(path), remedy=remedy)
 
 
 class _LockedError(Exception):

@@ -75,8 +75,7 @@ class Keyring:
 
     def place(self, role: str, template: Template) -> str:
         """Return the URI of a CA's key, or its path relative to the keystore."""
-        role_key = {IDENTITY: template.identity_key}.get(role, template.permissions_key)
-        return self.places.get(role) or role_key or ca_key(role)
+        return self.places.get(role) or template.key_place(role) or ca_key(role)
 
     def ca_service(self, root: Path, role: str, template: Template) -> CaService | None:
         """Return the CA service that signs as the ``role`` CA; None if the CA has a key for sros.
@@ -154,9 +153,7 @@ class Keyring:
                 ``compared`` with a certificate that the user chose: whoever wrote the template
                 could make another CA of the user sign for the new keystore.
         """
-        place = self.places.get(role) or (
-            template.identity_key if role == IDENTITY else template.permissions_key
-        )
+        place = self.places.get(role) or template.key_place(role)
         _refuse_ca_service(role, place)
         if is_token_uri(place):
             parse_token_uri(place)
