@@ -41,10 +41,11 @@ def note_on_earlier_permissions(
     try:
         issued = IssuedEarlier(keystore, denied)
     except SrosError as error:
-        yield _unknown(error.what)
+        yield _unknown(keystore, "explain.earlier-permissions", error.what, error.remedy)
         return
-    if issued.ledger.gaps:
-        yield _unknown(f"{LEDGER}: {first_few(issued.ledger.gaps, 1)}")
+    if gaps := issued.ledger.gaps:
+        reason = f"{LEDGER}: {first_few(gaps, 1)}"
+        yield _unknown(keystore, "explain.earlier-permissions", reason)
     for name in denied:
         permissions = issued.permissions(name)
         for earlier, end in permissions:
@@ -73,17 +74,17 @@ def note_on_revoked_enclaves(
     DDS accepts them in processes without the current revocation list; Zenoh (``vendor`` None) has
     no revocation list.  ``named`` are the enclaves that have the right now.
     """
-    unknown = "whether processes still accept revoked certificates is not known"
+    kind = "explain.revoked-enclaves"
     try:
         if not keystore.has(LEDGER):  # an export, or a keystore of ros2/sros2, has no list here
             if keystore.revocation_list:
-                yield Note("explain.revoked-enclaves", f"{unknown}: {LEDGER} is missing.")
+                yield _unknown(keystore, kind, f"{LEDGER} is missing")
             return
         if gaps := keystore.ledger_with("what", "revocation").gaps:
-            yield Note("explain.revoked-enclaves", f"{unknown}: {LEDGER}: {first_few(gaps, 1)}.")
+            yield _unknown(keystore, kind, f"{LEDGER}: {first_few(gaps, 1)}")
         revoked = tuple(_revoked_with_right(keystore, question, vendor, asking))
     except SrosError as error:
-        yield Note("explain.revoked-enclaves", f"{unknown}: {error.what}. {error.remedy}".rstrip())
+        yield _unknown(keystore, kind, error.what, error.remedy)
         return
     root = quote(str(keystore.root))
     if vendor:
@@ -104,7 +105,7 @@ def note_on_revoked_enclaves(
                 f"without {old} still accepts them, until {max(gone.values())}: each process has "
                 f"to load {remedy}."
             )
-            yield Note("explain.revoked-enclaves", text)
+            yield Note(kind, text)
     again = {of.name: of.until for of in revoked if of.name in named}
     if again and vendor is None:
         text = (
@@ -112,7 +113,7 @@ def note_on_revoked_enclaves(
             f"do it, too, until {max(again.values())}: Zenoh has no revocation list. Give the "
             f"enclave another name, or run `sros rotate_ca {root}`."
         )
-        yield Note("explain.revoked-enclaves", text)
+        yield Note(kind, text)
 
 
 class _RevokedEnclave(NamedTuple):
@@ -205,6 +206,13 @@ def _allows(
     return False
 
 
-def _unknown(reason: str) -> Note:
-    text = f"whether earlier permissions may still allow it is not known: {reason}."
-    return Note("explain.earlier-permissions", text)
+_UNKNOWN = {
+    "explain.earlier-permissions": "whether earlier permissions may still allow it",
+    "explain.revoked-enclaves": "whether processes still accept revoked certificates",
+}
+
+
+def _unknown(keystore: OpenedKeystore, kind: str, reason: str, remedy: str = "") -> Note:
+    """Return a note of a kind that says why the answer is not known, and what to do."""
+    remedy = remedy or f"`sros check {quote(str(keystore.root))}` says what to do."
+    return Note(kind, f"{_UNKNOWN[kind]} is not known: {reason}. {remedy}")

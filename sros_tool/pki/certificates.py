@@ -551,9 +551,21 @@ def authority_text(certificate: x509.Certificate) -> str:
 
 
 def other_issuer_text(certificate: x509.Certificate, authority: x509.Certificate) -> str:
-    """Return a certificate's issuer, as "another CA named X" if ``authority`` has that name."""
+    """Return the issuer of a certificate that ``authority`` did not issue.
+
+    If both have the same name, the text has their key identifiers, by which they differ.
+    """
     name = subject_text(certificate.issuer)
-    return f"another CA named {name}" if certificate.issuer == authority.subject else name
+    if certificate.issuer != authority.subject:
+        return name
+    issuer = extension(certificate, x509.AuthorityKeyIdentifier)
+    own = extension(authority, x509.SubjectKeyIdentifier)
+    if issuer is None or issuer.key_identifier is None:
+        return f"another CA named {name} (the certificate does not name the CA's key)"
+    named, here = issuer.key_identifier.hex(), own.digest.hex() if own else "missing"
+    if named == here:
+        return f"a CA named {name} by its key identifier, but signature or serial number differ"
+    return f"another CA named {name} (key identifier {named}, here {here})"
 
 
 def subject_text(name: x509.Name) -> str:

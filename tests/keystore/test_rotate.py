@@ -316,7 +316,7 @@ def test_keys_in_files_elsewhere(tmp_path: Path) -> None:
     assert snapshot(tmp_path) == before
     rotate_ca(root, now=NOW, new_keys=places("new"))
     check(root)
-    for says in ("needs it until the stage retire", "nothing needs it any more"):
+    for says in ("needs it until the stage retire", "nothing needs it any more: delete it"):
         refused(lambda: rotate_ca(root, now=NOW, delete_old_key=True), root, "outside of the key")
         step = rotate_ca(root, now=NOW)
         assert step.kept_elsewhere == tuple(places("old").places.values())
@@ -329,6 +329,26 @@ def test_keys_in_files_elsewhere(tmp_path: Path) -> None:
     check(root)
     assert not list(root.glob("private/*.pem"))
     assert not list(root.glob("retired/*.key.pem"))
+
+
+def test_the_note_on_a_lost_old_key_names_where_it_belongs(separate: Path) -> None:
+    key = separate / "private/identity_ca.key.pem"
+    kept = key.rename(separate.parent / "kept.pem")
+    refused(lambda: rotate_ca(separate, now=NOW), separate, f"It is not at '{key}'")
+    kept.rename(key)
+    rotate_ca(separate, now=NOW)
+    key.rename(kept)
+    step = rotate_ca(separate, now=NOW)
+    assert not step.kept_elsewhere
+    (note,) = (note.text for note in step.notes if "the old key of the identity CA" in note.text)
+    assert "is missing; until the stage retire, `sros revoke` needs it as" in note
+    place = Path(note.split("'")[1])
+    assert not place.exists()
+    refused(lambda: revoke(separate, [NAMES[0]], now=NOW), separate, place.name)
+    kept.rename(place)
+    revoke(separate, [NAMES[0]], now=NOW)
+    notes = str(rotate_ca(separate, now=NOW, delete_old_key=True).notes)
+    assert "deletes the old key of the identity CA" in notes and not place.exists()
 
 
 def test_from_the_keystore_to_elsewhere(tmp_path: Path) -> None:

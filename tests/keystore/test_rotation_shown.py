@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from cryptography import x509
 
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.describe import HistoryStatus, history
@@ -17,7 +18,17 @@ from sros_tool.keystore.lifecycle.rotate import renew_identity_ca, rotate_ca
 from sros_tool.keystore.lifecycle.rotation import RotationStage
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
-from sros_tool.pki.certificates import common_name_of, digest
+from sros_tool.pki.certificates import (
+    Issuer,
+    common_name,
+    common_name_of,
+    digest,
+    extension,
+    issue_ca,
+    other_issuer_text,
+)
+from sros_tool.pki.keys import generate_key
+from sros_tool.validity import window
 from tests.support.harness import sros
 
 NOW = datetime.now(UTC)
@@ -128,6 +139,22 @@ def test_a_certificate_of_the_other_ca_is_said_to_be_of_another_one(kept: str, r
     if kept == "cert.pem":
         refused = sros("renew", root, "/a").err
         assert ("another CA named CN=" in refused) is same, refused
+
+
+def test_two_cas_of_one_name_differ_by_their_key_identifiers() -> None:
+    keys, name, moment = (
+        [generate_key() for _ in range(2)],
+        common_name("ca"),
+        window(NOW, timedelta(days=1)),
+    )
+    one, other = (issue_ca(key, name, moment) for key in keys)
+    issued = Issuer(one, keys[0]).issue(common_name("/a"), keys[1].public_key(), moment)
+    text = other_issuer_text(issued, other)
+    for authority in (one, other):
+        identifier = extension(authority, x509.SubjectKeyIdentifier)
+        assert identifier and identifier.digest.hex() in text
+    assert "signature or serial number differ" in other_issuer_text(issued, one)  # a changed one
+    assert other_issuer_text(other, issue_ca(keys[0], common_name("b"), moment)) == "CN=ca"
 
 
 @pytest.mark.parametrize("target", [".", "..", "../..", "../private", "/", "gone.cert.pem"])

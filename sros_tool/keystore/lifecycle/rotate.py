@@ -494,25 +494,41 @@ class _Rotator:
             )
 
     def _note_old_key(
-        self, roles: Sequence[str], place: str, stage: RotationStage, *, outside: bool = False
+        self,
+        roles: Sequence[str],
+        old: x509.Certificate,
+        stage: RotationStage,
+        *,
+        is_here: bool,
+        elsewhere: str,
     ) -> None:
-        """Add a note on where the old key of a CA is after ``stage``, and until when to keep it."""
+        """Add a note on where the old key of a CA is after ``stage``, and until when to keep it.
+
+        ``is_here`` says whether the keystore has it; ``elsewhere`` is its place outside, or "".  A
+        key that was lost is noted only while revocations need it.
+        """
         revokes = stage is RotationStage.REISSUE and IDENTITY in roles
-        if self._delete:
-            text = f"--delete-old-key deletes the old key of the {_ca_name(roles)}"
+        key, place = f"the old key of the {_ca_name(roles)}", f"{self._root}/{retired_key(old)}"
+        if not (is_here or elsewhere or revokes):
+            return
+        if not (is_here or elsewhere):
+            text = f"{key} is missing; until the stage retire, `sros revoke` needs it as "
+            text += f"'{place}', or the option --until-retired"
+        elif self._delete:
+            text = f"--delete-old-key deletes {key}"
             text += "; until the stage retire, `sros revoke` needs --until-retired" * revokes
         else:
-            where = place if outside else f"{self._root}/{place}"
-            does = "does not delete" if outside else "keeps"
-            text = f"sros {does} the old key of the {_ca_name(roles)}, '{where}'; "
+            text = f"sros does not delete {key}, '{elsewhere}'; "
+            if not elsewhere:
+                text = f"sros keeps {key}, '{place}'; "
             text += (
                 "`sros revoke` needs it until the stage retire"
                 if revokes
-                else "nothing needs it any more"
+                else "nothing needs it any more: delete it"
             )
         self._change.notes.append(Note("rotation.old-key", f"{text}."))
-        if outside:
-            self.kept_elsewhere.append(place)
+        if elsewhere:
+            self.kept_elsewhere.append(elsewhere)
 
     # ── the stages ─────────────────────────────────────────────────────────────────────────
 
@@ -698,17 +714,17 @@ class _Rotator:
                 self._change.names,
             )
             self._keep_certificate(old)
-            key = retired_key(old)
-            outside = bool(replacement.old_key)
-            if outside or (self._root / key).exists():
-                self._note_old_key(
-                    files[replacement.file],
-                    replacement.old_key or key,
-                    RotationStage.RETIRE,
-                    outside=outside,
-                )
-                if self._delete and not outside:
-                    self._transaction.remove(key)
+            key, elsewhere = retired_key(old), replacement.old_key
+            is_here = (self._root / key).exists() and not elsewhere
+            self._note_old_key(
+                files[replacement.file],
+                old,
+                RotationStage.RETIRE,
+                is_here=is_here,
+                elsewhere=elsewhere,
+            )
+            if self._delete and is_here:
+                self._transaction.remove(key)
         self._transaction.remove(ROTATION)
 
     # ── files ──────────────────────────────────────────────────────────────────────────────
@@ -725,17 +741,16 @@ class _Rotator:
 
         Return the place of the old key if it is outside of the keystore, else "".
         """
-        transaction, root = self._transaction, self._root
-        old_key = ""
+        transaction, root, roles = self._transaction, self._root, successor.roles
         place = f"{PRIVATE}/{successor.file}.key.pem"
-        outside = not (root / place).is_file()
-        if outside:
-            old_key = self._change.keyring.place(successor.roles[0], self._template)
+        is_here, elsewhere = (root / place).is_file(), ""
+        if not is_here:
+            named = self._change.keyring.place(roles[0], self._template)
+            elsewhere = "" if named == ca_key(roles[0]) else named  # the key was lost
         elif not self._delete:
             key = transaction.read(place)
             transaction.write(retired_key(successor.old[0]), key, private=True)
-        kept = old_key or retired_key(successor.old[0])
-        self._note_old_key(successor.roles, kept, stage, outside=outside)
+        self._note_old_key(roles, successor.old[0], stage, is_here=is_here, elsewhere=elsewhere)
         if successor.key == f"{PRIVATE}/next_{successor.file}.key.pem":
             transaction.write(place, transaction.read(successor.key), private=True)
             transaction.remove(successor.key)
@@ -744,7 +759,7 @@ class _Rotator:
             for role in successor.roles:
                 if (root / ca_key(role)).is_symlink():
                     transaction.remove(ca_key(role))
-        return old_key
+        return elsewhere
 
     def _write_settings(self, successors: list[_Successor]) -> None:
         """Stage the settings with the places of the new keys."""
@@ -886,7 +901,9 @@ def _check_place(change: KeystoreChange, file: str, role: str, new_keys: Keyring
         raise KeystoreError(
             f"the key of the {role} CA is not in the keystore, so the key of the new CA should not "
             "be there either",
-            f"The current key is at '{change.keyring.place(role, change.template)}'.",
+            f"It is not at '{change.root}/{place}'."
+            if (place := change.keyring.place(role, change.template)) == ca_key(role)
+            else f"The current key is at '{place}'.",
             f"Name a place for the new key with --{role}-key.",
         )
 
