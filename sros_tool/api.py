@@ -8,12 +8,14 @@ exception.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta, tzinfo
+from functools import wraps
 from os import PathLike, fspath
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar
 
 from sros_tool.errors import Note, PolicyError, UsageError
 
@@ -33,9 +35,92 @@ if TYPE_CHECKING:
     from sros_tool.proof.growth import Growth
 
 AnyPath = str | PathLike[str]
-Item = TypeVar("Item")
 Secrets = Callable[[str], str]
 """A callback that gets a prompt, such as "the PIN of the token X", and returns the secret."""
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+
+def _checked(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Decorate a public function so that it refuses arguments of other types than annotated."""
+    code, annotations = function.__code__, function.__annotations__
+    positional = code.co_varnames[: code.co_argcount]
+    others = code.co_varnames[code.co_argcount + code.co_kwonlyargcount :]  # "*paths" is the first
+
+    @wraps(function)
+    def call(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:
+        names = [*positional, *[*others[:1]] * len(arguments)][: len(arguments)]
+        given: list[Any] = [
+            _argument(name, annotations.get(name, ""), argument)
+            for name, argument in zip(names, arguments, strict=True)
+        ]
+        for name, argument in named.items():
+            named[name] = _argument(name, annotations.get(name, ""), argument)
+        return function(*given, **named)
+
+    return call
+
+
+_TYPES: dict[str, type | tuple[type, ...]] = {
+    "Literal": str,
+    "None": type(None),
+    **{kind.__name__: kind for kind in (str, int, bool, datetime, timedelta, tzinfo)},
+}
+_TYPE_TEXTS = {
+    "AnyPath": "a path (str or os.PathLike)",
+    "Literal": "a string",
+    "None": "None",
+    "Secrets": "a function",
+    "bool": "True or False",
+    "int": "an integer",
+    "str": "a string",
+}
+
+
+def _argument(name: str, annotation: str, argument: Any) -> Any:
+    """Return an argument, or a list as a tuple, if it and its items are of an annotated type.
+
+    Raises:
+        UsageError: it is of another type.
+    """
+    texts = []
+    for kind, items in re.findall(r"(\w+)(?:\[([^\]]*)\])?", annotation):
+        if kind in ("Iterable", "Sequence"):
+            texts.append("a list")
+            if isinstance(argument, Iterable) and not isinstance(argument, str | bytes):
+                return tuple(_argument(f"an item of {name}", items, item) for item in argument)
+        elif _is_of_type(argument, kind):
+            if kind == "AnyPath" and "\0" in fspath(argument):
+                raise UsageError(f"{name} has a NUL character", "", "Pass the path of a file.")
+            return argument
+        else:
+            texts.append(_TYPE_TEXTS.get(kind, f"a {kind}"))
+    if not annotation:  # Python itself refuses it
+        return argument
+    wanted, is_one = " or ".join(texts), isinstance(argument, str) and "a list" in texts
+    raise UsageError(
+        f"{name} is {'one string' if is_one else f'of type {type(argument).__name__}'}",
+        "",
+        f"Pass {wanted}: [{argument!r}]." if is_one else f"Pass {wanted}.",
+    )
+
+
+def _is_of_type(argument: Any, kind: str) -> bool:
+    """Return whether an argument has the type that an annotation names."""
+    if kind == "AnyPath":
+        return isinstance(argument, str) or (
+            isinstance(argument, PathLike) and isinstance(fspath(argument), str)
+        )
+    if kind == "Secrets":
+        return callable(argument)
+    if kind in _TYPES:
+        is_truth = isinstance(argument, bool)
+        return isinstance(argument, _TYPES[kind]) and (not is_truth or kind == "bool")
+    return any(
+        of.__name__ == kind and of.__module__.startswith("sros_tool.")
+        for of in type(argument).__mro__
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +139,7 @@ class Keystore:
         """The sorted names of the enclaves, read from the folder at each access."""
         from sros_tool.keystore.layout import list_enclaves
 
-        return list_enclaves(self.path)
+        return list_enclaves(Path(self.path))
 
     def __fspath__(self) -> str:
         return fspath(self.path)
@@ -89,9 +174,10 @@ class AccessAnswer:
         return self.allowed
 
 
+@_checked
 def create_keystore(
     path: AnyPath,
-    template: str | Template = "development",
+    template: AnyPath | Template = "development",
     *,
     domains: int | str = 0,
     identity_ca: AnyPath | None = None,
@@ -128,7 +214,7 @@ def create_keystore(
 
     result = create.create_keystore(
         Path(path),
-        template=load_template(template) if isinstance(template, str) else template,
+        template=load_template(template) if isinstance(template, str | PathLike) else template,
         domains=DomainSet.parse(str(domains), "domains"),
         now=_time_or_now(now),
         keyring=_keyring(secrets, identity_key, encrypt=encrypt_ca_keys, short=short_passphrase),
@@ -137,6 +223,7 @@ def create_keystore(
     return Keystore(result.root, result.notes)
 
 
+@_checked
 def open_keystore(path: AnyPath) -> Keystore:
     """Return the keystore in the folder ``path``, whether sros or ros2/sros2 created it.
 
@@ -153,6 +240,7 @@ def open_keystore(path: AnyPath) -> Keystore:
     return Keystore(Path(path))
 
 
+@_checked
 def load_template(choice: AnyPath) -> Template:
     """Return the keystore template named ``choice`` ("production"), or in the TOML file ``choice``.
 
@@ -170,6 +258,7 @@ def load_template(choice: AnyPath) -> Template:
     return template.load_template(fspath(choice))
 
 
+@_checked
 def read_policy(path: AnyPath) -> Policy:
     """Return the policy in the file ``path``, with the files that it includes.
 
@@ -198,6 +287,7 @@ def read_policy(path: AnyPath) -> Policy:
         ) from error
 
 
+@_checked
 def generate(
     keystore: AnyPath,
     *policies: AnyPath | Policy,
@@ -241,7 +331,7 @@ def generate(
     """
     from sros_tool.keystore.lifecycle import create
 
-    names = tuple(_no_string("enclaves", enclaves))
+    names = tuple(enclaves)
     if not (policies or names):
         text = "no policy and no enclave is given"
         raise UsageError(text, "", "Pass at least one policy or enclave.")
@@ -273,6 +363,7 @@ def _fleet_policies(policies: Iterable[AnyPath | Policy], fleet: AnyPath) -> lis
     return read
 
 
+@_checked
 def create_enclaves(
     keystore: AnyPath,
     enclaves: Iterable[str],
@@ -307,6 +398,7 @@ def create_enclaves(
     )
 
 
+@_checked
 def renew(
     keystore: AnyPath,
     enclaves: Iterable[str] = (),
@@ -346,7 +438,7 @@ def renew(
     from sros_tool.keystore.expiry import Threshold
     from sros_tool.keystore.lifecycle import renew as lifecycle
 
-    names = tuple(_no_string("enclaves", enclaves))
+    names = tuple(enclaves)
     if not names and expiring is None:
         raise UsageError("nothing is given to renew", "", "Pass enclaves, or a time as expiring.")
     return lifecycle.renew(
@@ -361,6 +453,7 @@ def renew(
     )
 
 
+@_checked
 def revoke(
     keystore: AnyPath,
     enclaves: Iterable[str],
@@ -400,7 +493,7 @@ def revoke(
     """
     from sros_tool.keystore.lifecycle import revoke as lifecycle
 
-    names = tuple(_no_string("enclaves", enclaves))
+    names = tuple(enclaves)
     if not names:
         raise UsageError("no enclave is given to revoke", "", "Pass at least one enclave name.")
     return lifecycle.revoke(
@@ -414,6 +507,7 @@ def revoke(
     )
 
 
+@_checked
 def fleet_status(
     keystore: AnyPath,
     robots: Iterable[str] = (),
@@ -447,10 +541,11 @@ def fleet_status(
     from sros_tool.keystore import fleet_status as status
     from sros_tool.keystore.reader import OpenedKeystore
 
-    fleet = status.fleet_status(OpenedKeystore(Path(keystore)), tuple(_no_string("robots", robots)))
+    fleet = status.fleet_status(OpenedKeystore(Path(keystore)), tuple(robots))
     return fleet.with_overdue(_time_or_now(now), max_age)
 
 
+@_checked
 def export_enclaves(
     keystore: AnyPath,
     enclaves: Iterable[str],
@@ -479,7 +574,7 @@ def export_enclaves(
     from sros_tool.keystore.delivery.export import distribute
     from sros_tool.keystore.reader import OpenedKeystore
 
-    names = tuple(_no_string("enclaves", enclaves))
+    names = tuple(enclaves)
     if not names:
         raise UsageError("no enclave is given to export", "", "Pass at least one enclave name.")
     return distribute(
@@ -487,6 +582,7 @@ def export_enclaves(
     ).target
 
 
+@_checked
 def explain_access(
     keystore: AnyPath | Policy,
     enclave: str,
@@ -628,6 +724,7 @@ def _enclave_to_ask(
     return AskedEnclave(signed._replace(keystore=opened, policy=stated_enclave), stated)
 
 
+@_checked
 def check(
     *paths: AnyPath,
     policies: Iterable[AnyPath | Policy] = (),
@@ -683,7 +780,7 @@ def check(
         read_policy_for(Path(policy), robots)
         if robots and isinstance(policy, str | PathLike)
         else _policy(policy)
-        for policy in _no_string("policies", policies)
+        for policy in policies
     )
     at = Circumstances(
         _time_or_now(now),
@@ -699,12 +796,13 @@ def check(
     return chosen.choose(findings).shown
 
 
+@_checked
 def check_requirements(
     path: AnyPath | Sequence[AnyPath],
     requirements: AnyPath | Sequence[AnyPath],
     *,
     fleet: AnyPath | None = None,
-    template: str = "",
+    template: AnyPath = "",
     vendor: str = "",
     distribution: str = "",
     domain: int | None = None,
@@ -762,7 +860,7 @@ def check_requirements(
         domain=of,
         fleet=read_fleet(Path(fleet)) if fleet else None,
         only_enclaves=only,
-        template=load_template(template) if template else None,
+        template=load_template(fspath(template)) if template else None,
     )
     findings = requirement_findings(read_all_requirements(map(Path, files), system.fleet), system)
     return tuple(
@@ -770,6 +868,7 @@ def check_requirements(
     )
 
 
+@_checked
 def new_access(
     base: AnyPath,
     head: AnyPath,
@@ -857,17 +956,20 @@ def _keyring(
     from sros_tool.keystore.issuing.keyring import Keyring, absolute_place, no_secrets
 
     places = {"identity": absolute_place(identity_key)} if identity_key else {}
-    return Keyring(secrets or no_secrets, places, encrypt, short)
+    return Keyring(_texts(secrets) if secrets else no_secrets, places, encrypt, short)
+
+
+def _texts(secrets: Secrets) -> Secrets:
+    """Return ``secrets``, which then refuses to return anything but a string."""
+
+    def secret(prompt: str) -> str:
+        text: str = _argument("the return value of secrets", "str", secrets(prompt))
+        return text
+
+    return secret
 
 
 def _content(path: AnyPath) -> bytes:
     from sros_tool.xml import read_bytes
 
     return read_bytes(Path(path), "file")
-
-
-def _no_string(parameter: str, items: Iterable[Item]) -> Iterable[Item]:
-    """Return ``items``; refuse a single string, which would be iterated letter by letter."""
-    if isinstance(items, str):
-        raise UsageError(f"{parameter} is one string", "", f"Pass a list: [{items!r}].")
-    return items

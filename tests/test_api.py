@@ -6,6 +6,7 @@ import inspect
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
@@ -358,6 +359,54 @@ def test_what_cannot_be_meant_is_refused_with_a_remedy(
     assert callable(call)
     with pytest.raises(error, match=text):
         call(keystore.path)
+
+
+FUNCTIONS = [
+    value for name in sros_tool.__all__ if inspect.isfunction(value := getattr(sros_tool, name))
+]
+VALID = {
+    **dict.fromkeys(("keystore", "path", "base", "head", "target", "requirements"), "ks"),
+    "enclave": "/a",
+    "action": "join",
+}
+
+
+@pytest.mark.parametrize("function", FUNCTIONS, ids=lambda function: function.__name__)
+def test_an_argument_of_another_type_is_refused_with_the_type_to_pass(
+    function: Callable[..., object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, parameter in inspect.signature(function).parameters.items():
+        lists = "Iterable" in parameter.annotation or "Sequence" in parameter.annotation
+        for wrong in (1.5, b"x", object(), *([[None]] if lists else [])):
+            arguments: list[object] = []
+            named: dict[str, object] = {
+                key: text for key, text in VALID.items() if key in function.__annotations__
+            }
+            if parameter.kind is parameter.VAR_POSITIONAL:
+                arguments, named = ["ks", wrong], {}
+            else:
+                named[name] = wrong
+            with pytest.raises(UsageError, match=rf"^(an item of )?{name} is of type .*Pass "):
+                function(*arguments, **named)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_not_annotated_is_a_type_error_and_a_path_is_a_template(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="unexpected keyword argument 'patch'"):
+        sros_tool.open_keystore(patch="ks")  # type: ignore[call-arg]
+    with pytest.raises(TypeError, match="positional argument"):
+        sros_tool.open_keystore("ks", "ks")  # type: ignore[call-arg]
+    with pytest.raises(UsageError, match="path has a NUL character"):
+        sros_tool.open_keystore("k\0s")
+    with pytest.raises(DocumentError, match="template"):
+        sros_tool.create_keystore(tmp_path / "ks", tmp_path / "gone.toml")
+    with pytest.raises(UsageError, match="the return value of secrets is of type NoneType"):
+        sros_tool.create_keystore(
+            tmp_path / "ks",
+            encrypt_ca_keys=True,
+            secrets=lambda _: None,  # type: ignore[arg-type, return-value]
+        )
 
 
 def test_a_moment_of_another_zone_is_as_good(keystore: sros_tool.Keystore) -> None:

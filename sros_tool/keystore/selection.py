@@ -5,6 +5,7 @@ The error for a missing enclave says whether it was revoked, or its name may be 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from fnmatch import fnmatchcase
@@ -271,17 +272,17 @@ def missing_enclave_error(
             f"process, and `sros close {folder} --for 1m`.",
         )
     if not keystore.is_original:
-        where = f"`sros distribute_key KEYSTORE {name} {quote(str(root))}`"
+        where = f"`sros distribute_key KEYSTORE {quote(name)} {quote(str(root))}`"
         return KeystoreError(missing, why, f"If it is not a typo, export it with {where}.")
     if not may_create:
         return KeystoreError(missing, why, f"See `sros list_enclaves {quote(str(root))}`.")
-    create = f"`sros create_enclave {quote(str(root))} {name}`"
+    create = f"`sros create_enclave {quote(str(root))} {quote(name)}`"
     return KeystoreError(missing, why, f"If it is not a typo, create it with {create}.")
 
 
 def _enclaves_of_node(keystore: OpenedKeystore, node: str, names: Sequence[str]) -> list[str]:
     """Return the enclaves whose permissions let a node of this full name serve its parameters."""
-    topic = f">rr{node}/get_parametersReply<".encode()
+    topic = os.fsencode(f">rr{node}/get_parametersReply<")  # a name that is not UTF-8, too
     enclaves = []
     for name in names:
         with suppress(SrosError, OSError):

@@ -741,6 +741,12 @@ def test_the_default_of_the_template_is_no_policy_file(template: str, tmp_path: 
     assert "digest" not in found.out and "--policy" not in found.out
 
 
+def test_a_name_that_is_no_utf_8_is_refused(keystore: Path) -> None:
+    for words in (("/\udcff", "join"), ("--reach", "/\udcff")):
+        found = explain(keystore, *words)
+        assert found.status == 2 and "is not a valid enclave name" in found.err, found
+
+
 # ── who, and reach ─────────────────────────────────────────────────────────────────────────
 
 
