@@ -2,7 +2,7 @@
 
 Each text was seen in a real log of Fast DDS 2.9.1, 2.14.5 or 3.6.2 (Permissions.cpp,
 SecurityManager.cpp, PKIDH.cpp), Cyclone DDS 0.10.2 (access_control.c, authentication.c,
-q_omg_security.c), or rcl of Jazzy.
+q_omg_security.c), or rcl of Jazzy, and those of rmw_cyclonedds with Cyclone DDS 0.10.5.
 
 To add a vendor, add its rows to `LOG_TEXTS`; `sros_tool.runtime.vendor_log` reads the lines.
 """
@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.faults import Fault
+from sros_tool.runtime.rmw import denial_trace_variables
 
 
 class RefusedObject(Enum):
@@ -149,6 +150,7 @@ _SAME_KEYSTORE = (
     "Give both sides enclaves of the same keystore; `sros inspect` shows the CA of each."
 )
 _FAST, _CYCLONE = Vendor.FAST, Vendor.CYCLONE
+_CYCLONE_TRACE = denial_trace_variables("stderr")["CYCLONEDDS_URI"]
 _DENIED_ENDPOINT = (
     "the permissions deny a publisher, subscription, client or server; this message does not name "
     "the topic (`invalid allocator` has nothing to do with memory)"
@@ -195,6 +197,15 @@ _ROS_TEXTS = (
     _log_text(
         "files-missing", _ROS, r"couldn't find all security files",
         "a file of the enclave is missing or a broken link; the message does not say which",
+        "`sros explain KEYSTORE ENCLAVE join` names the file and the command that restores it; on "
+        "a robot, export the enclave again.", _FILE_FAULTS,
+        refuses=RefusedObject.PARTICIPANT,
+    ),
+    _log_text(
+        "files-missing", _ROS, r"could not find all security files",
+        "a file of the enclave is missing, a broken link, or closed to the user of this process; "
+        "the message does not say which. rmw_cyclonedds starts no node then, but if "
+        "ROS_SECURITY_STRATEGY is not exactly Enforce, the node RUNS UNSECURED",
         "`sros explain KEYSTORE ENCLAVE join` names the file and the command that restores it; on "
         "a robot, export the enclave again.", _FILE_FAULTS,
         refuses=RefusedObject.PARTICIPANT,
@@ -591,7 +602,16 @@ _CONSEQUENCE_TEXTS = (
         remedy_without_fault=_LOG_FILE_REMEDY, vagueness=2,
     ),
     _log_text(
-        "service", _ROS, r"(?:could not|failed to) create (?:service|client)"
+        "endpoint", _CYCLONE, r"failed to create (?:writer|reader)\b",
+        "the permissions deny a publisher, subscription, client or server, but name its topic for "
+        "the opposite: for a client in place of a server, say; this message does not name the "
+        "topic",
+        f"Start the node with `CYCLONEDDS_URI='{_CYCLONE_TRACE}'` to see the topic, and explain "
+        "that log.",
+        vagueness=3,
+    ),
+    _log_text(
+        "service", _ROS, r"(?:could not|failed to) create (?:service|client|action \w+)"
         r"|create_(?:service|client)\(\) failed",
         "the permissions deny a service or client, and this message does not name it. If the node "
         "fails when it is created, a standard service of the node is denied: the node has another "
@@ -625,6 +645,11 @@ _DENIED_TOPIC_TEXTS = (
         "topic-denied", _CYCLONE,
         r"(?:Local topic permission denied|Writer is not permitted|Reader is not permitted): "
         r"(?P<topic>\S+) (?P<rule>denied by default rule|found in deny_rule)",
+        refuses=RefusedObject.TOPIC,
+    ),
+    _log_text(  # rmw_cyclonedds, which names other reasons than a refusal
+        "topic-denied", _CYCLONE,
+        r"failed to create topic \[(?P<topic>[^\]\s]+)\] for (?P<rule>unknown reasons)",
         refuses=RefusedObject.TOPIC,
     ),
     _log_text(  # the nodes of `sros demo`
@@ -693,6 +718,8 @@ UNKNOWN = LogText(
         # Cyclone DDS; what it traces of success is no trouble.
         r"|\A\d+\.\d+ \[\d*\]\s+\S+: (?!.*(?:DDS Security plugins have been loaded"
         r"|using security settings from|allow non-secure remote|FSM: |handshake (?:delete|resend)"
+        r"|config: |(?:PARTICIPANT|WRITER|READER) \S+ QOS=|write_sample |data\(builtin"
+        r"|validate_local_identity: candidate_guid|cleanup participant|SPDP ST"
         r"|\) (?:processed|send tokens|succeeded)))"
         rf".*(?:{_AMBIGUOUS_WORDS}|plugin|not allowed|token|encoded|authenticat"
         r"|Could not (?:load|find))"

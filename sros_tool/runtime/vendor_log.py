@@ -60,13 +60,15 @@ ENDPOINT_KINDS: Mapping[str, re.Pattern[str]] = {
     "writer": re.compile(
         r"Writer is not|local writer|create a writer on|check_create_datawriter|datawriter_sec"
         r"|associated Writer|DATA_WRITER|create(?:_p| p|P)ublisher|register_local_writer"
+        r"|/rcl/publisher\.c:"
     ),
     "reader": re.compile(
         r"Reader is not|local reader|create a reader on|check_create_datareader|datareader_sec"
         r"|associated Reader|DATA_READER|create(?:_s| s|S)ubscri|register_local_reader"
+        r"|/rcl/subscription\.c:"
     ),
-    "client": re.compile(r"create(?:_c| c|C)lient"),
-    "server": re.compile(r"create(?:_s| s|S)ervice"),
+    "client": re.compile(r"create(?:_c| c|C)lient|/rcl/client\.c:"),
+    "server": re.compile(r"create(?:_s| s|S)ervice|/rcl/service\.c:"),
 }
 """The words in lines near a denied topic that show the kind of the denied endpoint."""
 
@@ -153,8 +155,8 @@ def plain_refusal(line: str) -> str:
 _COLOR_CODE = re.compile(r"\x1b\[[0-9;]*m")
 
 _REASON_CONTEXT = re.compile(
-    # Fast DDS: time, `[SECURITY Error]`, source position, and function.
-    r"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d[.\d]* (?=\[)|\[SECURITY\w* (?:Error|Warning)\]\s*"
+    # rcutils: level, time and logger; Fast DDS: time, `[SECURITY Error]`, source position, and function.
+    r"^\[[A-Z]+\] \[[\d.]+\] \[\w+\]: |^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d[.\d]* (?=\[)|\[SECURITY\w* (?:Error|Warning)\]\s*"
     r"|\s*\([^()\s]+\.(?:cpp|h|hpp|ipp):\d+\)|\s*-> Function \w+\Z|, at \S+\.(?:cpp|c):\d+"
     # The file of ROS_SECURITY_LOG_FILE: time, severity, participant, domain, and function.
     r"|^\S+ \[[A-Z]+\] \S+ \d+ \w+::\w+ :\s*"

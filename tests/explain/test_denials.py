@@ -78,6 +78,30 @@ def test_rcl_tells_what_cyclone_does_not(topic: str, said: str, direction: str) 
     assert read_denials(text) == (Denial(topic, direction),)
 
 
+@pytest.mark.parametrize(
+    ("line", "denial"),
+    [
+        ("RCLError: Failed to create publisher: failed to create topic [rt/x] for unknown reasons",
+         Denial("rt/x", "publish")),
+        ("  'failed to create topic [rt/x] for unknown reasons, at src/rmw_node.cpp:1941, at "
+         "/project/src/rcl/subscription.c:112'", Denial("rt/x", "subscribe")),
+        ("Failed to create action client: failed to create topic [rq/x/_action/send_goalRequest] "
+         "for unknown reasons, at src/rmw_node.cpp:1941, at /project/src/rcl/client.c:146",
+         Denial("rq/x/_action/send_goalRequest", "publish")),
+        ("failed to create service: failed to create topic [rr/xReply] for unknown reasons",
+         Denial("rr/xReply", "publish")),
+        ("failed to create topic [rt/x] for unknown reasons", Denial("rt/x", "")),
+    ],
+)  # fmt: skip
+def test_rmw_cyclonedds_names_the_topic_and_rcl_the_kind(line: str, denial: Denial) -> None:
+    """As rclpy printed it with rmw_cyclonedds over Cyclone DDS 0.10.5, without a trace."""
+    assert read_denials(line) == (denial,)
+    other_reason = line.replace(
+        "for unknown reasons", "because it's already in use in this context with another type"
+    )
+    assert not read_denials(other_reason)
+
+
 def test_a_denial_of_a_peer_is_no_reason_to_widen_ones_own() -> None:
     text = "rt/x topic not found in allow rule. -> Function check_remote_datawriter"
     (denial,) = read_denials(text)

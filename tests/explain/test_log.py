@@ -325,6 +325,20 @@ def test_without_a_keystore(file: str, ids: list[str]) -> None:
 
 
 @pytest.mark.parametrize(
+    "line",
+    [
+        "config: Domain/SSL/CertificateVerification/#text: true {}",
+        "validate_local_identity: candidate_guid: 1:2:3:1c1 adjusted_guid: 8:9:d:1c1",
+        'PARTICIPANT 8:9:d:1c1 QOS={user_data=10<"enclave=/;">,property_list={0:"dds.sec.auth"}}',
+        "SPDP ST3 8:9:d:1c1 unknown not allowed",
+        "cleanup participant 8:9:d:1c1 security attributes",
+    ],
+)
+def test_a_trace_of_success_is_no_trouble(line: str) -> None:
+    assert not explained(f"1795877133.730803 [43] python: {line}")
+
+
+@pytest.mark.parametrize(
     ("line", "name"),
     [
         ("couldn't find all security files!", "files-missing"),
@@ -342,6 +356,9 @@ def test_without_a_keystore(file: str, ids: list[str]) -> None:
          "file-unreadable"),
         ("rclpy._rclpy_pybind11.RCLError: Failed to create subscription: invalid allocator",
          "endpoint"),
+        ("[INFO] [1.2] [rmw_cyclonedds_cpp]: could not find all security files", "files-missing"),
+        ("ValueError: Failed to create action server: failed to create writer", "endpoint"),
+        ("ValueError: Failed to create action client: rcl node is invalid", "service"),
     ],
 )  # fmt: skip
 def test_single_lines(line: str, name: str) -> None:
