@@ -155,8 +155,10 @@ def plain_refusal(line: str) -> str:
 _COLOR_CODE = re.compile(r"\x1b\[[0-9;]*m")
 
 _REASON_CONTEXT = re.compile(
-    # rcutils: level, time and logger; Fast DDS: time, `[SECURITY Error]`, source position, and function.
-    r"^\[[A-Z]+\] \[[\d.]+\] \[\w+\]: |^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d[.\d]* (?=\[)|\[SECURITY\w* (?:Error|Warning)\]\s*"
+    # rcutils: level, time and logger.
+    r"^\[[A-Z]+\] \[[\d.]+\] \[\w+\]: "
+    # Fast DDS: time, `[SECURITY Error]`, source position, and function.
+    r"|^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d[.\d]* (?=\[)|\[SECURITY\w* (?:Error|Warning)\]\s*"
     r"|\s*\([^()\s]+\.(?:cpp|h|hpp|ipp):\d+\)|\s*-> Function \w+\Z|, at \S+\.(?:cpp|c):\d+"
     # The file of ROS_SECURITY_LOG_FILE: time, severity, participant, domain, and function.
     r"|^\S+ \[[A-Z]+\] \S+ \d+ \w+::\w+ :\s*"
