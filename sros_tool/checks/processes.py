@@ -208,12 +208,20 @@ def _required_files(enclave: ProcessEnclave) -> Sequence[str]:
 
 
 def newer_files(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
-    """Yield the names of the files that changed, or were removed, since a process started."""
+    """Yield the names of the files that changed, or were removed, since a process started.
+
+    The certificate tells which key the process has loaded: a change of the key's file alone is one
+    of its mode or place, or the key does not fit, and no process starts with it.
+    """
     files = enclave.files
     if process.is_zenoh:
         files = tuple(file for file in files if file.name in _LOADED_BY_ZENOH)
         files += (process.configuration,) if process.configuration else ()
-    newer = [e.name for e in files if e.changed and e.changed > process.started]
+    newer = [
+        file.name
+        for file in files
+        if file.changed and file.changed > process.started and file.name not in _KEYS
+    ]
     gone = [name for name in enclave.lacking if any(name == file.name for file in files)]
     yield from (_plain_path(file) for file in newer)
     yield from (f"{file} (removed)" for file in gone)
@@ -233,7 +241,8 @@ def may_lack_list(process: Process, enclave: ProcessEnclave, *, has_list: bool =
     return moved or not {*newer_files(process, enclave)} <= same_files
 
 
-_OWN_FILES = {CERTIFICATE_FILE, KEY_FILE, PERMISSIONS_FILE, GOVERNANCE_FILE}
+_KEYS = (KEY_FILE, KEY_URI_FILE)
+_OWN_FILES = {CERTIFICATE_FILE, PERMISSIONS_FILE, GOVERNANCE_FILE}
 
 
 def _unread_file_findings(process: Process, enclave: ProcessEnclave) -> Iterator[Finding]:

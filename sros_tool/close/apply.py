@@ -6,7 +6,8 @@ import os
 import shlex
 import subprocess
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
+from datetime import timedelta
 from itertools import chain
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from sros_tool.close.state import (
     current_state,
     keystore_text,
     secured_process,
+    wait_until,
 )
 from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.files import remove_file
@@ -36,7 +38,10 @@ from sros_tool.xml import read_bytes
 _SYSTEMD = Path("/etc/systemd/system")
 
 _RESTART_SECONDS = 30.0
-"""How long processes that sros restarted may take until they run in their enclaves."""
+"""How long processes that sros restarted may take until they run in their enclaves, or open."""
+
+_STEADY = timedelta(seconds=2)
+"""How long a process that sros restarted open has to run: many end while they start."""
 
 
 def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseState:
@@ -89,6 +94,9 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     # Without a drop-in, a unit is not open yet if an earlier --undo was killed before the restart.
     units |= {process.unit for process in observed.processes if not running.is_open(process)} - {""}
     _restart_units(robot, observed, units, dry_run=dry_run)
+    started = [process for process in observed.processes if process.unit in units and process.pid]
+    if started and not dry_run:
+        running = wait_until(robot, lambda seen: not [*_not_open(seen, started)], _RESTART_SECONDS)
     changes = [FileChange("remove", str(path)) for path in drop_ins]
     policy = _readable_policy(robot)
     state = current_state(robot, policy)._replace(dry_run=dry_run, changes=changes)
@@ -99,10 +107,24 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     problems = [
         *remaining.commands_to_open(),
         *(() if dry_run else remaining.secured_units()),
+        *(() if dry_run else _not_open(running, started)),
         *remaining.secured_guests(),
         *remaining.unknown_processes(),
     ]
     return state._replace(problems=problems)
+
+
+def _not_open(running: RunningRobot, started: Sequence[ClosedProcess]) -> Iterator[str]:
+    """Yield the processes of restarted units that run neither open nor in their enclaves."""
+    secured = {enclave.name for _, enclave in running.secured_everywhere}
+    since = running.robot.shell.now() - _STEADY
+    steady = [process for process in running.open_processes if process.started <= since]
+    for process in started:
+        if process.enclave not in secured and not any(map(process.fits, steady)):
+            yield (
+                f"{process.enclave} does not run open, though {process.unit} was restarted: "
+                f"systemctl status {process.unit}"
+            )
 
 
 def _readable_policy(robot: LocalRobot) -> Policy | None:

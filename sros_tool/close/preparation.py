@@ -370,26 +370,25 @@ def _shared_program_problems(robot: LocalRobot) -> Iterator[str]:
 
 def _shared_node_problems(robot: LocalRobot) -> Iterator[str]:
     """Yield a text for processes with nodes of the same name, which would share an enclave."""
-    observed = robot.processes
-    is_signed = robot.keystore.exists()
-    if is_signed:  # otherwise the policy was learned of them, whether they run or not
-        observed = observed.with_current_pids(RunningRobot(robot).processes, robot.export)
-    by_enclave: dict[str, dict[int, str]] = {}
-    for process in observed.processes:
+    running, is_signed = RunningRobot(robot).processes, robot.keystore.exists()
+    by_enclave: dict[str, dict[tuple[int, str], str]] = {}
+    for process in robot.processes.processes:
         # Whoever was started in the enclave did not choose it by its name.
-        if process.known_by != "enclave":
-            twins = by_enclave.setdefault(process.enclave, {})
-            twins |= dict.fromkeys(process.alike or [process.pid], shlex.join(process.command))
+        if process.known_by == "enclave":
+            continue
+        twins, command = by_enclave.setdefault(process.enclave, {}), shlex.join(process.command)
+        now = process.with_current_pid(running, robot.domain, robot.export)
+        if is_signed:
+            pids = now.alike or [now.pid] * bool(now.pid)
+            twins |= {(pid, ""): f"process {pid} ({command})" for pid in pids}
+        else:  # the policy was learned of the process, whether it still runs or not
+            label = now.pids_text or "a process that ended"
+            twins[process.pid, command] = f"{label} ({command})"
     for enclave, twins in by_enclave.items():
-        commands = [
-            f"process {pid} ({command})" if pid else f"a process that ended ({command})"
-            for pid, command in twins.items()
-            if pid or not is_signed
-        ]
-        if len(commands) > 1:
+        if len(twins) > 1:
             yield (
-                f"{enumerated(commands)} call themselves {enclave}, and the enclave of this "
-                "name would have the rights of all; nothing was signed; if one is not of the "
+                f"{enumerated([*twins.values()])} call themselves {enclave}, and the enclave of "
+                "this name would have the rights of all; nothing was signed; if one is not of the "
                 f"robot, stop it, remove '{robot.policy}', and watch again: {robot.close_command} "
                 "--for 1m; if all are, accept it: --partial"
             )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -23,6 +22,7 @@ from sros_tool.close.state import (
     RunningRobot,
     current_state,
     keystore_text,
+    wait_until,
 )
 from sros_tool.errors import UnavailableError
 from sros_tool.explain.audit import DeniedRight
@@ -39,7 +39,6 @@ from sros_tool.graph.observation import (
 from sros_tool.keystore.layout import list_enclaves
 from sros_tool.names import expand, is_expression
 from sros_tool.runtime.environment import ROS_ARGS, named_enclave
-from sros_tool.runtime.processes import ProcessTable
 from sros_tool.runtime.variables import ENCLAVE
 from sros_tool.wording import counted, enumerated, first_few
 
@@ -84,7 +83,7 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     expected = {process.enclave for process in state.observed.processes} | {*state.new}
     if not expected:
         return [Proof(_STARTED, False, "no process of the robot is known")]
-    running = _wait_for(robot, expected, patience)
+    running = wait_until(robot, lambda seen: seen.current_enclaves >= expected, patience)
     missing = sorted(expected - running.current_enclaves)
     running_now = {enclave.name for _, enclave in running.secured}
     needed = {*missing}.difference(robot.without) | running_now.intersection(missing)
@@ -106,17 +105,6 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
         talk = talk._replace(reason=f"{talk.reason}; if they may be away, add {options}")
     silence = _proof_of_silence(robot, nodes.compared(away), hears=talk.holds is not None)
     return [proof, _proof_of_files(robot), *_proof_of_requirements(robot), talk, silence]
-
-
-def _wait_for(robot: LocalRobot, enclaves: set[str], patience: float) -> RunningRobot:
-    """Return the processes when some run in all ``enclaves``, or after ``patience`` seconds."""
-    table, end = ProcessTable(), time.monotonic() + patience
-    while True:
-        is_over = time.monotonic() > end
-        running = RunningRobot(robot, table.look(robot.shell.now()))
-        if is_over or running.current_enclaves >= enclaves:
-            return running
-        time.sleep(0.2)
 
 
 def _proof_of_files(robot: LocalRobot) -> Proof:

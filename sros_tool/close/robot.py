@@ -109,14 +109,19 @@ class LocalRobot:
         self.observation_file = folder / "observed.json"
         self.processes_file = folder / CLOSED_PROCESSES
         self.observed_policy = folder / "seen.xml"
+        self._chosen_domain = domain
         self._check_writers()
-        is_watched = self.processes_file.exists()
+        self._read_processes()
+
+    def _read_processes(self) -> None:
+        """Read which processes were observed, if the robot was watched."""
+        is_watched, chosen = self.processes_file.exists(), self._chosen_domain
         self.observed = read_processes(self.processes_file) if is_watched else None
-        chosen = domain_of(shell.environment) if domain is None else domain
-        self.domain = self.observed.domain if self.observed else chosen
-        if domain not in (None, self.domain):
+        default = domain_of(self.shell.environment) if chosen is None else chosen
+        self.domain = self.observed.domain if self.observed else default
+        if chosen not in (None, self.domain):
             raise UsageError(
-                f"the robot was watched in domain {self.domain}, not {domain}",
+                f"the robot was watched in domain {self.domain}, not {chosen}",
                 "",
                 "Close each domain into a folder of its own.",
             )
@@ -163,6 +168,7 @@ class LocalRobot:
                 ) from None
             except OSError:  # a file system without locks
                 pass
+            self._read_processes()  # another run may have written them meanwhile
             yield
         finally:
             os.close(handle)
@@ -208,13 +214,16 @@ class LocalRobot:
         check_enclaves(self.named_elsewhere, known, "--elsewhere")
 
     def check_rmw(self) -> None:
-        """Raise `UsageError` if the robot was watched on Zenoh, and this shell is not on Zenoh."""
-        is_on_zenoh = any(process.rmw == RMW_ZENOH for process in self.processes.processes)
-        if is_on_zenoh and self.shell.environment.get(RMW) != RMW_ZENOH:
+        """Raise `UsageError` if the robot was watched on Zenoh, or on DDS, and the shell is not."""
+        rmws = {process.rmw for process in self.processes.processes}
+        is_on_zenoh, shell_is = RMW_ZENOH in rmws, self.shell.environment.get(RMW) == RMW_ZENOH
+        if rmws and is_on_zenoh != shell_is:
+            used, other = (RMW_ZENOH, "DDS") if is_on_zenoh else ("DDS", RMW_ZENOH)
+            rmw = RMW_ZENOH if is_on_zenoh else min(rmws - {""}, default="")
             raise UsageError(
-                f"this robot runs on {RMW_ZENOH}",
-                "An observer that this shell starts would look for it on DDS.",
-                f"Set {RMW}={RMW_ZENOH}.",
+                f"this robot runs on {used}",
+                f"An observer that this shell starts would look for it on {other}.",
+                f"Set {RMW}={rmw}." if rmw else f"Unset {RMW}, as when the robot was watched.",
             )
 
     def variables(self, enclave: str, rmw: str = "") -> dict[str, str]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+import time
+from collections.abc import Callable, Mapping, Sequence, Set
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -37,6 +38,9 @@ from sros_tool.wording import first_few
 
 _LONGEST_PATH = 300
 """Number of characters of a path that another process chose, in texts."""
+
+_LOOK_SECONDS = 0.2
+"""How often processes are looked at until they are as they should be."""
 
 TALK = "everything that talked can still talk"
 SILENCE = "an open listener finds nothing"
@@ -159,6 +163,19 @@ class RunningRobot:
             f"to close it, {close} --domain {domain}"
             for domain, labels in sorted(domains.items())
         )
+
+
+def wait_until(
+    robot: LocalRobot, is_over: Callable[[RunningRobot], bool], patience: float
+) -> RunningRobot:
+    """Return the running processes when they fulfill a condition, or after ``patience`` seconds."""
+    table, end = ProcessTable(), time.monotonic() + patience
+    while True:
+        is_last = time.monotonic() > end
+        running = RunningRobot(robot, table.look(robot.shell.now()))
+        if is_last or is_over(running):
+            return running
+        time.sleep(_LOOK_SECONDS)
 
 
 def secured_process(process: Process, enclave: str) -> ClosedProcess:

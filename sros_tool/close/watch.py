@@ -62,13 +62,20 @@ def check_watchable(robot: LocalRobot) -> None:
             f"Go back by `{robot.close_command} --undo` and watch again, "
             f"or add what is missing to '{robot.policy}' by hand.",
         )
-    for process in running.in_domain:
-        if process.is_zenoh and rmw != RMW_ZENOH:
-            raise UsageError(
-                f"{process.label} speaks Zenoh, but this shell is set up for DDS",
-                "",
-                f"Run `export {RMW}={RMW_ZENOH}`, and this command again.",
-            )
+    nodes = [process for process in running.in_domain if not process.is_daemon]
+    on_zenoh = [process for process in nodes if process.is_zenoh]
+    if on_zenoh and rmw != RMW_ZENOH:
+        raise UsageError(
+            f"{on_zenoh[0].label} speaks Zenoh, but this shell is set up for DDS",
+            "",
+            f"Run `export {RMW}={RMW_ZENOH}`, and this command again.",
+        )
+    if nodes and not on_zenoh and rmw == RMW_ZENOH:
+        raise UsageError(
+            f"{nodes[0].label} speaks DDS, but this shell is set up for Zenoh",
+            "",
+            f"Run `unset {RMW}`, or set it to the RMW of the robot, and this command again.",
+        )
 
 
 def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:

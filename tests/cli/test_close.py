@@ -185,7 +185,9 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(preparation, "built_without_security", lambda *_: lacking.exists())
     monkeypatch.setattr(apply, "_SYSTEMD", tmp_path / "systemd")
     monkeypatch.setattr(apply, "_RESTART_SECONDS", 0.1)
+    monkeypatch.setattr(apply, "_STEADY", timedelta())
     monkeypatch.setattr(proof, "_START_SECONDS", 0.1)
+    monkeypatch.setattr(state, "_LOOK_SECONDS", 0.01)
     monkeypatch.setattr(proof, "_TRIES", 1)
     for name in ("ROS_DOMAIN_ID", "RMW_IMPLEMENTATION", "ROS_SECURITY_ENABLE"):
         monkeypatch.delenv(name, raising=False)
@@ -375,6 +377,12 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     assert undone.err.count("removed ") == 2
     robot.close("--undo")
     assert len(robot.restarts) == 4, "they run open already"
+    robot.absent = {"/talker"}
+    ended = "/talker does not run open, though talker.service was restarted: systemctl status talk"
+    assert ended in robot.close("--undo", status=1).out
+    assert robot.restarts[4:] == ["daemon-reload", "restart talker.service"]
+    robot.absent = set()
+    (robot.folder / "systemctl.log").write_text("before\n" * 4)
     robot.by_hand = {"/talker"}
     still = "process 4711 (run) still runs in /talker: stop it if talker.service did not start it"
     assert still in robot.close("--undo", status=1).out
@@ -623,7 +631,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         "others can read key.pem (its mode is 0644): if anybody did, `sros renew KEYSTORE /talker"
         in said
     )
-    assert " and 3 more changed, or got another mode, after the start of" in said
+    assert " and 2 more changed, or got another mode, after the start of" in said
     assert f"the processes of /talker (process {PID['/talker']}); restart them\n" in said
     robot.outdated, robot.absent = set(), {"/talker"}
     talker = robot.process("/talker", is_secured=True)
@@ -907,6 +915,10 @@ def test_a_process_with_the_name_of_another_is_not_signed(robot: Robot) -> None:
     assert both in said
     assert not (robot.folder / "robot/keystore").exists()
     assert both in robot.close("--apply", status=1).out
+    robot.more, robot.absent = (), {"/talker"}
+    both = "a process that ended (/tmp/evil 'a b') and a process that ended (/opt/run talker) call"
+    assert both in robot.close(status=1).out, "the policy has the rights of both"
+    robot.absent = set()
     talker = ClosedProcess("/talker", 7, ("talk",), "/opt", 0, "a.service", "program")
     accepted = ObservedProcesses(0, [talker, talker._replace(unit="b.service")])  # --partial
     assert accepted.units == {"a.service", "b.service"}
@@ -1067,6 +1079,9 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
     robot.more = (Process(5, ("rmw_zenohd",), {}, datetime.now(UTC)),)
     assert "speaks Zenoh" in robot.close(status=2).err
     assert not (robot.folder / "robot").exists()
+    robot.more = ()
+    said = robot.close(status=2, RMW_IMPLEMENTATION="rmw_zenoh_cpp").err
+    assert "process 4711 (run) speaks DDS, but this shell is set up for Zenoh. Run `unset " in said
     robot.more, robot.nodes = (Process(5, ("a",), {"ROS_DOMAIN_ID": "7"}, datetime.now(UTC)),), ()
     ended = robot.close(status=2)
     there = "in domain 7, not 0, runs process 5 (a): to close it, sros close robot --domain 7"
@@ -1091,6 +1106,10 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
         said = robot.close(*words, status=2).err
         assert "this robot runs on rmw_zenoh_cpp. " in said
         assert "Set RMW_IMPLEMENTATION=rmw_zenoh_cpp." in said
+    for rmw, remedy in (("", "Unset RMW_IMPLEMENTATION, as"), ("rmw_a", "Set RMW_IMPLEMENTATION=")):
+        file.write_text(text.replace('"rmw": ""', f'"rmw": "{rmw}"'))
+        said = robot.close("--proof", status=2, RMW_IMPLEMENTATION="rmw_zenoh_cpp").err
+        assert "this robot runs on DDS. " in said and f" {remedy}{rmw}" in said
     for wrong in (other_unit, other_user, other_name, number, "{}", "[" * 100_000):
         file.write_text(wrong)
         assert "is not a list of processes" in robot.close(status=2).err
@@ -1127,6 +1146,13 @@ def test_one_run_at_a_time_writes_into_the_folder(robot: Robot) -> None:
     robot.close("--proof", status=1)
     robot.close("--undo")
     os.close(folder)
+    shell = Shell(close._run, print, os.environ, lambda: datetime.now(UTC), UTC)
+    waits, works = (LocalRobot(robot.folder / "robot", None, shell) for _ in range(2))
+    observed = works.processes
+    works.remember(observed.belonging_elsewhere(["/listener"]))
+    with waits.locked():
+        assert waits.not_here == {"/listener"}
+    works.remember(observed)
     robot.close()
 
 
