@@ -10,7 +10,8 @@ import os
 import sys
 from collections.abc import Callable
 from functools import cache
-from typing import NamedTuple
+
+from sros_tool.deferred import NamedTuple
 
 _CONTROLS = [
     *(code for code in range(0x20) if chr(code) not in "\n\t"),

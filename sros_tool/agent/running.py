@@ -10,7 +10,6 @@ from dataclasses import replace
 from datetime import datetime, tzinfo
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
 
 from sros_tool.agent.settings import AgentSettings
 from sros_tool.checks.processes import (
@@ -20,6 +19,7 @@ from sros_tool.checks.processes import (
     other_folder_findings,
     process_findings,
 )
+from sros_tool.deferred import NamedTuple
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.confirmation import (
     RobotClock,

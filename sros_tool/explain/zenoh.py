@@ -9,16 +9,17 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from enum import StrEnum
 from functools import cache
 from pathlib import Path
 from shlex import quote
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
+from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.explain.answer import (
     Answer,

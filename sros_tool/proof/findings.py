@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from sros_tool.automata import SearchLimit
 from sros_tool.checks.kind import Finding, RelatedPlace
@@ -16,6 +16,7 @@ from sros_tool.checks.requirements import (
     VIOLATED,
 )
 from sros_tool.dds.decision.vendors import joined_titles
+from sros_tool.deferred import dataclass
 from sros_tool.faults import REFUSE_STRANGERS
 from sros_tool.keystore.template import DEFAULT_TEMPLATE
 from sros_tool.names import (

@@ -21,16 +21,16 @@ requirements of the new file together demand at least as much, whatever their na
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 from sros_tool.checks.kind import Finding, RelatedPlace
 from sros_tool.checks.requirements import DROPPED
+from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import DocumentError
 from sros_tool.files import read_toml
 from sros_tool.fleet.robots import Fleet, Robot
@@ -385,8 +385,8 @@ def _pairs(requirement: Requirement) -> int:
             return 0
 
 
-_HEADER = re.compile(r"[ \t]*\[\[?[ \t]*([A-Za-z0-9_-]+)[ \t]*\]")
-_KEY = re.compile(r"[ \t]*([A-Za-z0-9_-]+)[ \t]*=")
+_HEADER = regex(r"[ \t]*\[\[?[ \t]*([A-Za-z0-9_-]+)[ \t]*\]")
+_KEY = regex(r"[ \t]*([A-Za-z0-9_-]+)[ \t]*=")
 
 
 def _headers(text: str) -> Iterator[tuple[int, str]]:

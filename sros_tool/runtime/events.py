@@ -12,11 +12,12 @@ import os
 import signal
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+from sros_tool.deferred import dataclass
 from sros_tool.errors import DocumentError
 
 
