@@ -284,6 +284,7 @@ def explain(
     if len(logs) > 1:
         raise UsageError("--log takes one log", "", "Run the command once for each log.")
     from sros_tool.explain.asking import is_policy
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.runtime.rmw import chosen_vendor
 
     mode = "--who" if who else "--reach" if reach else "--log" if logs else ""
@@ -300,6 +301,7 @@ def explain(
         )
     if names_policy and not (policy or reach):
         policy, root = root, None
+    opened = OpenedKeystore(root) if root else None
     if fleet_file and not (policy or names_policy):
         raise UsageError("--fleet goes with a policy only", "", "Leave it out.")
     if reach:
@@ -307,17 +309,19 @@ def explain(
             text = "It follows the rights, which are the same for all DDS vendors."
             raise UsageError("--reach takes only --vendor zenoh", text, "Leave it out.")
         stated = policy, fleet_file
-        zenoh = bool(_reason_for_zenoh(vendor, root))
+        zenoh = bool(_reason_for_zenoh(vendor, opened))
         only_in = domain_of(domain)
-        return _show_reach(reach, root, rest, stated, infrastructure, only_in, as_json, zenoh=zenoh)
+        return _show_reach(
+            reach, opened, rest, stated, infrastructure, only_in, as_json, zenoh=zenoh
+        )
     asking = _circumstances(moment, domain, time_zone, fleet_file)
-    print_notes([*_notes_on_past(asking.at, root)])
+    print_notes([*_notes_on_past(asking.at, opened)])
     if logs:
-        return _show_log(logs[0], root, rest, asking, as_json)
+        return _show_log(logs[0], opened, rest, asking, as_json)
     if vendor == ZENOH and distro:
         text = "Zenoh decides alike in every distribution."
         raise UsageError("--vendor zenoh takes no --distro", text, "Leave it out.")
-    why_zenoh = "" if all_vendors or all_distros else _reason_for_zenoh(vendor, root)
+    why_zenoh = "" if all_vendors or all_distros else _reason_for_zenoh(vendor, opened)
     by_machine = not (why_zenoh or vendor or distro or all_vendors or all_distros)
     if who and by_machine:
         _note_unknown_distribution()
@@ -326,13 +330,13 @@ def explain(
         chosen = None if why_zenoh else chosen_vendor(vendor, distro, os.environ)
         only = patterns, robots
         if policy:
-            return _show_who_in_policy(policy, root, rest, kind, chosen, asking, only, as_json)
+            return _show_who_in_policy(policy, opened, rest, kind, chosen, asking, only, as_json)
         by_stated = not (vendor or distro)
         return _show_who(
-            root, rest, kind, chosen, why_zenoh, asking, only, as_json, stated=by_stated
+            opened, rest, kind, chosen, why_zenoh, asking, only, as_json, stated=by_stated
         )
-    question = _question(root, rest, kind)
-    asked = _open(root, rest[0], policy, asking)
+    question = _question(opened, rest, kind)
+    asked = _open(opened, rest[0], policy, asking)
     context = asking.context(asked.enclave.joined_domains)
     explanation: DdsExplanation | ZenohExplanation
     if why_zenoh:
@@ -358,7 +362,7 @@ def explain(
         print_json(explanation)
     else:
         _echo(lines)
-    print_notes([*_policy_alone(root, asked, policy), *explanation.notes])
+    print_notes([*_policy_alone(opened, asked, policy), *explanation.notes])
     return 0 if explanation.allowed else 1
 
 
@@ -402,24 +406,21 @@ def _circumstances(
     )
 
 
-def _notes_on_past(moment: datetime, root: Path | None) -> Iterator[Note]:
+def _notes_on_past(moment: datetime, keystore: OpenedKeystore | None) -> Iterator[Note]:
     """Yield a note if the moment is in the past, where other files may have been in force."""
     if moment > now() - timedelta(minutes=1):
         return
     changes = 0
-    if root:
-        from sros_tool.keystore.reader import OpenedKeystore
-
+    if keystore:
         with suppress(SrosError):
-            entries = OpenedKeystore(root).ledger.entries
-            changes = sum(entry.time > iso(moment) for entry in entries)
+            changes = sum(entry.time > iso(moment) for entry in keystore.ledger.entries)
     text = "the current files decide for that time: they do not show what was allowed then"
     if changes:
         text += f"; {counted(changes, 'entry', 'entries')} of ledger.jsonl are later"
     yield Note("explain.past", text)
 
 
-def _reason_for_zenoh(vendor: str | None, root: Path | None) -> str:
+def _reason_for_zenoh(vendor: str | None, keystore: OpenedKeystore | None) -> str:
     """Return the reason to ask Zenoh and not a DDS vendor, or ""."""
     from sros_tool.keystore.layout import has_zenoh_files, is_keystore
     from sros_tool.runtime.rmw import RMW
@@ -427,22 +428,30 @@ def _reason_for_zenoh(vendor: str | None, root: Path | None) -> str:
     if vendor == ZENOH:
         return "as asked"
     rmw = os.environ.get(RMW, "")
-    keystore = root or Path(os.environ.get(KEYSTORE_VARIABLE, ""))
-    if vendor or "rmw_zenoh" not in rmw or not is_keystore(keystore):
+    root = keystore.root if keystore else Path(os.environ.get(KEYSTORE_VARIABLE, ""))
+    if vendor or "rmw_zenoh" not in rmw or not is_keystore(root):
         return ""
-    return f"{RMW} is {rmw}" if has_zenoh_files(keystore) else ""
+    return f"{RMW} is {rmw}" if has_zenoh_files(root) else ""
 
 
 # ── one question ───────────────────────────────────────────────────────────────────────────
 
 
-def _open(root: Path | None, name: str, policy: Path | None, asking: AskingContext) -> AskedEnclave:
+def _open(
+    keystore: OpenedKeystore | None, name: str, policy: Path | None, asking: AskingContext
+) -> AskedEnclave:
     """Open an enclave of a keystore, in its folder, or in a policy alone."""
     from sros_tool.explain.asking import is_enclave, open_to_ask
 
-    if root is None and not policy and not is_enclave(Path(name)):
-        root = keystore_from_environment()
-    return open_to_ask(root, name, policy, asking)
+    if keystore is None and not policy and not is_enclave(Path(name)):
+        keystore = _keystore_of_environment()
+    return open_to_ask(keystore, name, policy, asking)
+
+
+def _keystore_of_environment() -> OpenedKeystore:
+    from sros_tool.keystore.reader import OpenedKeystore
+
+    return OpenedKeystore(keystore_from_environment())
 
 
 def _note_unknown_distribution() -> None:
@@ -466,13 +475,13 @@ def _stated_distribution(keystore: OpenedKeystore | None, enclave: str) -> Distr
 
 
 def _policy_alone(
-    root: Path | None, asked_enclave: AskedEnclave, policy: Path | None
+    keystore: OpenedKeystore | None, asked_enclave: AskedEnclave, policy: Path | None
 ) -> list[Note]:
     """Return a note if the policy was explained although $ROS_SECURITY_KEYSTORE is set."""
     from sros_tool.runtime.variables import KEYSTORE
 
     default = os.environ.get(KEYSTORE)
-    if not default or root is not None or asked_enclave.enclave.signed or policy is None:
+    if not default or keystore is not None or asked_enclave.enclave.signed or policy is None:
         return []
     text = (
         f"this is decided by the policy '{policy}'. For the signed permissions, name the "
@@ -481,13 +490,15 @@ def _policy_alone(
     return [Note("explain.policy-alone", text)]
 
 
-def _question(root: Path | None, other_arguments: tuple[str, ...], kind: str | None) -> Question:
+def _question(
+    keystore: OpenedKeystore | None, other_arguments: tuple[str, ...], kind: str | None
+) -> Question:
     """Return the question in the arguments after the keystore: enclave, operation and name."""
     from sros_tool.explain.answer import ask
     from sros_tool.keystore.layout import is_keystore
 
     if (
-        root is None
+        keystore is None
         and len(other_arguments) > 1
         and other_arguments[1] in _OPERATIONS
         and is_keystore(Path(other_arguments[0]))
@@ -502,8 +513,8 @@ def _question(root: Path | None, other_arguments: tuple[str, ...], kind: str | N
         )
     if not 2 <= len(other_arguments) <= 3:
         remedy = "Write for example `sros explain /talker publish /chatter`."
-        if root and len(other_arguments) == 1 and other_arguments[0].startswith("/"):
-            folder = quote(f"{root}/enclaves{other_arguments[0]}")
+        if keystore and len(other_arguments) == 1 and other_arguments[0].startswith("/"):
+            folder = quote(f"{keystore.root}/enclaves{other_arguments[0]}")
             remedy += f" `sros inspect {folder}` shows everything that this enclave may do."
         raise UsageError("explain takes an enclave, an operation and a name", "", remedy)
     return ask(other_arguments[1], other_arguments[2] if len(other_arguments) > 2 else "", kind)
@@ -796,7 +807,7 @@ def _link_text(link: CheckedLink) -> str:
 
 
 def _show_who(
-    root: Path | None,
+    keystore: OpenedKeystore | None,
     other_arguments: tuple[str, ...],
     kind: str | None,
     chosen_vendor: tuple[Vendor, str] | None,
@@ -814,11 +825,10 @@ def _show_who(
     """
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.layout import is_original_keystore
-    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.selection import select_enclaves
 
     question = _question_to_all(other_arguments, kind)
-    keystore = OpenedKeystore(root or keystore_from_environment())
+    keystore = keystore or _keystore_of_environment()
     keystore.check()
     patterns, robots = only
     names = select_enclaves(keystore, (), patterns, robots=robots) if patterns or robots else None
@@ -852,7 +862,7 @@ def _show_who(
 
 def _show_who_in_policy(
     policy: Path,
-    root: Path | None,
+    keystore: OpenedKeystore | None,
     other_arguments: tuple[str, ...],
     kind: str | None,
     chosen_vendor: tuple[Vendor, str] | None,
@@ -865,7 +875,7 @@ def _show_who_in_policy(
     from sros_tool.explain.vendors import VendorOfPolicy
 
     patterns, robots = only
-    if root:
+    if keystore:
         text = "A keystore is asked about what it has signed."
         raise UsageError("--who takes a keystore or a policy", text, "Leave one of them out.")
     if chosen_vendor is None:
@@ -981,7 +991,7 @@ def _who_lines(
 
 def _show_reach(
     enclave: str,
-    root: Path | None,
+    keystore: OpenedKeystore | None,
     other_arguments: tuple[str, ...],
     stated: tuple[Path | None, Path | None],
     infrastructure: bool,
@@ -1000,8 +1010,8 @@ def _show_reach(
     from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 
     policy, fleet_file = stated
-    if root is None and len(other_arguments) == 1:
-        root, other_arguments = Path(other_arguments[0]), ()
+    if keystore is None and len(other_arguments) == 1:
+        keystore, other_arguments = OpenedKeystore(Path(other_arguments[0])), ()
     if other_arguments:
         raise UsageError("--reach takes an enclave, and no operation or name")
     if zenoh and policy:
@@ -1009,10 +1019,11 @@ def _show_reach(
             "--reach on Zenoh takes no --policy", "It uses the keystore's Zenoh files."
         )
     if zenoh:
-        source = load_zenoh_rights(OpenedKeystore(root or keystore_from_environment()))
+        source = load_zenoh_rights(keystore or _keystore_of_environment())
     else:
         fleet = fleet_of(fleet_file, None)
-        source = load_rights(root or policy or keystore_from_environment(), fleet)
+        named = keystore.root if keystore else policy  # which can be a policy, too
+        source = load_rights(named or keystore_from_environment(), fleet)
     with progress("following the rights"):
         followed = follow_reach(source, enclave, infrastructure=infrastructure, domain=domain)
     if as_json:
@@ -1053,7 +1064,7 @@ def _followed_lines(followed: FollowedReach) -> Iterator[str]:
 
 def _show_log(
     log: str,
-    root: Path | None,
+    keystore: OpenedKeystore | None,
     other_arguments: tuple[str, ...],
     asking: AskingContext,
     as_json: bool,
@@ -1064,7 +1075,7 @@ def _show_log(
     if len(other_arguments) > 1:
         raise UsageError("--log takes at most a keystore and an enclave")
     text = read_log(log)
-    explained = explain_log_of(log, text, root, "".join(other_arguments), asking)
+    explained = explain_log_of(log, text, keystore, "".join(other_arguments), asking)
     if as_json:
         print_json(explained)
         return 1 if explained.findings else 0

@@ -148,7 +148,7 @@ def is_enclave(folder: Path) -> bool:
 
 
 def open_to_ask(
-    root: Path | None, name: str, policy_file: Path | None, asking: AskingContext
+    keystore: OpenedKeystore | None, name: str, policy_file: Path | None, asking: AskingContext
 ) -> AskedEnclave:
     """Return an enclave to ask about, from a keystore, a folder ``name``, or a policy alone.
 
@@ -157,7 +157,6 @@ def open_to_ask(
         PolicyError: the policy does not have the enclave.
     """
     policy = policy_enclave = stated = None
-    keystore = OpenedKeystore(root) if root else None
     if policy_file:
         stated, policy = policy_to_ask(policy_file, fleet_of(asking.fleet_file, keystore))
         policy_enclave = policy.enclave(name)

@@ -127,8 +127,8 @@ class ExplainedLog(NamedTuple):
 class SearchedKeystore:
     """An index of the enclaves of a keystore, by peers and nodes that a log names."""
 
-    def __init__(self, root: Path) -> None:
-        self._keystore = OpenedKeystore(root)
+    def __init__(self, keystore: OpenedKeystore) -> None:
+        self._keystore = keystore
 
     def peer(self, guid: str) -> str:
         """Return the enclave of the participant with a GUID, as a vendor prints it; or ""."""
@@ -191,7 +191,7 @@ FindEnclave = Callable[[str], LoadedEnclave | None]
 
 
 def explain_log_of(
-    log: str, text: str, root: Path | None, name: str, asking: AskingContext
+    log: str, text: str, keystore: OpenedKeystore | None, name: str, asking: AskingContext
 ) -> ExplainedLog:
     """Explain the security messages of a log, and examine the enclaves that it names.
 
@@ -201,7 +201,6 @@ def explain_log_of(
     Raises:
         UsageError: ``name`` is an enclave, and there is no keystore.
     """
-    keystore = OpenedKeystore(root) if root else None
     named: LoadedEnclave | None = None
     if name:
         named = signed_enclave(keystore, name, asking.at)
@@ -233,8 +232,8 @@ def explain_log_of(
         text,
         find,
         lambda enclave: asking.context(enclave.joined_domains),
-        str(root or ""),
-        SearchedKeystore(root) if root and is_keystore(root) else None,
+        str(keystore.root) if keystore else "",
+        SearchedKeystore(keystore) if keystore and is_keystore(keystore.root) else None,
     )
     return ExplainedLog(log, findings, _NOTES if any(e.found for e in findings) else ())
 

@@ -713,7 +713,7 @@ class VendorOfKeystore(NamedTuple):
         from sros_tool.explain.earlier import note_on_earlier_permissions, note_on_revoked_enclaves
         from sros_tool.explain.who import note_on_export
 
-        yield from note_on_export(self.keystore.root)
+        yield from note_on_export(self.keystore)
         refuse = remedy_in_keystore(self.keystore.root, f"Run {REFUSE_STRANGERS}.")
         yield from _note_on_anybody((outcome.opened for outcome in outcomes), refuse)
         denied = {outcome.enclave for outcome in outcomes if not outcome.allowed}

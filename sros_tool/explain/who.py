@@ -122,12 +122,12 @@ class AnswerForAll(NamedTuple):
         )
 
 
-def note_on_export(root: Path) -> Iterator[Note]:
-    """Yield a note if a folder is an export, which may lack enclaves of its keystore."""
-    if not is_original_keystore(root):
+def note_on_export(keystore: OpenedKeystore) -> Iterator[Note]:
+    """Yield a note if a keystore is an export, which may lack enclaves of its keystore."""
+    if not is_original_keystore(keystore.root):
         text = (
-            f"'{root}' is an export, which may lack enclaves: enclaves that are elsewhere may have "
-            "the right, too. Ask the keystore that it comes from."
+            f"'{keystore.root}' is an export, which may lack enclaves: enclaves that are elsewhere "
+            "may have the right, too. Ask the keystore that it comes from."
         )
         yield Note("explain.export", text)
 

@@ -981,7 +981,7 @@ class ZenohOfKeystore:
         from sros_tool.explain.earlier import note_on_revoked_enclaves  # as in `outcomes`
         from sros_tool.explain.who import note_on_export
 
-        yield from note_on_export(self._keystore.root)
+        yield from note_on_export(self._keystore)
         yield from note_on_lacking_keys(self._keystore)
         yield from _note_on_unsigned(next(iter(self._evaluators.values())).unsigned_files())
         if any(outcome.of_router and outcome.allowed for outcome in outcomes):

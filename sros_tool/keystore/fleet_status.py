@@ -64,7 +64,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     has_enclave,
 )
-from sros_tool.keystore.ledger import RESTORED, SAME_KEY, Entry, behind_clause, clock_behind
+from sros_tool.keystore.ledger import RESTORED, SAME_KEY, Entry, behind_clause
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.parallel import map_slices
@@ -451,6 +451,8 @@ class FleetStatus:
     """The groups of the fleet file, with their robots."""
     awaited: frozenset[str] = frozenset()
     """The kinds of files that every robot has to have before the next stage of a rotation."""
+    recorded: datetime | None = None
+    """The time of the last entry of the ledger, in UTC; None without an entry."""
 
     @property
     def names(self) -> list[str]:
@@ -525,7 +527,7 @@ class FleetStatus:
         is_accepted = publication is None or bool(publication.accepted)
         to_do = tuple(robot.with_to_do(now, is_accepted=is_accepted) for robot in robots)
         received = max((robot.received for robot in self.robots if robot.received), default=None)
-        clock = clock_behind(self.keystore, now)
+        clock = behind_clause(now, self.recorded, "the last entry of the ledger")
         clock = clock or behind_clause(now, received, "the last confirmation")
         if clock:  # nobody knows how old the confirmations are
             to_do = tuple(robot.without_list() for robot in to_do)
@@ -564,6 +566,7 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
         is_any_revoked=records.is_any_revoked(),
         groups=fleet.groups,
         awaited=stages.awaited,
+        recorded=keystore.ledger_file.last_time(),
     )
 
 

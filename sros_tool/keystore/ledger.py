@@ -201,13 +201,6 @@ _CLOCK_TOLERANCE = timedelta(hours=1)
 """How far behind the clock may be without counting as wrong."""
 
 
-def clock_behind(root: Path, now: datetime) -> str:
-    """Return, as a clause, how far the clock is behind the last entry of the ledger; "" if not."""
-    with suppress(SrosError, OSError):
-        return LedgerFile(root, lambda: ()).clock_behind(now)
-    return ""
-
-
 def behind_clause(now: datetime, last: datetime | None, event: str) -> str:
     """Return, as a clause, how far the clock is behind the moment ``last`` of ``event``; "" if not.
 
@@ -447,7 +440,11 @@ class LedgerFile:
         return files.part, files.state.st_size if files.state else 0
 
     def clock_behind(self, now: datetime) -> str:
-        """Return, as a clause, how far the clock is behind the last entries; "" if it is not.
+        """Return, as a clause, how far the clock is behind the last entries; "" if it is not."""
+        return behind_clause(now, self.last_time(), "the last entry of the ledger")
+
+    def last_time(self) -> datetime | None:
+        """Return the time of the last entries, in UTC; None without an entry.
 
         The latest entry since the last revocation list counts, so that a later entry with the wrong
         time hides nothing, and a new list corrects a clock that was ahead.
@@ -459,7 +456,7 @@ class LedgerFile:
                     times.append(parse_iso(entry.time))
                 if entry.what == "crl":
                     break
-        return behind_clause(now, max(times, default=None), "the last entry of the ledger")
+        return max(times, default=None)
 
     def content(self) -> Iterator[bytes]:
         """Yield the bytes of the last part, in blocks."""

@@ -39,7 +39,7 @@ from sros_tool.keystore.delivery.release import (
 )
 from sros_tool.keystore.delivery.repository import Composer, Roots, load_signer, read_present
 from sros_tool.keystore.fleet_status import fleet_status
-from sros_tool.keystore.ledger import Entry, clock_behind
+from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.crl import load_crl
@@ -903,7 +903,7 @@ def test_a_clock_that_was_set_back(publisher: Home) -> None:
         change.entries.append(Entry(iso(wrong), "x"))
         change.record()
         change.finish()
-    assert "h 59 min behind" in clock_behind(publisher.root, wrong)
+    assert "h 59 min behind" in OpenedKeystore(publisher.root).ledger_file.clock_behind(wrong)
     status = fleet_status(OpenedKeystore(publisher.root))
     assert not status.with_overdue(publisher.now + timedelta(days=30, minutes=30)).clock
     behind = status.with_overdue(publisher.now)
@@ -912,9 +912,9 @@ def test_a_clock_that_was_set_back(publisher: Home) -> None:
         change.entries.append(Entry(iso(wrong), "crl"))
         change.record()
         change.finish()
-    assert not clock_behind(publisher.root, wrong)
+    assert not OpenedKeystore(publisher.root).ledger_file.clock_behind(wrong)
     (publisher.root / "ledger.jsonl").write_text("damaged")
-    assert not clock_behind(publisher.root, publisher.now)
+    assert not OpenedKeystore(publisher.root).ledger_file.clock_behind(publisher.now)
 
 
 def test_keystore_and_folder_in_one_another(publisher: Home) -> None:

@@ -64,7 +64,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     fleet_key,
 )
-from sros_tool.keystore.ledger import RESTORED, Entry, clock_behind
+from sros_tool.keystore.ledger import RESTORED, Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import Forgotten
 from sros_tool.keystore.lifecycle.revoke import (
@@ -200,7 +200,7 @@ def publish(
     recorded_fleet(keystore)
     checked_fleet(keystore)
     _check_apart(root, folder)
-    if behind := clock_behind(root, now):
+    if behind := keystore.ledger_file.clock_behind(now):
         raise KeystoreError(
             behind,
             "Robots would refuse what is published now, or get it with wrong dates.",
