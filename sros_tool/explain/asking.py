@@ -21,7 +21,6 @@ from sros_tool.explain.answer import Evaluator, Question, about_action, ask
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     PERMISSIONS_FILE,
-    has_enclave,
     is_keystore,
 )
 from sros_tool.keystore.participant import (
@@ -248,7 +247,7 @@ def signed_enclave(
             raise KeystoreError(f"'{root}' is the folder of {found_name}, not of {name}")
         return enclave
     keystore.check()
-    if has_enclave(root, name):
+    if keystore.has_enclave(name):
         return deciding_enclave(keystore, name, moment=moment)
     if planned:
         return None

@@ -332,7 +332,7 @@ class ZenohEvaluator:
             known = {
                 name: file.process.access.names() for name, file in routers.items() if file.process
             }
-            check_routers(self.root, known)
+            check_routers(self.keystore, known)
             return routers
         if has_zenoh_files(self.root):
             raise KeystoreError(
@@ -1022,7 +1022,7 @@ class ZenohExplanation(NamedTuple):
     out_of_date: tuple[str, ...] | None
     """The deciding files that do not match the permissions for the question; null if not known."""
     stated: Answer
-    root: Path
+    keystore: OpenedKeystore
     notes: tuple[Note, ...]
 
     @property
@@ -1070,7 +1070,7 @@ class ZenohExplanation(NamedTuple):
         text = "Look at the files"
         if self.out_of_date:
             text = "Write the Zenoh files as the permissions are"
-        command = f"sros zenoh {quote(str(self.root))}"
+        command = f"sros zenoh {quote(str(self.keystore.root))}"
         return f"{text}: `{command}`; then restart the processes that it names."
 
     @property
@@ -1131,7 +1131,7 @@ def explain_on_zenoh(
         *(() if joins else note_on_lacking_keys(keystore)),
     )
     asked = Asked(enclave.name, question, context)
-    return ZenohExplanation(asked, why, answer, outdated, by_permissions, keystore.root, notes)
+    return ZenohExplanation(asked, why, answer, outdated, by_permissions, keystore, notes)
 
 
 def _notes(answer: ZenohAnswer, stated: Answer, outdated: Sequence[str] | None) -> Iterator[Note]:

@@ -27,7 +27,7 @@ from sros_tool.fleet.robots import (
     size_problem,
     unrecorded_enclaves,
 )
-from sros_tool.keystore.layout import FLEET, FLEET_ROOT, enclave_names, has_enclave
+from sros_tool.keystore.layout import FLEET, FLEET_ROOT
 from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.policy.placeholders import has_placeholder
@@ -161,9 +161,9 @@ def recorded_fleet(keystore: OpenedKeystore) -> Fleet:
     return fleet
 
 
-def enclaves_of_robot(root: Path, fleet: Fleet, robot: Robot) -> tuple[str, ...]:
+def enclaves_of_robot(keystore: OpenedKeystore, fleet: Fleet, robot: Robot) -> tuple[str, ...]:
     """Return the names of the robot's enclaves that exist in the keystore, sorted."""
-    return tuple(name for name in enclaves_of(fleet, robot) if has_enclave(root, name))
+    return tuple(name for name in enclaves_of(fleet, robot) if keystore.has_enclave(name))
 
 
 def publish_command(root: Path) -> str:
@@ -301,12 +301,12 @@ def _refuse_shared(fleet: Fleet) -> None:
 
 
 def refuse_stale_domains(
-    root: Path, before: EnclaveDomains, fleet: Fleet, stated: Collection[str]
+    keystore: OpenedKeystore, before: EnclaveDomains, fleet: Fleet, stated: Collection[str]
 ) -> None:
     """Raise `KeystoreError` if an enclave would keep permissions for its former domains.
 
     Args:
-        root: the keystore.
+        keystore: the keystore.
         before: the domains of the keystore's enclaves until now.
         fleet: the robots of the keystore from now on.
         stated: the names of enclaves that get new permissions.
@@ -314,7 +314,7 @@ def refuse_stale_domains(
     after = EnclaveDomains(before.keystore, fleet)
     if not any(robot.domain is not None for side in (before, after) for robot in side.robots()):
         return
-    for name in enclave_names(root):
+    for name in keystore.names:
         if name in stated or robot_of(fleet, name) is None:
             continue
         if before.of(name) != (domains := after.of(name)):
@@ -326,7 +326,7 @@ def refuse_stale_domains(
             )
 
 
-def left_enclave_notes(root: Path, before: Fleet, after: Fleet) -> Iterator[Note]:
+def left_enclave_notes(keystore: OpenedKeystore, before: Fleet, after: Fleet) -> Iterator[Note]:
     """Yield a note for each robot that no longer has enclaves, or a router, that the keystore has.
 
     No two robots of ``after`` have an enclave in common, as `write_fleet` makes sure.
@@ -338,15 +338,13 @@ def left_enclave_notes(root: Path, before: Fleet, after: Fleet) -> Iterator[Note
         if same_robot and robot.router and not same_robot.router:
             router = router_of(before, robot)
             kept.add(router)
-            if has_enclave(root, router):
-                yield _lost_router_note(root, robot.name, router)
+            if keystore.has_enclave(router):
+                yield _lost_router_note(keystore, robot.name, router)
         names = (name for name in enclaves_of(before, robot) if name not in kept)
-        if left_names := {name for name in names if has_enclave(root, name)}:
+        if left_names := {name for name in names if keystore.has_enclave(name)}:
             left_enclaves[robot.name] = left_names
     # Also what an earlier change of the fleet left.
-    earlier = (
-        unrecorded_enclaves(before, enclave_names(root), left_enclaves) if left_enclaves else {}
-    )
+    earlier = unrecorded_enclaves(before, keystore.names, left_enclaves) if left_enclaves else {}
     for name, enclaves in left_enclaves.items():
         enclaves.update(enclave for enclave in earlier[name].below if not robot_of(after, enclave))
         why = "has other enclave paths now" if name in after.robots else "is no longer in the fleet"
@@ -355,26 +353,27 @@ def left_enclave_notes(root: Path, before: Fleet, after: Fleet) -> Iterator[Note
         yield Note(
             "fleet.left-enclaves",
             f"the robot {name} {why}: {shown} {stay} valid. To take them back, run `sros revoke "
-            f"{quote(str(root))} {arguments_for(root, sorted(enclaves))}`.",
+            f"{quote(str(keystore.root))} {arguments_for(keystore, sorted(enclaves))}`.",
         )
 
 
-def _lost_router_note(root: Path, robot: str, router: str) -> Note:
+def _lost_router_note(keystore: OpenedKeystore, robot: str, router: str) -> Note:
     text = (
         f"the robot {robot} has no Zenoh router any more: its enclave {router} stays valid. Stop "
-        f"the router, and take its enclave back: `sros revoke {quote(str(root))} {router}`."
+        "the router, and take its enclave back: `sros revoke "
+        f"{quote(str(keystore.root))} {router}`."
     )
     return Note("fleet.left-router", text)
 
 
-def arguments_for(root: Path, names: Sequence[str]) -> str:
+def arguments_for(keystore: OpenedKeystore, names: Sequence[str]) -> str:
     """Return the command line arguments that select exactly the enclaves ``names``.
 
     These are ``--match 'PREFIX*'`` if that selects no others, else the names.
     """
     begin = f"{os.path.commonpath(names).rstrip('/')}/"
     if len(names) > 1 and begin != "/":
-        fitting = [name for name in enclave_names(root) if name.startswith(begin)]
+        fitting = [name for name in keystore.names if name.startswith(begin)]
         if fitting == sorted(names):
             return f"--match {quote(f'{begin}*')}"
     return " ".join(names)

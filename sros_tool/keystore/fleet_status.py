@@ -62,7 +62,6 @@ from sros_tool.keystore.layout import (
     REQUIRED_FILES,
     enclave_folder,
     enclave_path,
-    has_enclave,
 )
 from sros_tool.keystore.ledger import RESTORED, SAME_KEY, Entry, behind_clause
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
@@ -660,7 +659,7 @@ def _compare_robots(
 def _compare(
     keystore: OpenedKeystore, fleet: Fleet, robot: Robot, keystore_files: _KeystoreFiles
 ) -> _ComparedRobot:
-    enclaves = enclaves_of_robot(keystore.root, fleet, robot)
+    enclaves = enclaves_of_robot(keystore, fleet, robot)
     notes: list[str] = []
     received = None
     try:
@@ -1022,7 +1021,7 @@ class _KeystoreRecords:
             return ()
         names = {name for name in enclaves_of(self._fleet, robot) if name in self._revoked}
         names.update(self._unrecorded[robot.name].below)
-        return tuple(sorted(name for name in names if not has_enclave(self._root, name)))
+        return tuple(sorted(name for name in names if not self._keystore.has_enclave(name)))
 
     def short_lived(self, first: Mapping[str, _Expiring]) -> tuple[str, ...]:
         """Return the short-lived enclaves of which a file is in ``first``: it expires first."""
@@ -1051,9 +1050,12 @@ class _KeystoreRecords:
         kind, name = _kind_of(difference.path), enclave_of(difference.path)
         state, issued_at, owner = self._identify(difference, kind, name)
         if not difference.is_own and state is not State.REVOKED:
-            if name in self._revoked and not has_enclave(self._root, name):
+            if name in self._revoked and not self._keystore.has_enclave(name):
                 state = State.REVOKED
-            elif has_enclave(self._root, name) or robot_of(self._fleet, name) not in (None, robot):
+            elif self._keystore.has_enclave(name) or robot_of(self._fleet, name) not in (
+                None,
+                robot,
+            ):
                 state, owner = State.ANOTHER, name
         other_robot = robot_of(self._fleet, owner) if owner else None
         return ConfirmedFile(

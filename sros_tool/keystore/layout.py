@@ -258,11 +258,6 @@ def is_enclave(folder: Path) -> bool:
     return any(os.path.lexists(f"{folder}/{file}") for file in _OF_ENCLAVE)
 
 
-def has_enclave(root: Path, name: str) -> bool:
-    """Return whether the keystore has the enclave ``name``, without listing all enclaves."""
-    return is_enclave(enclave_path(root, name))
-
-
 def key_on_robot(folder: Path) -> bool:
     """Return whether the key of an enclave was made on its robot and stays there."""
     return (folder / REQUEST).exists() and not has_key(folder)

@@ -287,7 +287,7 @@ def load_zenoh_rights(keystore: OpenedKeystore, *, hidden: bool = False) -> Righ
             ):
                 sources.append(_zenoh_rights(file, document))
     check_routers(
-        root,
+        keystore,
         {router: configurations[files[router] / ROUTER_FILE].access.names() for router in routers},
     )
     # Peers state the rights that both ends of a link have: parts of those that the router states.
@@ -341,7 +341,7 @@ def _links(
     return RouterLinks(router_of, passing)
 
 
-def check_routers(root: Path, known: Mapping[str, Collection[str]]) -> None:
+def check_routers(keystore: OpenedKeystore, known: Mapping[str, Collection[str]]) -> None:
     """Raise `KeystoreError` if a router has no rules for another router of the keystore.
 
     ``known`` maps the enclave of each router to the names for which its configuration has rules. A
@@ -351,11 +351,12 @@ def check_routers(root: Path, known: Mapping[str, Collection[str]]) -> None:
     for name in routing:
         if strangers := sorted({*routing} - {name, *known[name]}):
             raise KeystoreError(
-                f"keystore '{root}' has the files of several routers that are not connected",
+                f"keystore '{keystore.root}' has the files of several routers that are not "
+                "connected",
                 f"{ROUTER_FILE} of {name} has no rules for {', '.join(strangers[:5])}, so it is "
                 "not known which file the router uses.",
                 "Remove the files that no process uses, or write all files again: "
-                f"`sros zenoh {quote(str(root))}`.",
+                f"`sros zenoh {quote(str(keystore.root))}`.",
             )
 
 

@@ -157,7 +157,7 @@ def _unrecorded_notes(
             "fleet.unrecorded-enclaves",
             f"Still valid, because the fleet does not record whose it is: {_names_text(left)}, "
             "with the name of a robot that you revoke in the path. If the key was on that robot, "
-            f"run `sros revoke {quote(str(keystore.root))} {arguments_for(keystore.root, left)}`.",
+            f"run `sros revoke {quote(str(keystore.root))} {arguments_for(keystore, left)}`.",
         )
 
 
@@ -192,7 +192,7 @@ def _robots_enclaves(
     enclaves: list[str] = []
     for name in robots:
         own_enclaves = (
-            enclaves_of_robot(root, fleet, fleet.robots[name]) if name in fleet.robots else ()
+            enclaves_of_robot(keystore, fleet, fleet.robots[name]) if name in fleet.robots else ()
         )
         own_enclaves += unrecorded[name].below if name in unrecorded else ()
         if not own_enclaves:
@@ -201,7 +201,7 @@ def _robots_enclaves(
                     f"the fleet in keystore '{root}' gives no enclave to a robot {name}",
                     f"It has {_names_text(left)}: perhaps the robot left the fleet or a group, or "
                     "the path is written without {robot}.",
-                    f"Name the enclaves themselves: {arguments_for(root, left)}.",
+                    f"Name the enclaves themselves: {arguments_for(keystore, left)}.",
                 )
             fleet.robot(name)
             raise KeystoreError(

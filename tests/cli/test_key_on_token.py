@@ -13,8 +13,9 @@ import pytest
 
 from sros_tool.dds.decision.vendors import CYCLONE_DDS, TESTED
 from sros_tool.errors import PkiError, UsageError
-from sros_tool.keystore.layout import has_enclave, list_enclaves
+from sros_tool.keystore.layout import list_enclaves
 from sros_tool.keystore.participant import load_enclave
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.token import (
     TokenUri,
     parse_enclave_uri,
@@ -150,7 +151,10 @@ def test_a_place_that_cannot_be_used_is_refused_before_anything_is_made(
     ):
         ended = sros(*words, "--key", uri)
         assert (ended.status, ended.err.count("\n")) == (2, 1), ended
-    assert (has_enclave(root, "/new"), (tmp_path / "robot").exists()) == (False, False)
+    assert (OpenedKeystore(root).has_enclave("/new"), (tmp_path / "robot").exists()) == (
+        False,
+        False,
+    )
 
 
 def test_one_key_is_not_given_to_two_enclaves(root: Path) -> None:

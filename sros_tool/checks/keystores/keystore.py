@@ -207,13 +207,13 @@ def keystore_findings(
         ]
         found += findings_in(parts, distribution)
     real_root = os.path.realpath(root)
-    located = (_with_real_file(finding, root, real_root) for finding in found)
+    located = (_with_real_file(finding, opened, real_root) for finding in found)
     found = with_causes(
         with_joined_findings([_with_enclave_names(finding, keystore) for finding in located])
     )
     if not keystore.is_original:
         return found
-    return _with_cause_of_expiry(_with_cause_of_ros2(found, opened), root)
+    return _with_cause_of_expiry(_with_cause_of_ros2(found, opened), opened)
 
 
 def _stated_distributions(
@@ -298,14 +298,14 @@ def _governance_findings(
         yield from governance_findings(keystore, governance, file, vendors)
 
 
-def _with_real_file(finding: Finding, root: Path, real_root: str) -> Finding:
+def _with_real_file(finding: Finding, keystore: OpenedKeystore, real_root: str) -> Finding:
     """Return the finding with the path of the shared file instead of an enclave's link to it."""
     if "/enclaves/" not in finding.file or finding.id.startswith("keystore.link"):
         return finding
     real = Path(os.path.realpath(finding.file))
     if not Path(finding.file).is_symlink() or not real.is_relative_to(real_root):
         return finding
-    return finding._replace(file=str(root / real.relative_to(real_root)))
+    return finding._replace(file=str(keystore.root / real.relative_to(real_root)))
 
 
 _OF_SEVERAL = regex(
@@ -363,7 +363,7 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: OpenedKeystore) -
         return _with_cause(
             findings,
             chosen,
-            root,
+            keystore,
             "a keystore that ros2/sros2 made",
             text,
             f"Run `sros update_keystore {quote(str(root))} --template sros2`, which takes it over "
@@ -383,7 +383,7 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: OpenedKeystore) -
     return _with_cause(
         findings,
         chosen,
-        root,
+        keystore,
         f"{len(names)} enclaves that the keystore never issued"
         if len(names) > 1
         else "an enclave that the keystore never issued",
@@ -395,22 +395,22 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: OpenedKeystore) -
     )
 
 
-def _with_cause_of_expiry(findings: Sequence[Finding], root: Path) -> list[Finding]:
+def _with_cause_of_expiry(findings: Sequence[Finding], keystore: OpenedKeystore) -> list[Finding]:
     """Return the findings, with a cause for all certificates and permissions that expire soon."""
     soon = [f for f in findings if f.kind is EXPIRES_SOON and not f.accepted and not f.cause]
     if not soon:
         return list(findings)
     enclaves = len({finding.subject for finding in soon})
     first = min(soon, key=lambda finding: finding.text.rpartition(" ")[2])
-    published = publish_command(root)
+    published = publish_command(keystore.root)
     return _with_cause(
         findings,
         soon,
-        root,
+        keystore,
         EXPIRES_SOON.title.replace("a certificate", "certificates"),
         f"{counted(len(soon), 'file')} of {counted(enclaves, 'enclave')}, the first of "
         f"{first.subject}: {first.text}. {EXPIRES_SOON.why}",
-        f"Run `{renewal_command(root)}`, then "
+        f"Run `{renewal_command(keystore.root)}`, then "
         f"{published or 'export the enclaves again'}, and restart their processes.",
     )
 
@@ -423,7 +423,7 @@ def _is_unrecorded(findings: Sequence[Finding], name: str) -> bool:
 def _with_cause(
     findings: Sequence[Finding],
     chosen: Sequence[Finding],
-    root: Path,
+    keystore: OpenedKeystore,
     title: str,
     text: str,
     remedy: str,
@@ -432,7 +432,7 @@ def _with_cause(
     together = {id(finding) for finding in chosen if finding.severity >= WARNING}
     if len(together) < 2:
         return list(findings)
-    cause = Cause(title, text, remedy, len(together), str(root))
+    cause = Cause(title, text, remedy, len(together), str(keystore.root))
     return [
         finding._replace(cause=cause) if id(finding) in together else finding
         for finding in findings

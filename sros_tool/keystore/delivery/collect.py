@@ -540,7 +540,7 @@ class _Verifier:
         """Return whether all enclaves that a robot had were revoked."""
         return bool(
             self._revoked
-            and not enclaves_of_robot(self._keystore.root, self._fleet, robot)
+            and not enclaves_of_robot(self._keystore, self._fleet, robot)
             and self._revoked_names.intersection(enclaves_of(self._fleet, robot))
         )
 

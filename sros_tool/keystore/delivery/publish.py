@@ -841,11 +841,10 @@ class _Run:
         """Return the enclaves of a robot with certificates; none if it is not in the fleet."""
         if robot not in fleet.robots:
             return []
-        root = self.keystore.root
         return [
             name
-            for name in enclaves_of_robot(root, fleet, fleet.robots[robot])
-            if (enclave_path(root, name) / CERTIFICATE_FILE).exists()
+            for name in enclaves_of_robot(self.keystore, fleet, fleet.robots[robot])
+            if (self.keystore.folder(name) / CERTIFICATE_FILE).exists()
         ]
 
     def _has_files_of(self, robot: str, release: PublishedRelease) -> bool:

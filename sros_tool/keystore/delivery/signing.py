@@ -363,7 +363,7 @@ class _Signer:
         if fleet and not paths <= set(fleet.enclaves):
             before = EnclaveDomains(change.domains, fleet)
             fleet = change.write_fleet(fleet, paths)
-            refuse_stale_domains(root, before, fleet, stated)
+            refuse_stale_domains(change.keystore, before, fleet, stated)
         for name, of_enclave in stated.items():
             if of_enclave.path and not (fleet and robot_of(fleet, name)):
                 lacks = "its fleet does not have the robot" if fleet else "it has no fleet"

@@ -46,7 +46,7 @@ from sros_tool.keystore.layout import (
     ROLES,
     ca_certificate,
     enclave_folder,
-    has_enclave,
+    is_enclave,
 )
 from sros_tool.keystore.participant import JoinContext, VendorParticipant, load_enclave
 from sros_tool.keystore.reader import OpenedKeystore
@@ -447,7 +447,9 @@ class _FilesOfChange:
         added = [f"{serial:x}" for serial in _listed_serials(after) - _listed_serials(before)]
         entries = ledger.with_values("serial", added).entries
         listed = {entry.enclave for entry in entries if entry.enclave}
-        existing = (name for name in recorded if has_enclave(self.transaction.root, name))
+        existing = (
+            name for name in recorded if is_enclave(self.transaction.root / enclave_folder(name))
+        )
         kept = next((name for name in existing if enclave_folder(name) not in self.changed), None)
         return listed | ({kept} if kept else set())
 
@@ -516,7 +518,7 @@ def _kinds(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[str]]:
         names.update(others)
     elif shared:
         names.update(files.transaction.enclaves)
-    present = {name for name in names if has_enclave(root, name)}
+    present = {name for name in names if is_enclave(root / enclave_folder(name))}
     lists: dict[str, frozenset[int]] = {}
     kinds: dict[_Kind, list[str]] = {}
     for name in sorted(names):

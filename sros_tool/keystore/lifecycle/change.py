@@ -289,7 +289,7 @@ class KeystoreChange:
         if self.template.zenoh:
             self.set_network(self.with_routers_of_robots(self.template.zenoh, before))
         elif any(robot.router for robot in fleet.robots.values()):
-            self.notes.append(_no_network_note(self.root))
+            self.notes.append(_no_network_note(self.keystore))
         return fleet
 
     def with_routers_of_robots(
@@ -592,10 +592,10 @@ def _short_lived_notes(fleet: Fleet, template: Template) -> Iterator[Note]:
         yield Note("fleet.short-lived", text)
 
 
-def _no_network_note(root: Path) -> Note:
+def _no_network_note(keystore: OpenedKeystore) -> Note:
     text = (
         "the fleet names Zenoh routers of robots, but the keystore has no Zenoh network yet; "
-        f"create it with `sros zenoh {quote(str(root))}`."
+        f"create it with `sros zenoh {quote(str(keystore.root))}`."
     )
     return Note("fleet.no-zenoh-network", text)
 

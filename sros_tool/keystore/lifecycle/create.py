@@ -500,13 +500,14 @@ def _prepare_change(
         protections: the protection that policies demand; the governance is changed if it gives
             less.
     """
-    root = change.root
     change.begin_issuing(domain)
     if fleet is not None:
         before = load_fleet(change.keystore)
         recorded = change.write_fleet(fleet, patterns)
-        refuse_stale_domains(root, EnclaveDomains(change.domains, before), recorded, stated)
-        change.notes += left_enclave_notes(root, before, recorded) if before else ()
+        refuse_stale_domains(
+            change.keystore, EnclaveDomains(change.domains, before), recorded, stated
+        )
+        change.notes += left_enclave_notes(change.keystore, before, recorded) if before else ()
     if protections:
         _raise_protection(change, protections)
 
@@ -1090,7 +1091,7 @@ class _EnclaveMaker:
         words, left = [], list(names)
         fleet = load_fleet(self._change.keystore)
         for robot in fleet.robots.values() if fleet and len(names) > 1 else ():
-            own = enclaves_of_robot(self._root, fleet, robot) if fleet else ()
+            own = enclaves_of_robot(self._change.keystore, fleet, robot) if fleet else ()
             if own and {*own} <= {*names}:
                 words.append(f"--robot {robot.name}")
                 left = [name for name in left if name not in own]

@@ -27,7 +27,7 @@ from sros_tool.keystore.issuing.enclave import (
 )
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.issuing.tokens import EnclaveTokens, token_notes, token_places
-from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path, has_enclave, has_key
+from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path, has_key
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
 from sros_tool.keystore.lifecycle.replaced import Superseded, certificates_until, lacks_some
 from sros_tool.keystore.rights import RecordedRights, SignedRights
@@ -84,7 +84,7 @@ def renew(
     )
     with change:
         for name in names:
-            if not has_enclave(root, check_enclave_name(name)):
+            if not change.keystore.has_enclave(check_enclave_name(name)):
                 raise missing_enclave_error(change.keystore, name, change.names)
         wanted = dict.fromkeys(names)
         if expiring is not None:

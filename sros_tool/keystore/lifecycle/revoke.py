@@ -219,7 +219,7 @@ def restore_revocations(
     if unknown:
         change.notes.append(_unknown_note(change, unknown))
     replaced = _key_revoked_by_enclave(change, revoked, {key for _, key in replaced_keys}, gone)
-    change.notes += _replaced_notes(root, replaced)
+    change.notes += _replaced_notes(change, replaced)
     outcomes = dict.fromkeys(lost_revocations, "revoked") | dict.fromkeys(replaced, "replaced")
     return change.result(Changed, outcomes=outcomes)
 
@@ -250,10 +250,10 @@ def _key_revoked_by_enclave(
     return replaced
 
 
-def _replaced_notes(root: Path, replaced: Mapping[str, bool]) -> Iterator[Note]:
+def _replaced_notes(change: KeystoreChange, replaced: Mapping[str, bool]) -> Iterator[Note]:
     """Yield a note on enclaves whose certificates, and perhaps keys, were replaced."""
     commands = [
-        f"`sros renew {quote(str(root))} {' '.join(map(quote, names))}{options}`"
+        f"`sros renew {quote(str(change.root))} {' '.join(map(quote, names))}{options}`"
         for is_key_revoked, options in ((False, ""), (True, " --new-key --revoke-old"))
         if (names := [name for name, is_key in replaced.items() if is_key is is_key_revoked])
     ]

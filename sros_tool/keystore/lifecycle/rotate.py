@@ -161,14 +161,13 @@ def rotate_ca(
                 _refuse_edited(change.keystore)
             cut_off = robots_cut_off(change.keystore, rotation, stage, now)
             if cut_off and not allow_unconfirmed:
-                raise _cut_off_error(root, rotation, stage, cut_off)
+                raise _cut_off_error(change.keystore, rotation, stage, cut_off)
             stage = rotator.go_to(stage, roles, new_keys, validity, progress)
             if stage in (RotationStage.DISTRIBUTE, RotationStage.REISSUE):
                 change.notes += _no_robot_notes(change.keystore, change.names)
             change.finish()
         elif delete_old_key:
-            kept = sorted((root / RETIRED).glob("*.key.pem"))
-            _refuse_late_deletion(root, rotation.stage, [str(path) for path in kept])
+            _refuse_late_deletion(change.keystore, rotation.stage)
     return _step(
         change,
         stage=stage,
@@ -225,13 +224,15 @@ def _no_robot_notes(keystore: OpenedKeystore, names: Iterable[str]) -> Iterator[
         )
 
 
-def _refuse_late_deletion(root: Path, stage: RotationStage, kept: Sequence[str]) -> None:
-    """Raise `UsageError` if the keystore is at ``stage`` already, and no old key is deleted."""
+def _refuse_late_deletion(keystore: OpenedKeystore, stage: RotationStage) -> None:
+    """Raise `UsageError` if the keystore is at ``stage`` already, and has old keys."""
+    kept = sorted(map(str, (keystore.root / RETIRED).glob("*.key.pem")))
     if stage is RotationStage.DISTRIBUTE or (kept and stage is not RotationStage.NONE):
         raise UsageError(
             f"the keystore is already at the stage {stage}, so no key is deleted",
             "`sros revoke` may need the key of the old identity CA until the stage retire.",
-            f"Run `sros rotate_ca {quote(str(root))} --next --delete-old-key` for that stage.",
+            f"Run `sros rotate_ca {quote(str(keystore.root))} --next --delete-old-key` for that "
+            "stage.",
         )
     if kept:
         raise UsageError(
@@ -242,9 +243,9 @@ def _refuse_late_deletion(root: Path, stage: RotationStage, kept: Sequence[str])
 
 
 def _cut_off_error(
-    root: Path, rotation: Rotation, to: RotationStage, robots: Sequence[str]
+    keystore: OpenedKeystore, rotation: Rotation, to: RotationStage, robots: Sequence[str]
 ) -> KeystoreError:
-    where, names = quote(str(root)), first_few(robots, _SHOWN)
+    where, names = quote(str(keystore.root)), first_few(robots, _SHOWN)
     if _leaves_out_stages(rotation, to):
         return KeystoreError(
             f"several stages at once would cut off every robot: {names}",
