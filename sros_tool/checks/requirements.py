@@ -23,6 +23,16 @@ VACUOUS = FindingKind(
     "Correct the name or its kind (service or action), here or in the policy (was a topic "
     "renamed?), or remove the requirement.",
 )
+UNNAMED = FindingKind(
+    "requirement.unnamed",
+    NOTE,
+    "a requirement about a name that no right states",
+    "Only wildcards match the name. A misspelled name looks like this, and so does one that is to "
+    "stay unused.",
+    "The requirements file.",
+    "Compare the name with those of the robot; ignore this if it is to stay unused.",
+    prominent=True,
+)
 DROPPED = FindingKind(
     "requirement.dropped",
     WARNING,

@@ -22,7 +22,8 @@ from collections.abc import (
     Sequence,
 )
 from functools import lru_cache, partial
-from itertools import product
+from itertools import product, takewhile
+from operator import eq
 
 from sros_tool.automata import NameSet, SearchLimit
 from sros_tool.deferred import dataclass
@@ -52,6 +53,7 @@ from sros_tool.proof.requirements import (
 )
 from sros_tool.proof.worlds import (
     ANYBODY,
+    Side,
     Topics,
     TopicUser,
     World,
@@ -112,6 +114,7 @@ class Verdict:
     that says why the requirement cannot fail whatever rights enclaves get, or "".  ``assumed`` is a
     name whose protection is assumed because the policy does not state it, or "".  ``kept`` is a
     demanded use that does not pass between Zenoh routers, so other enclaves do not get it; or None.
+    ``unnamed`` are names in the requirement that no right states, and only wildcards match.
     """
 
     requirement: Requirement
@@ -120,6 +123,7 @@ class Verdict:
     always: str = ""
     assumed: str = ""
     kept: KeptUse | None = None
+    unnamed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,13 +192,14 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
             raise AssertionError(requirement)
     if witness:
         _confirm(requirement, witness, world)
-    empty = tuple(_empty_list_clauses(requirement, world, limit))
+    unused, unnamed = _unused_names(requirement, world, limit)
+    empty = (*_missing_enclaves_clauses(requirement, world), *unused)
     always = "" if witness or empty else _why_never_fails(requirement, world)
     assumed = "" if witness else _assumed_protection(requirement, world, limit)
     kept = None
     if isinstance(requirement, Must) and not witness and world.crossing:
         kept = _use_kept_from_others(requirement, world, limit)
-    return Verdict(requirement, witness, empty, always, assumed, kept)
+    return Verdict(requirement, witness, empty, always, assumed, kept, tuple(unnamed))
 
 
 def _confirm(requirement: Requirement, witness: Witness, world: World) -> None:
@@ -621,51 +626,110 @@ _OF_OTHER_KIND = {"call": "request", "request": "call", "execute": "reply", "rep
 """For a right to an action, the same right to a service, and the other way round."""
 
 
-def _empty_list_clauses(
-    requirement: Requirement, world: World, limit: SearchLimit
-) -> Iterator[str]:
-    """Yield clauses on enclaves in a requirement that do not exist, and on names without users."""
+def _missing_enclaves_clauses(requirement: Requirement, world: World) -> Iterator[str]:
+    """Yield clauses on enclaves in a requirement that do not exist."""
     patterns: tuple[str, ...] = ()
     match requirement:
-        case Only():
-            patterns = requirement.enclaves
-        case Widest() | NothingBut():
+        case Only() | Widest() | NothingBut():
             patterns = requirement.enclaves
         case Apart():
             patterns = (*requirement.sources, *requirement.targets, *requirement.through)
     for pattern in dict.fromkeys(patterns):
-        if not fnmatch.filter(world.enclaves, pattern.removeprefix(EXCEPT)):
-            yield f"there is no enclave {pattern}"
+        name = pattern.removeprefix(EXCEPT)
+        if not fnmatch.filter(world.enclaves, name):
+            yield f"there is no enclave {pattern}{_meant(name, world.enclaves)}"
+
+
+def _unused_names(
+    requirement: Requirement, world: World, limit: SearchLimit
+) -> tuple[list[str], list[str]]:
+    """Return clauses on names in a requirement without users, and the names that no right states.
+
+    The latter are in use only by wildcards.  Such a name counts as one without users if a right
+    states another name that differs by one slip, as in ``/cmd_vle``.
+    """
+    clauses, unnamed = [], []
+    for right, name, parts in _restricted_names(requirement):
+        verb = "use" if isinstance(requirement, Nobody | Protected) else right
+        named = _named_right(right, name)
+        known = is_expression(name) or any(
+            part.topics(name).expression in side.exact for part, side in _sides(world, right)
+        )
+        meant = "" if known else _meant(name, _stated_names(world, right))
+        if not _is_used_by_anybody(world, parts, name, limit):
+            other = _OF_OTHER_KIND.get(right, "") if verb == right else ""
+            if other and _is_used_by_anybody(world, _sufficient_parts(other), name, limit):
+                meant = f", but some may {other} {_named_right(other, name)}"
+            clauses.append(f"no enclave may {verb} {named}{meant}")
+        elif meant:
+            clauses.append(f"only wildcards match {named}{meant}")
+        elif not known:
+            unnamed.append(named)
+    return clauses, unnamed
+
+
+def _restricted_names(requirement: Requirement) -> Iterator[tuple[str, str, tuple[_Part, ...]]]:
+    """Yield each name whose use a requirement restricts: a right, the name, and parts to use it.
+
+    Of what nobody may do, and of what is protected, a use at the other side counts as well.
+    """
+    rights: RightNames = ()
     match requirement:
-        case Only() | AtMost() | NotBoth():
-            sides = (
-                (*requirement.first, *requirement.second)
-                if isinstance(requirement, NotBoth)
-                else requirement.rights
-            )
-            for right, names in sides:
-                for name in names:
-                    if not _is_used_by_anybody(world, _sufficient_parts(right), name, limit):
-                        text = f"no enclave may {right} {_named_right(right, name)}"
-                        other = _OF_OTHER_KIND.get(right, "")
-                        if other and _is_used_by_anybody(
-                            world, _sufficient_parts(other), name, limit
-                        ):
-                            text += f", but some may {other} {_named_right(other, name)}"
-                        yield text
-        case Nobody():
-            for right, names in requirement.rights:
-                other = OTHER_SIDE[right]
-                for name in names:
-                    if not _is_used_by_anybody(
-                        world, (*_sufficient_parts(other), *_sufficient_parts(right)), name, limit
-                    ):
-                        yield f"no enclave may use {_named_right(right, name)}"
-        case Protected():
-            for kind, name in requirement.names:
-                parts = [part for right in RIGHTS[kind] for part in _sufficient_parts(right)]
-                if not _is_used_by_anybody(world, parts, name, limit):
-                    yield f"no enclave may use {kind.removesuffix('s')} {name}"
+        case Only() | AtMost() | Nobody():
+            rights = requirement.rights
+        case NotBoth(first=first, second=second):
+            rights = (*first, *second)
+        case Protected(names=pairs):
+            rights = tuple((RIGHTS[kind][0], (name,)) for kind, name in pairs)
+    for right, names in rights:
+        parts = _sufficient_parts(right)
+        if isinstance(requirement, Nobody | Protected):
+            parts = (*_sufficient_parts(OTHER_SIDE[right]), *parts)
+        yield from ((right, name, parts) for name in names)
+
+
+def _sides(world: World, right: str) -> Iterator[tuple[_Part, Side]]:
+    """Yield the DDS topics of a right, each with its writers and with its readers."""
+    for part in _parts_of(right):
+        for writes in (True, False):
+            yield part, world.side(writes)
+
+
+def _stated_names(world: World, right: str) -> Iterator[str]:
+    """Yield the names that rights of this kind state without a wildcard."""
+    for part, side in _sides(world, right):
+        for topic in side.exact:
+            if topic.startswith(part.begin) and topic.endswith(part.end):
+                yield part.topics("").ros_name(topic)
+
+
+def _meant(name: str, known: Iterable[str]) -> str:
+    """Return a clause with a known name that differs by one slip, or ""."""
+    similar = shortest(other for other in known if _is_one_slip_from(name, other))
+    return f" (perhaps {similar} is meant)" if similar else ""
+
+
+def _is_one_slip_from(name: str, other: str) -> bool:
+    """Return whether names differ by a letter within a word: wrong, missing, or in wrong order.
+
+    Digits, and letters that are a word of their own, tell things apart (``/arm_l``, ``/arm_r``).
+    """
+    if name == other or abs(len(name) - len(other)) > 1:
+        return False
+    begin = _equal_letters(name, other)
+    end = _equal_letters(name[begin:][::-1], other[begin:][::-1])
+    wrong, right = name[begin : len(name) - end], other[begin : len(other) - end]
+    around = name[begin - 1 : begin] + name[len(name) - end :][:1]
+    return (
+        (max(len(wrong), len(right)) == 1 or (len(wrong) == 2 and wrong == right[::-1]))
+        and not any(map(str.isdigit, wrong + right))
+        and any(map(str.isalpha, around))
+    )
+
+
+def _equal_letters(name: str, other: str) -> int:
+    """Return with how many equal letters two texts begin."""
+    return sum(takewhile(bool, map(eq, name, other)))
 
 
 def _why_never_fails(requirement: Requirement, world: World) -> str:

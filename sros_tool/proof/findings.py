@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 from sros_tool.automata import SearchLimit
@@ -12,6 +12,7 @@ from sros_tool.checks.requirements import (
     NOT_CROSSING,
     NOT_ON_ZENOH,
     OF_EXPORT,
+    UNNAMED,
     VACUOUS,
     VIOLATED,
 )
@@ -128,13 +129,15 @@ class Decided:
 
     ``assumed`` are requirements that hold only with the assumed protection of the default template,
     each with a name whose protection the policy does not state.  ``kept`` are requirements that
-    hold, each with a use that does not pass between Zenoh routers.
+    hold, each with a use that does not pass between Zenoh routers.  ``unnamed`` are requirements
+    that hold, each with its names that no right states.
     """
 
     violations: tuple[Violation, ...]
     vacuous: tuple[tuple[Requirement, tuple[str, ...]], ...]
     assumed: tuple[tuple[Requirement, str], ...] = ()
     kept: tuple[tuple[Requirement, KeptUse], ...] = ()
+    unnamed: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
 
 
 def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
@@ -143,7 +146,7 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
     Raises:
         DocumentError: there are too many wildcards to decide a requirement.
     """
-    violations, vacuous, assumed, kept = [], [], [], []
+    violations, vacuous, assumed, kept, unnamed = [], [], [], [], []
     limit = SearchLimit(MOST_STEPS)
     worlds = Worlds(system.worlds)
     for requirement in requirements:
@@ -170,12 +173,14 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
             )
         if reasons := tuple(_never_fails([verdict for _, verdict in verdicts])):
             vacuous.append((requirement, reasons))
+        if not broken and (names := _in_all(verdict.unnamed for _, verdict in verdicts)):
+            unnamed.append((requirement, names))
         if not broken and (
-            names := [verdict.assumed for _, verdict in verdicts if verdict.assumed]
+            assumed_names := [verdict.assumed for _, verdict in verdicts if verdict.assumed]
         ):
-            assumed.append((requirement, names[0]))
+            assumed.append((requirement, assumed_names[0]))
         kept += [(requirement, verdict.kept) for _, verdict in verdicts if verdict.kept][:1]
-    return Decided(tuple(violations), tuple(vacuous), tuple(assumed), tuple(kept))
+    return Decided(tuple(violations), tuple(vacuous), tuple(assumed), tuple(kept), tuple(unnamed))
 
 
 def _step(use: Use, world: World, system: System) -> Step:
@@ -187,14 +192,16 @@ def _step(use: Use, world: World, system: System) -> Step:
 
 def _never_fails(verdicts: Sequence[Verdict]) -> Iterator[str]:
     """Yield clauses that say why a requirement, or a part of it, cannot fail in any world."""
-    first, *later_verdicts = verdicts
-    empty = [
-        name for name in first.empty if all(name in verdict.empty for verdict in later_verdicts)
-    ]
-    if empty:
+    if empty := _in_all(verdict.empty for verdict in verdicts):
         yield _listed_names(empty)
     if all(verdict.always for verdict in verdicts):
-        yield first.always
+        yield verdicts[0].always
+
+
+def _in_all(lists: Iterable[Sequence[str]]) -> tuple[str, ...]:
+    """Return the texts that are in each of some lists, in the order of the first one."""
+    first, *others = lists
+    return tuple(text for text in first if all(text in other for other in others))
 
 
 # ── as findings ────────────────────────────────────────────────────────────────────────────
@@ -215,6 +222,7 @@ def decided_findings(decided: Decided, system: System) -> list[Finding]:
     """Return the findings of decisions: broken requirements first, in order."""
     findings = [_violation_finding(violation) for violation in decided.violations]
     findings += [_vacuous_finding(requirement, why) for requirement, why in decided.vacuous]
+    findings += [_unnamed_finding(requirement, names) for requirement, names in decided.unnamed]
     findings += [_assumption_finding(*assumption) for assumption in decided.assumed]
     findings += [_not_crossing_finding(*kept_use) for kept_use in decided.kept]
     if system.is_export:
@@ -339,6 +347,12 @@ def _vacuous_finding(requirement: Requirement, why: Sequence[str]) -> Finding:
     place = requirement.source
     text = f"{'; '.join(why)}: {demand(requirement)}"
     return VACUOUS.found(place.file, text, place.file, place.line)
+
+
+def _unnamed_finding(requirement: Requirement, names: Sequence[str]) -> Finding:
+    place = requirement.source
+    text = f"no right names {_listed_names(names)}: {demand(requirement)}"
+    return UNNAMED.found(place.file, text, place.file, place.line)
 
 
 def _assumption_finding(requirement: Requirement, name: str) -> Finding:

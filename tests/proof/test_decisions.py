@@ -161,6 +161,29 @@ def test_what_cannot_fail_is_said(required: str) -> None:
     assert [each for _, reasons in found.vacuous for each in reasons] == ([why] if why else [])
 
 
+READ_BY_ALL = {"/mux": may("publish", "/cmd_vel", "/arm_l/cmd"), "/rec": may("subscribe", "/*")}
+SLIPS = ("/cmd_vle", "/cmd_ve", "/cmd_vell", "/cmdvel", "/cnd_vel")
+OTHER_NAMES = ("/cmd_vel2", "/cmd_vel_raw", "/arm_r/cmd", "/robot/cmd_vel")
+
+
+@pytest.mark.parametrize("name", [*SLIPS, *OTHER_NAMES])
+def test_a_guard_of_a_name_that_only_wildcards_match(name: str) -> None:
+    """A misspelled name is found; of one that may be meant to stay unused, it is only noted."""
+    found = decided(READ_BY_ALL, f'[[nobody]]\npublish = ["{name}"]')
+    assert found.violations == ()
+    reasons = [each for _, reasons in found.vacuous for each in reasons]
+    unnamed = [each for _, names in found.unnamed for each in names]
+    if name in SLIPS:
+        hint = "perhaps /cmd_vel is meant"
+        assert (reasons, unnamed) == ([f"only wildcards match topic {name} ({hint})"], [])
+    else:
+        assert (reasons, unnamed) == ([], [f"topic {name}"])
+    stated = decided(
+        READ_BY_ALL | {"/b": may("subscribe", name)}, f'[[nobody]]\npublish = ["{name}"]'
+    )
+    assert (stated.vacuous, stated.unnamed) == ((), ())
+
+
 def test_what_is_proposed_can_fail() -> None:
     two = {"/a": may("publish", "/x", "/*"), "/b": may("subscribe", "/x")}
     system = robot(two)
@@ -286,7 +309,7 @@ def test_permissions_that_a_vendor_takes_for_ones_own_count() -> None:
     (chain,) = texts(SHARED | {"/base": may("subscribe", "/cmd_vel")}, apart)
     assert "/mux -publish /cmd_vel by /cmd* with the permissions of /robot/mux-> /base" in chain
     others = {"/mux2": SHARED["/mux"], "/robot/mux": SHARED["/robot/mux"]}
-    assert texts(others, ONLY_MUX) == []
+    assert decided(others, ONLY_MUX).violations == ()
 
 
 def test_unique_subjects_fit_no_other_permissions(tmp_path: Path) -> None:
