@@ -265,7 +265,7 @@ class RobotStatus:
     which has not expired, says that no process may run with another list or with earlier CAs, and
     is not ``offline``; false if this is not known, or the keystore is older than its robots; null
     if the keystore has no list, or the robot has no
-    enclave. `sros agent` knows the processes that lack only new permissions, governance or
+    enclave. `sros agent` and plays know the processes that lack only new permissions, governance or
     certificates of their own; for other robots, any restart that is due counts."""
     expiry: Mapping[Annotated[str, Words(_EXPIRING)], datetime]
     """The first expiry of the files that the robot confirmed, by kind, in UTC, from the ledger."""

@@ -52,7 +52,8 @@ def test_what_sros_packs_is_read(made_keystore: Path) -> None:
     assert changed_enclaves(files, other) == ["/b"]
     without = {path: files[path] for path in files if not path.endswith("b/permissions.p7s")}
     assert changed_enclaves(files, without) == ["/b"]
-    said = confirmation("r1", files, NOW.timestamp(), ["/r1/a"])
+    said = confirmation("r1", files, NOW.timestamp(), ["/r1/a"], [])
+    assert (said["restart"], said["crl_restart"]) == (["/r1/a"], [])
     assert not [path for path in said["files"] if path.endswith("key.pem")]
     assert len(said["files"]) == 10
 

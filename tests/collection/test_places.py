@@ -304,7 +304,9 @@ def test_processes_of_a_folder_that_was_lost_have_to_be_restarted(
     asked = {"robot": "r1", "verifier": ["sros"], "replace_authorities": False}
 
     def deliver(files: dict[str, bytes]) -> list[str]:
-        due: list[str] = module._install(place, place.read(), files, asked, 0.0)["restart"]
+        due: list[str] = module._install(place, place.read(), files, asked, 0.0, same=set())[
+            "restart"
+        ]
         place.set_due([])
         return due
 
@@ -314,3 +316,30 @@ def test_processes_of_a_folder_that_was_lost_have_to_be_restarted(
     shutil.rmtree(place.path)
     changed = {**NEW, "enclaves/b/c/cert.pem": b"changed", "enclaves/d/cert.pem": b"new"}
     assert deliver(changed) == ["/a", "/b/c"]
+
+
+def test_processes_that_may_lack_the_revocation_list_are_remembered(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever lacks only its own new documents has the list; also another list that is equal."""
+    module = pytest.importorskip("ansible_collections.sros.fleet.plugins.modules.enclaves")
+    verified = {"by": "openssl", "ok": True, "problems": [], "remarks": []}
+    monkeypatch.setattr(module, "verify", lambda *_: verified)
+    asked = {"robot": "r1", "verifier": ["sros"], "replace_authorities": False}
+
+    def deliver(same: set[str], **changed: bytes) -> list[list[str]]:
+        named = {f"enclaves/a/{name}": content for name, content in changed.items()}
+        files = place.read() | {path.replace("_", "."): data for path, data in named.items()}
+        said = module._install(place, place.read(), files, asked, 0.0, same=same)["confirmation"]
+        return [said["restart"], said["crl_restart"]]
+
+    assert deliver(set(), crl_pem=b"list") == [["/a"], ["/a"]]
+    assert deliver({"/a"}, permissions_p7s=b"1") == [["/a"], ["/a"]], "the process still lacks it"
+    place.set_due([])
+    assert deliver({"/a"}, permissions_p7s=b"2") == [["/a"], []]
+    assert deliver({"/a"}, crl_pem=b"equal") == [["/a"], []]
+    install(place, place.read() | {"enclaves/a/crl.pem": b"by an earlier version"})
+    assert place.crl_due(place.read()) == ["/a"]
+    assert deliver(set(), crl_pem=b"equal") == [["/a"], ["/a"]], "as it may have restarted before"
+    place.set_due([])
+    assert not [name for name in beside(place) if "trusting" in name]

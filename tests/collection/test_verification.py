@@ -14,12 +14,13 @@ from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedE
 from ansible_collections.sros.fleet.plugins.module_utils.verification import (
     check_lists,
     clock_remark,
+    same_trust,
     verify,
 )
 from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
-from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
@@ -50,6 +51,8 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     copy_of(folder / "ks", folder / "restored")
     revoke(folder / "ks", ["/c"], now=now)
     export("revoked", "/a", "/b")
+    refresh_crl(folder / "ks", now=now + timedelta(minutes=1))
+    export("refreshed", "/a", "/b")
     create_enclaves(folder / "restored", ["/d"], now=now)
     for which, name in (("restored", "/d"), ("restored twice", "/b")):
         revoke(folder / "restored", [name], now=now)
@@ -164,7 +167,7 @@ def test_no_older_list_takes_the_place_of_a_newer_one(
 ) -> None:
     """A home that was restored from a backup would let revoked enclaves be trusted again."""
     files = {what: files_of(folder) for what, folder in exports.items()}
-    stages = ["ks", "revoked", "distribute", "reissue", "retire"]
+    stages = ["ks", "revoked", "refreshed", "distribute", "reissue", "retire"]
     for before, after in [*pairwise(stages), ("revoked", "revoked")]:
         assert check_lists(files[before], files[after], str(tmp_path)) == [], (before, after)
     for before, after, number in (
@@ -180,6 +183,25 @@ def test_no_older_list_takes_the_place_of_a_newer_one(
     monkeypatch.setenv("PATH", "/nonexistent")
     with pytest.raises(RefusedError, match="lacks openssl"):
         check_lists(files["revoked"], files["ks"], str(tmp_path))
+
+
+def test_processes_trust_the_same_after_a_list_was_only_signed_again(
+    exports: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files, both = {what: files_of(folder) for what, folder in exports.items()}, {"/a", "/b"}
+    for before, after, same in (
+        ("revoked", "revoked", both),
+        ("revoked", "refreshed", both),
+        ("refreshed", "revoked", both),
+        ("ks", "revoked", set()),
+        ("refreshed", "distribute", set()),
+        ("restored", "restored twice", set()),
+    ):
+        assert same_trust(files[before], files[after], str(tmp_path)) == same, (before, after)
+    more = {path: data * 2 for path, data in files["revoked"].items() if path.endswith("a/crl.pem")}
+    assert same_trust(files["revoked"] | more, files["refreshed"], str(tmp_path)) == {"/b"}
+    monkeypatch.setenv("PATH", "/nonexistent")
+    assert same_trust(files["revoked"], files["refreshed"], str(tmp_path)) == set()
 
 
 def test_a_list_that_the_robot_made_itself_holds_up_nothing(

@@ -89,7 +89,7 @@ def assert_current(made: Fleet, *which: str, own: str = "") -> None:
             wanted = 0o600 if path.endswith("key.pem") else 0o644
             assert mode & 0o777 == (wanted if path.endswith((".pem", ".p7s")) else 0o700), path
         beside = os.listdir(made.robots[name].keystore.parent)
-        due = {".keystore.sros-restart"} if own else set()
+        due = {".keystore.sros-restart", ".keystore.sros-trusting"} if own else set()
         assert set(beside) - due == {"keystore", ".keystore.sros-lock", ".keystore.sros-delivered"}
 
 
@@ -220,6 +220,7 @@ def test_what_robots_confirm(three: Fleet) -> None:
     )
     for path in own.keys() & others.keys():  # processes come and go
         assert others[path] in (own[path], ""), "a wheel's version is only in its metadata"
-    assert kept.pop("restart") == [], "which sros does not know"
+    for due in ("restart", "crl_restart"):
+        assert kept.pop(due) == [], "which sros does not know"
     assert by_sros.pop("problems") == [], "which the play tells by failing"
     assert by_sros == kept

@@ -45,6 +45,7 @@ class ActionModule(RobotAction):
             files=map_of(name),
             certificates=map_of(list_of(name)),
             restart=list_of(enclave),
+            crl_restart=list_of(enclave),
             dds=record(
                 libraries=list_of(record(product=name, version=name, path=name, seen=name)),
                 unseen=number,

@@ -29,6 +29,8 @@ ZENOH_FILES = ("session.json5", "session.p7s", "router.json5", "router.p7s")
 REQUIRED_FILES = (CERTIFICATE_FILE, *AUTHORITY_FILES, *SIGNED_FILES)
 CONFIRMED_FILES = (*REQUIRED_FILES, "crl.pem", *ZENOH_FILES)
 """The files of an enclave that an export has besides the key, and that a confirmation names."""
+TRUST_FILES = (*AUTHORITY_FILES, "crl.pem", *ZENOH_FILES)
+"""The files that decide which other enclaves a process accepts."""
 _LOCAL_FILES = (*KEY_FILES, REQUEST_FILE, "answer.p7s", "permissions.xml", "governance.xml")
 """Other files that an enclave on a robot may have."""
 
@@ -172,6 +174,15 @@ def authorities(files: Files) -> frozenset[bytes]:
     )
 
 
+def trust_digest(files: Files, enclave: str) -> str:
+    """Return the SHA-256 of what decides which others the processes of an enclave accept."""
+    parts = [enclave]
+    for file in TRUST_FILES:
+        content = files.get(folder_of(enclave) + "/" + file)
+        parts.append("-" if content is None else hashlib.sha256(content).hexdigest())
+    return hashlib.sha256(" ".join(parts).encode()).hexdigest()
+
+
 def certificate_digests(content: bytes) -> list[str]:
     """Return the SHA-256 of the certificates (DER) in a file, in their order."""
     found = []
@@ -183,7 +194,7 @@ def certificate_digests(content: bytes) -> list[str]:
     return found
 
 
-def confirmation(robot: str, files: Files, now: float, due: list) -> dict:
+def confirmation(robot: str, files: Files, now: float, due: list, crl_due: list) -> dict:
     """Return what a robot confirms that it has (sros_tool/schemas/confirmation.json), with its DDS.
 
     Args:
@@ -191,6 +202,7 @@ def confirmation(robot: str, files: Files, now: float, due: list) -> dict:
         files: the files of its keystore.
         now: seconds since 1970 by the clock of the robot.
         due: the enclaves whose processes still have earlier files.
+        crl_due: those of them whose processes may lack the revocation list, or a CA.
     """
     confirmed = {
         path: content
@@ -209,6 +221,7 @@ def confirmation(robot: str, files: Files, now: float, due: list) -> dict:
             if path.rpartition("/")[2] in (CERTIFICATE_FILE, *AUTHORITY_FILES)
         },
         "restart": sorted(due),
+        "crl_restart": sorted(crl_due),
         "dds": _dds_here(),
     }
 

@@ -10,7 +10,7 @@ import pwd
 import shutil
 import stat
 import time
-from typing import Iterator
+from typing import Callable, Iterator
 
 from ansible_collections.sros.fleet.plugins.module_utils.exports import (
     KEY_FILE,
@@ -21,6 +21,7 @@ from ansible_collections.sros.fleet.plugins.module_utils.exports import (
     RefusedError,
     check_enclave,
     is_enclave_path,
+    trust_digest,
 )
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -51,7 +52,8 @@ class Place:
 
     Whoever comes after a process that was killed ends a change that was decided, and drops another.
     ``.keystore.sros-restart`` lists the enclaves whose processes still have files of before, and
-    ``.keystore.sros-delivered`` those that were installed last.
+    ``.keystore.sros-delivered`` those that were installed last.  ``.keystore.sros-trusting`` has
+    digests of the CAs and revocation lists that these processes have loaded.
     """
 
     def __init__(self, path: str, owner: str | None = None) -> None:
@@ -309,11 +311,13 @@ class Place:
         Raises:
             RefusedError: the record cannot be read.
         """
-        return self._names("restart")
+        return self._names("restart", check_enclave)
 
     def set_due(self, names: list[str]) -> None:
         """Record the enclaves whose processes have to be restarted; flushed to the disk."""
         self._set_names("restart", names)
+        if not names:
+            self.set_trusting([])
 
     def delivered(self) -> list[str]:
         """Return the enclaves that were installed last, also if somebody removed them since.
@@ -321,18 +325,39 @@ class Place:
         Raises:
             RefusedError: the record cannot be read.
         """
-        return self._names("delivered")
+        return self._names("delivered", check_enclave)
 
     def set_delivered(self, names: list[str]) -> None:
         """Record the enclaves that are installed; flushed to the disk."""
         self._set_names("delivered", names)
 
-    def _names(self, record: str) -> list[str]:
+    def trusting(self) -> list[str]:
+        """Return digests (`trust_digest`) of enclaves of `due` whose processes have these files.
+
+        Raises:
+            RefusedError: the record cannot be read.
+        """
+        return self._names("trusting", str)
+
+    def set_trusting(self, digests: list[str]) -> None:
+        """Record the digests for `trusting`; flushed to the disk."""
+        self._set_names("trusting", digests)
+
+    def crl_due(self, files: Files) -> list[str]:
+        """Return the enclaves of `due` whose processes may lack the list or a CA in ``files``.
+
+        Raises:
+            RefusedError: a record cannot be read.
+        """
+        loaded = set(self.trusting())
+        return [enclave for enclave in self.due() if trust_digest(files, enclave) not in loaded]
+
+    def _names(self, record: str, check: Callable[[str], str]) -> list[str]:
         try:
             handle = os.open(self._beside(record), _FILE)
             with os.fdopen(handle, "rb") as file:
                 names = json.loads(file.read(MOST_OF_FILE).decode())
-            return sorted({check_enclave(enclave) for enclave in names})
+            return sorted({check(name) for name in names})
         except FileNotFoundError:
             return []
         except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:

@@ -12,7 +12,7 @@ import re
 import shutil
 import subprocess
 import time
-from typing import NamedTuple
+from typing import Callable, NamedTuple
 
 from ansible_collections.sros.fleet.plugins.module_utils.exports import (
     AUTHORITY_FILES,
@@ -20,6 +20,7 @@ from ansible_collections.sros.fleet.plugins.module_utils.exports import (
     KEY_FILE,
     KEY_URI_FILE,
     SIGNED_FILES,
+    TRUST_FILES,
     Files,
     RefusedError,
     enclaves_in,
@@ -86,20 +87,7 @@ def check_lists(before: Files, after: Files, spare: str) -> list[str]:
     Raises:
         RefusedError: a new list is older, or missing; revoked enclaves would be trusted again.
     """
-    asked: dict[tuple, _List | None] = {}
-
-    def newest(files: Files, name: str) -> _List | None:
-        """Return the newest list of an enclave that a CA signed which the new files trust."""
-        path, trust = (f"{folder_of(name)}/{file}" for file in ("crl.pem", AUTHORITY_FILES[0]))
-        known = []
-        for block in _LIST.findall(files.get(path, b""))[:_MOST_LISTS]:
-            for authority in _CERTIFICATE.findall(after.get(trust, b""))[:_MOST_LISTS]:
-                if (block, authority) not in asked:
-                    asked[block, authority] = _read_list(block, authority, spare)
-                known.append(asked[block, authority])
-        return max(filter(None, known), default=None)
-
-    remarks = {}
+    newest, remarks = _newest_list(after, spare), {}
     for name in sorted(set(enclaves_in(before)) & set(enclaves_in(after))):
         present = newest(before, name)
         new = newest(after, name) if present else None
@@ -124,6 +112,46 @@ def check_lists(before: Files, after: Files, spare: str) -> list[str]:
                 " but not if the keystore comes from a backup."
             )
     return list(remarks.values())
+
+
+def same_trust(before: Files, after: Files, spare: str) -> set[str]:
+    """Return the enclaves whose processes accept the same others with the new files as before.
+
+    Of a revocation list that a CA of the new files signed, only what it revokes counts.  The
+    arguments are those of `check_lists`.
+    """
+    newest, same = _newest_list(after, spare), set()
+    for name in set(enclaves_in(before)) & set(enclaves_in(after)):
+        paths = [f"{folder_of(name)}/{file}" for file in TRUST_FILES]
+        different = [path for path in paths if before.get(path) != after.get(path)]
+        if different == [f"{folder_of(name)}/crl.pem"] and shutil.which("openssl"):
+            lists = [newest(files, name) for files in (before, after)]
+            alone = all(
+                len(_LIST.findall(files.get(*different, b""))) == 1 for files in (before, after)
+            )
+            present, new = lists
+            if alone and present and new and present.serials == new.serials:
+                different = []
+        if not different:
+            same.add(name)
+    return same
+
+
+def _newest_list(after: Files, spare: str) -> Callable[[Files, str], _List | None]:
+    """Return a function for the newest list of an enclave that a CA of the new files signed."""
+    asked: dict[tuple, _List | None] = {}
+
+    def newest(files: Files, name: str) -> _List | None:
+        path, trust = (f"{folder_of(name)}/{file}" for file in ("crl.pem", AUTHORITY_FILES[0]))
+        known = []
+        for block in _LIST.findall(files.get(path, b""))[:_MOST_LISTS]:
+            for authority in _CERTIFICATE.findall(after.get(trust, b""))[:_MOST_LISTS]:
+                if (block, authority) not in asked:
+                    asked[block, authority] = _read_list(block, authority, spare)
+                known.append(asked[block, authority])
+        return max(filter(None, known), default=None)
+
+    return newest
 
 
 class _List(NamedTuple):

@@ -165,11 +165,13 @@ from ansible_collections.sros.fleet.plugins.module_utils.exports import (
     enclaves_in,
     folder_of,
     read_archive,
+    trust_digest,
 )
 from ansible_collections.sros.fleet.plugins.module_utils.places import Place
 from ansible_collections.sros.fleet.plugins.module_utils.verification import (
     check_lists,
     clock_remark,
+    same_trust,
     verify,
 )
 
@@ -221,12 +223,11 @@ def _run(module: AnsibleModule, now: float) -> dict:
     with contextlib.nullcontext() if module.check_mode else place.locked():
         before = place.read()
         after = _after(before, sent)
-        remarks = []
-        if not asked["allow_older_lists"]:
-            # The folder of this user alone.
-            with tempfile.TemporaryDirectory(dir=module.tmpdir) as spare:
-                remarks = check_lists(before, after, spare)
-        result = _install(place, before, after, asked, now, check=module.check_mode)
+        # The folder of this user alone.
+        with tempfile.TemporaryDirectory(dir=module.tmpdir) as spare:
+            remarks = [] if asked["allow_older_lists"] else check_lists(before, after, spare)
+            same = same_trust(before, after, spare)
+        result = _install(place, before, after, asked, now, same=same, check=module.check_mode)
     with_key = [
         name
         for name in result["removed_enclaves"]
@@ -265,7 +266,7 @@ def _look(place: Place, asked: dict, now: float) -> dict:
         "restart": place.due(),
         "routers": _routers(present),
         "verification": found,
-        "confirmation": confirmation(asked["robot"], present, now, place.due()),
+        "confirmation": _confirmation(place, asked, present, now),
     }
 
 
@@ -293,9 +294,21 @@ def _after(before: Files, sent: Files) -> Files:
     return after
 
 
+def _confirmation(place: Place, asked: dict, files: Files, now: float) -> dict:
+    return confirmation(asked["robot"], files, now, place.due(), place.crl_due(files))
+
+
 def _install(
-    place: Place, before: Files, after: Files, asked: dict, now: float, *, check: bool = False
+    place: Place,
+    before: Files,
+    after: Files,
+    asked: dict,
+    now: float,
+    *,
+    same: set[str],
+    check: bool = False,
 ) -> dict:
+    """Install and verify the new files; the enclaves ``same`` go on to trust the same others."""
     known, new = authorities(before), authorities(after)
     if known and not known & new and not asked["replace_authorities"]:
         raise RefusedError(
@@ -321,9 +334,10 @@ def _install(
     # In an enclave that never had a certificate no process can run.
     has_certificate = {enclave_of(path) for path in before if path.endswith("/" + CERTIFICATE_FILE)}
     ran = has_certificate.union(place.delivered())
-    due = sorted({*place.due(), *(ran & set(changed))} & set(enclaves_in(after)))
+    due_before, trusting = set(place.due()), set(place.trusting())
+    due = sorted({*due_before, *(ran & set(changed))} & set(enclaves_in(after)))
     if check and not present:
-        confirmed = confirmation(asked["robot"], before, now, place.due())
+        confirmed = _confirmation(place, asked, before, now)
         return {**result, "restart": due, "confirmation": confirmed}
     if present:
         found = verify(place.path, names, asked["verifier"])
@@ -335,6 +349,14 @@ def _install(
             found = verify(place.stage, names, asked["verifier"])
             if found["ok"]:
                 # Recorded first: who is killed in between restarts once too often, not never.
+                place.set_trusting(
+                    [
+                        trust_digest(after, name)
+                        for name in due
+                        if name in same
+                        and (name not in due_before or trust_digest(before, name) in trusting)
+                    ]
+                )
                 place.set_due(due)
                 place.replace()
                 place.set_delivered(names)
@@ -353,7 +375,7 @@ def _install(
         **result,
         "restart": place.due(),
         "verification": found,
-        "confirmation": confirmation(asked["robot"], after, now, place.due()),
+        "confirmation": _confirmation(place, asked, after, now),
     }
 
 
