@@ -125,11 +125,9 @@ def same_trust(before: Files, after: Files, spare: str) -> set[str]:
         paths = [f"{folder_of(name)}/{file}" for file in TRUST_FILES]
         different = [path for path in paths if before.get(path) != after.get(path)]
         if different == [f"{folder_of(name)}/crl.pem"] and shutil.which("openssl"):
-            lists = [newest(files, name) for files in (before, after)]
-            alone = all(
-                len(_LIST.findall(files.get(*different, b""))) == 1 for files in (before, after)
-            )
-            present, new = lists
+            contents = [files.get(different[0], b"") for files in (before, after)]
+            present, new = (newest(files, name) for files in (before, after))
+            alone = all(len(_LIST.findall(content)) == 1 for content in contents)
             if alone and present and new and present.serials == new.serials:
                 different = []
         if not different:
