@@ -590,6 +590,7 @@ _OF_LISTENERS = (NO_TYPE_DESCRIPTION, NO_ROSOUT)
 def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about nodes whose enclave lacks a right that every node needs.
 
+    A profile for any node is skipped if the enclave also has nodes with names: those start.
     Nodes whose names begin with an underscore are skipped: they are hidden nodes of tools such as
     ros2cli, without log, parameters and type descriptions (ROS 2 design, "Topic and Service
     Names").
@@ -599,6 +600,7 @@ def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         for enclave in checked_policy.policy.enclaves
         for profile in enclave.all_profiles()
         if profile.node and profile.ns.startswith("/") and not profile.node.startswith("_")
+        if not (_is_any_node(profile.node) and _has_named_node(enclave))
         for gap in _lacking_basics(checked_policy, enclave, profile)
     ]
     groups: dict[tuple[str, str], list[_Lacking]] = defaultdict(list)
@@ -764,6 +766,10 @@ _NAME_FIRST = (
 
 def _is_any_node(node: str) -> bool:
     return node.rpartition("/")[2] == "*"
+
+
+def _has_named_node(enclave: Enclave) -> bool:
+    return any(not is_expression(profile.node) for profile in enclave.all_profiles())
 
 
 def _lacking_basics(

@@ -215,12 +215,16 @@ def _without_parts(rights: set[NodeRight]) -> frozenset[NodeRight]:
 
 
 _ANY_NODE = ("/", "*")
-"""The namespace and name of a profile for any node."""
+"""The namespace and name of a profile for any node, in an enclave that has nodes with names."""
 
 _OTHER = (
     "not proposed, because the policy has no profile for nodes with these names; start them with "
     "the names in the policy (--ros-args -r __node:=NAME -r __ns:=NAMESPACE), or add a profile "
     "with --node /NAMESPACE/NAME: {}"
+)
+_ASSUMED = (
+    "the log does not name the node, so the last part of its enclave's name is taken; if this is "
+    "wrong, name the node with --node /NAMESPACE/NAME: {}"
 )
 _WHOLE = (
     "the profile has none of the rights that every node needs, so all of them are proposed "
@@ -258,7 +262,7 @@ def learned_from_logs(
     denials = {log: read_denials(plain_text(text)) for log, text in logs.items()}
     missing = propose(denial for denied in denials.values() for denial in denied)
     common = common_parts(file.parent if file else policies_dir(), policies_dir())
-    learned = as_learned(missing, enclave, node, present, common)
+    learned = as_learned(missing, enclave, node, present, common, written=file is not None)
     asked = {profile.enclave for profile in learned.profiles}
     lines = [
         AskingLine(
@@ -300,20 +304,25 @@ def as_learned(
     node: tuple[str, str] | None,
     policy: Policy | None,
     common: CommonParts | None = None,
+    *,
+    written: bool = False,
 ) -> Learned:
     """Return the proposed rights as profiles.
 
     With ``enclave``, only that enclave gets rights: from denials that name it or no enclave.
     ``node`` (namespace and name) names the profile.  Without it, the rights go to
     the node whose standard services were denied, else to the only profile of the enclave in
-    ``policy``, else to a profile for any node: DDS checks only the enclave.  A node that is not in
-    the policy gets a note instead of rights.  With ``common``, a node that has none of the rights
-    that every node needs gets all of them.
+    ``policy``, else to a profile for any node: DDS checks only the enclave.  If ``policy`` does not
+    have the enclave, the node is assumed to have the last part of its name, with a note.  A node
+    that is not in the policy gets a note instead of rights.  With ``common``, a node that has none
+    of the rights that every node needs gets all of them, if it was denied one of them, or if the
+    profile is new in a policy that is ``written``.
 
     Raises:
         UsageError: The log does not name the enclave of a denial, and ``enclave`` is "".
     """
-    profiles, other_nodes, parts_by_profile = [], dict[str, str](), dict[str, str]()
+    profiles, assumed = [], dict[str, str]()
+    other_nodes, parts_by_profile = dict[str, str](), dict[str, str]()
     for path, rights in sorted(_rights_by_enclave(missing_rights, enclave).items()):
         present = _profiles(policy, path)
         for profile, denied in sorted(_rights_by_profile(rights, node, present).items()):
@@ -321,8 +330,14 @@ def as_learned(
                 profile_names = ", ".join(sorted(map(_full_name, present)))
                 other_nodes[_full_name(profile)] = f"enclave {path} has {profile_names}"
                 continue
+            if profile == _ANY_NODE and not present and path != "/":
+                profile = "/", path.rpartition("/")[2]
+                assumed[path] = _full_name(profile)
             has = present.get(profile, frozenset())
-            parts = _denied_common_part(denied, profile, has, common) if common else ()
+            parts: tuple[str, ...] = ()
+            if common:
+                is_new = written and not present
+                parts = _missing_common_part(None if is_new else denied, profile, has, common)
             node_rights = (
                 common.included_rights(parts, *profile) if common else frozenset[NodeRight]()
             )
@@ -338,6 +353,7 @@ def as_learned(
     notes = [
         Note(name, text.format("; ".join(f"{who}: {reason}" for who, reason in reasons.items())))
         for name, text, reasons in (
+            ("log.node-assumed", _ASSUMED, assumed),
             ("log.other-node", _OTHER, other_nodes),
             ("log.common-part", _WHOLE, parts_by_profile),
             ("log.other-enclave", _ELSEWHERE, elsewhere),
@@ -398,22 +414,23 @@ def _full_name(profile: tuple[str, str]) -> str:
     return f"{profile[0].rstrip('/')}/{profile[1]}"
 
 
-def _denied_common_part(
-    denied: frozenset[NodeRight],
+def _missing_common_part(
+    denied: frozenset[NodeRight] | None,
     profile: tuple[str, str],
     node_rights: frozenset[NodeRight],
     common: CommonParts,
 ) -> tuple[str, ...]:
     """Return the common part that a profile does not include and needs, as a tuple; or ().
 
-    A denied right shows that it needs the part, and no right of the part that it is missing.
+    A denied right (None: any) shows that it needs the part, and no right of the part that it is
+    missing.
     """
     if is_expression(profile[1]):
         return ()
     for part in _NODE_PARTS:
         if part in common.rights:
             rights = common.included_rights([part], *profile)
-            if rights & denied and not rights & node_rights:
+            if (denied is None or rights & denied) and not rights & node_rights:
                 return (part,)
     return ()
 

@@ -124,7 +124,7 @@ def test_a_cause_of_which_a_finding_is_left_out_is_not_one_paragraph(tmp_path: P
 
 
 def test_the_parameters_of_every_node_are_not_opened_by_a_remedy(tmp_path: Path) -> None:
-    """`generate_policy --from-log` writes node="*" where it does not know the node."""
+    """With node="*", an author does not name the node."""
     topics = '<topics publish="ALLOW"><topic>/x</topic></topics>'
     for node, named in (("*", True), ("eye", False)):
         (tmp_path / "robot.xml").write_text(
@@ -136,6 +136,15 @@ def test_the_parameters_of_every_node_are_not_opened_by_a_remedy(tmp_path: Path)
         assert ("First write the name of the node in place of '*'" in text) is named
         remedies = sros("check", "robot.xml", "--json", cwd=tmp_path).out
         assert ("First write the name" in remedies) is named
+
+
+def test_a_profile_for_any_node_next_to_nodes_needs_nothing(tmp_path: Path) -> None:
+    """`generate_policy --from-log` writes one where an enclave has several nodes."""
+    policy = write_policy(tmp_path / "robot.xml", ("arm",))
+    lacking = sros("check", "robot.xml", "--json", cwd=tmp_path).out
+    shared = '<profile ns="/" node="*"><topics publish="ALLOW"><topic>x</topic></topics></profile>'
+    policy.write_text(policy.read_text().replace("</profile>", f"</profile>{shared}", 1))
+    assert sros("check", "robot.xml", "--json", cwd=tmp_path).out == lacking
 
 
 def test_nodes_that_lack_less_are_counted(tmp_path: Path) -> None:

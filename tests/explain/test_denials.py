@@ -149,9 +149,8 @@ def test_processes_that_write_at_the_same_time(one: str, other: str) -> None:
         "/talker": {NodeRight("publish", "/x")},
         "/listener": {NodeRight("subscribe", "/x")},
     }
-    assert [note.id for note in as_learned(proposal, "", None, None).notes] == [
-        "log.several-enclaves"
-    ]
+    learned = as_learned(proposal, "", None, None)
+    assert [note.id for note in learned.notes] == ["log.several-enclaves", "log.node-assumed"]
 
 
 @pytest.mark.parametrize(
@@ -197,7 +196,7 @@ def test_what_is_not_clear_is_said_and_not_granted() -> None:
         "subscribe /chatter",
         "publish /nope",
     }
-    assert (profile.enclave, profile.ns, profile.node) == ("/robot", "/", "*")
+    assert (profile.enclave, profile.ns, profile.node) == ("/robot", "/", "robot")
     notes = {note.id: note.text for note in learned.notes}
     assert "rt/camera/image" in notes["log.unclear"]
     assert "rt/front_camera/image_raw" in notes["log.denied-by-rule"]

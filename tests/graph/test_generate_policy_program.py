@@ -89,7 +89,11 @@ def test_or_as_json() -> None:
         ("publish", "/nope"),
         ("subscribe", "/chatter"),
     ]
-    assert [each["id"] for each in value["notes"]] == ["log.unclear", "log.denied-by-rule"]
+    assert [each["id"] for each in value["notes"]] == [
+        "log.unclear",
+        "log.denied-by-rule",
+        "log.node-assumed",
+    ]
     assert ended.err == ""
 
 
@@ -98,12 +102,15 @@ def test_or_into_a_file(tmp_path: Path) -> None:
     path = tmp_path / "robot.xml"
     first = sros("generate_policy", path, *words).ok()
     assert "wrote" in first.out
-    assert {f"{each.right} {each.name}" for each in policy_rights(read_policy(path))} == {
+    rights = {f"{each.right} {each.name}" for each in policy_rights(read_policy(path))}
+    basic = {right for right in rights if "parameter" in right or "/robot/" in right}
+    assert rights - basic - {"publish /rosout", "subscribe /clock"} == {
         "publish /nope",
         "subscribe /chatter",
         "request /add",
         "call /fibonacci",
     }
+    sros("check", path).ok()  # a new policy has what every node needs
     before = path.read_bytes()
     second = sros("generate_policy", path, *words, "--json").ok()
     assert json.loads(second.out)["changed"] is False
