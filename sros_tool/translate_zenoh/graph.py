@@ -28,7 +28,7 @@ from sros_tool.policy.rights import (
     nodes_of_rights,
 )
 from sros_tool.wording import first_few
-from sros_tool.zenoh.access import AccessRule, Flow, Message
+from sros_tool.zenoh.access import AccessRule, AclRule, Flow, Message
 from sros_tool.zenoh.key_expressions import (
     ANY_CHUNKS,
     ANY_PART,
@@ -39,7 +39,7 @@ from sros_tool.zenoh.key_expressions import (
 )
 
 GRAPH = "@ros2_lv"
-_NODE = "NN"
+_NODE, _NAME = "NN", 9
 _KINDS = {"publish": "MP", "subscribe": "MS", "reply": "SS", "request": "SC"}
 """The kind of entity that a right lets a node announce, as tokens write it."""
 _MOST_TOKENS = 4096
@@ -75,6 +75,28 @@ def announced_nodes(rules: Iterable[AccessRule], enclave: str) -> AnnouncedNodes
     return AnnouncedNodes(tuple(nodes[True]), tuple(nodes[False]))
 
 
+def announced_names(
+    rules: Iterable[AclRule], enclave: str, domain: int, right: str
+) -> dict[bool, tuple[str, ...]]:
+    """Return the names that rules of `graph_rules` allow (True) and deny to nodes of an enclave.
+
+    These are the names of topics or services for which the enclave has the right.
+    """
+    names: dict[bool, dict[str, None]] = {True: {}, False: {}}
+    begin, of_right = [GRAPH, str(domain)], [_KINDS[right], _part(enclave)]
+    for rule in rules:
+        for key in rule.key_expressions if _ANNOUNCING[0] in rule.messages else ():
+            chunks = key.split("/")
+            if chunks[:2] == begin and chunks[5:7] == of_right and len(chunks) > _NAME:
+                names[rule.allows][_named(chunks[_NAME])] = None
+    return {allows: tuple(of) for allows, of in names.items()}
+
+
+def _named(part: str) -> str:
+    """Return the ROS name that a token writes as ``part``."""
+    return part.replace(ANY_PART, "*").replace("%", "/")
+
+
 def nodes_in_rules(rules: Iterable[AccessRule], enclave: str) -> tuple[NodeName, ...]:
     """Return the nodes that rules of `graph_rules` allow to an enclave; denials are ignored."""
     nodes = map(_node_of, announced_nodes(rules, enclave).allowed)
@@ -83,7 +105,7 @@ def nodes_in_rules(rules: Iterable[AccessRule], enclave: str) -> tuple[NodeName,
 
 def _node_of(place: str) -> NodeName:
     """Return the node that a token writes as ``DOMAIN/NAMESPACE/NAME``."""
-    _, ns, name = (part.replace(ANY_PART, "*").replace("%", "/") for part in place.split("/"))
+    _, ns, name = map(_named, place.split("/"))
     return NodeName(ns, name)
 
 

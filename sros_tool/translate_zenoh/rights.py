@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from itertools import product
 
@@ -46,7 +47,7 @@ from sros_tool.policy.rights import (
     parts,
     placed_rights,
 )
-from sros_tool.translate_zenoh.graph import graph_rules
+from sros_tool.translate_zenoh.graph import announced_names, graph_rules
 from sros_tool.zenoh.access import (
     AccessControl,
     AccessRule,
@@ -486,17 +487,66 @@ def rights_in_rules(access: Enforcement) -> RightsInRules:
     for subject in access.subjects:
         for enclave in subject.cert_common_names or ():
             names.add(enclave)
-            for rule in access.rules_of(subject.id):
+            rules = access.rules_of(subject.id)
+            differences = _differences_in(rules, enclave)
+            for (_, of_domain), rights in differences.items():
+                for stated in rights:
+                    domains.setdefault(stated, set()).add(of_domain)
+            for rule in rules:
                 for right, key in _right_keys(rule):
-                    qualifier = ALLOW if rule.allows else DENY
-                    of_key, chunk = ros_names(key), key.partition("/")[0]
-                    domain = int(chunk) if _DOMAIN.fullmatch(chunk) and chunk != "*" else None
+                    qualifier, domain = ALLOW if rule.allows else DENY, _domain_of(key)
+                    if domain is not None and (right, domain) in differences:
+                        continue
+                    of_key = ros_names(key)
                     for name in of_key:
                         stated = Right(enclave, qualifier, right, name)
                         domains.setdefault(stated, set()).add(domain)
                     left_out |= set() if of_key else {key}
     in_domains = {right: frozenset(of_right) for right, of_right in domains.items()}
     return RightsInRules(in_domains, frozenset(names), tuple(sorted(left_out)))
+
+
+def _domain_of(key: str) -> int | None:
+    """Return the ROS domain in a key expression, None for a wildcard."""
+    chunk = key.partition("/")[0]
+    return int(chunk) if _DOMAIN.fullmatch(chunk) and chunk != "*" else None
+
+
+_NOWHERE = Source("", 0)
+
+
+def _differences_in(
+    rules: Sequence[AclRule], enclave: str
+) -> Mapping[tuple[str, int], Sequence[Right]]:
+    """Return the rights and denials of which rules list the names that remain, by right and domain.
+
+    The tokens of the graph name them; they count only if sros lists exactly these key expressions
+    for them.  A name of ROS for each key expression alone would match more: ``$*b$*/**`` has the b
+    in the first part, and ``/*b*`` in any.
+    """
+    keys: dict[tuple[str, int], set[str]] = {}
+    denied = set()
+    for rule in rules:
+        for right, key in _right_keys(rule):
+            if (domain := _domain_of(key)) is not None:
+                keys.setdefault((right, domain), set()).add(key)
+                denied |= set() if rule.allows else {(right, domain)}
+    differences = {}
+    for (right, domain), of_right in keys.items():
+        named = announced_names(rules, enclave, domain, right)
+        stated = [
+            Right(enclave, ALLOW if allows else DENY, right, name)
+            for allows, of in named.items()
+            for name in of
+        ]
+        if not named[False] or (right, domain) in denied:
+            continue
+        with suppress(PolicyError):
+            places = (StatedRight(right_or_denial, _NOWHERE) for right_or_denial in stated)
+            written = {key for _, of, _ in _allowed_keys(domain, places) for key in of}
+            if written == of_right:
+                differences[right, domain] = stated
+    return differences
 
 
 def _right_keys(rule: AclRule) -> Iterator[tuple[str, str]]:
