@@ -406,6 +406,7 @@ def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
             who += f" ({', '.join(edge.parts)})" if edge.parts else ""
             ends[0 if edge.sends else 1].append(who)
     known = {(name.kind, name.name): name for name in picture.names}
+    allowed = {(edge.kind, edge.name) for edge in picture.edges if edge.qualifier is ALLOW}
     lines = [f"### {plain(picture.title)}: who may do what", ""]
     lines += [f"- {plain(headline)}" for headline in picture.headlines]
     lines += ["", "| name | may publish or call | may subscribe or serve |", "| --- | --- | --- |"]
@@ -416,7 +417,8 @@ def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
         sides = Lack.SENDER, Lack.RECEIVER
         for end, lack, controlled, sends in zip(ends, sides, controls, (True, False), strict=True):
             first = [stated.protection.everybody] if not controlled else []
-            first += ["nobody"] if stated.lacks is lack else []
+            is_denied_alone = controlled and (kind, name) not in allowed
+            first += ["nobody"] if stated.lacks is lack or is_denied_alone else []
             who = ", ".join(dict.fromkeys((*first, *end)))
             cells.append(who or _who_for_single_names(picture, stated, sends=sends))
         lines.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")

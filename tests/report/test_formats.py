@@ -15,7 +15,7 @@ from sros_tool.report.layout import scenes_of
 from sros_tool.report.picture import Lack
 from tests.report.pictures import HOSTILE, MOBILE_ROBOT, hostile_permissions, mobile_robot
 from tests.support.children import importing, python, run
-from tests.support.harness import copy_of, sros
+from tests.support.harness import copy_of, policy_text, sros
 from tests.support.long_form import some
 
 pytest_plugins = ["tests.report.browsing"]
@@ -109,6 +109,14 @@ def test_mermaid_holds_no_letter_of_markup_in_a_label(tmp_path: Path) -> None:
     shown = sros("view", path, "--format", "mermaid").ok().out
     for label in re.findall(r'"([^"]*)"', shown):
         assert re.fullmatch(r"(?:<br/>|#\d+;|[A-Za-z0-9 /_.,:+-])*", label), label
+
+
+def test_no_cell_of_the_table_is_empty_where_a_denial_alone_names_something(tmp_path: Path) -> None:
+    rights = '<topics subscribe="DENY"><topic>/q</topic><topic>/arm/*</topic></topics>'
+    (tmp_path / "p.xml").write_text(policy_text({"/z": rights}))
+    table = sros("view", tmp_path / "p.xml", "--format", "markdown").ok().out
+    assert "| topic `/q` | nobody | nobody, `/z` is denied |" in table
+    assert "| topic `/arm/*` | nobody | nobody, `/z` is denied |" in table
 
 
 def test_a_table_has_every_right_that_not_every_node_needs(tmp_path: Path) -> None:
