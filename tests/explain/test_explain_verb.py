@@ -829,9 +829,20 @@ def test_earlier_permissions_that_still_allow_it(keystore: Path, tmp_path: Path)
         assert denied.status == 1
         assert f"note [explain.earlier-permissions]: {ENCLAVE}: earlier permissions" in denied.err
     assert "earlier-permissions" not in explain(keystore, "--who", "publish", "/other").err
+    ledger = keystore / "ledger.jsonl"
+    lines = ledger.read_text().splitlines(keepends=True)
+    earlier = next(
+        n for n, line in enumerate(lines) if f'permissions","enclave":"{ENCLAVE}' in line
+    )
+    ledger.write_text("".join((*lines[:earlier], "damaged\n", *lines[earlier + 1 :])))
+    denied = explain(keystore, "--who", *asked)
+    assert (
+        "whether earlier permissions may still allow it is not known: ledger.jsonl:" in denied.err
+    )
+    ledger.write_text("".join(lines))
     sros("renew", keystore, ENCLAVE, "--revoke-old").ok()
     assert "earlier-permissions" not in explain(keystore, "--who", *asked).err
-    (ledger := keystore / "ledger.jsonl").write_text("damaged")
+    ledger.write_text("damaged")
     for _ in range(2):
         denied = explain(keystore, "--who", *asked)
         assert denied.status == 1

@@ -9,6 +9,7 @@ import subprocess
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.delivery.export import distribute
+from sros_tool.keystore.issuing import keyring
 from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.layout import ROTATION, enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
@@ -28,7 +30,7 @@ from sros_tool.keystore.lifecycle.update import update_keystore
 from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import common_name, digest, pem, validity_of
-from sros_tool.pki.keys import generate_key, key_pem
+from sros_tool.pki.keys import PrivateKey, generate_key, key_pem
 from sros_tool.policy.document import read_policy
 from tests.keystore.test_transaction import DIED, in_child
 from tests.support import made_by_ros2
@@ -405,6 +407,28 @@ def test_a_new_key_that_is_protected_less_is_said(tmp_path: Path) -> None:
     (told,) = (note.text for note in step.notes if note.id == "keystore.new-key-plain")
     assert "sros cannot see" in told
     assert (tmp_path / "new").exists()
+
+
+def test_a_key_on_a_token_is_made_after_refusals_and_without_the_old_passphrase(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[str] = []
+
+    def create(place: str, *_: object, **__: object) -> PrivateKey:
+        made.append(place)
+        return generate_key()
+
+    monkeypatch.setattr(keyring, "holds_token_key", lambda *_, **__: False)
+    monkeypatch.setattr(keyring, "create_token_key", create)
+    root = tmp_path / "ks"
+    locked = Keyring(lambda what: "open, sesame", {"identity": f"file:{tmp_path}/old"}, True)
+    create_keystore(root, template=load_template("production"), now=NOW, keyring=locked)
+    on_token = Keyring(places={"identity": "pkcs11:token=robots;object=next"})
+    rotate = partial(rotate_ca, root, roles=["identity"], now=NOW, new_keys=on_token)
+    refused(lambda: rotate(delete_old_key=True), root, "deletes no key")
+    assert not made
+    rotate()
+    assert made == [on_token.places["identity"]]
 
 
 # ── revocation ─────────────────────────────────────────────────────────────────────────────

@@ -801,7 +801,8 @@ def test_private_keys_in_a_commit_are_named(change: Change, made_keystores: Path
     assert "keystores are signed for the policies is not reviewed; 'own.toml' changes and" in passed
     assert "pyproject" not in passed
     keys = ("ks/enclaves/a/key.pem", "ks/private/permissions_ca.key.pem", "old/ca.key")
-    change.commit(dict.fromkeys(keys, f"{begin}\nMHcCAQEE\n"))
+    texts = (f"{begin}\nMHcCAQEE\n", f"{begin}\r\nMHcCAQEE\r\n", rf'{{"key": "{begin}\nMHcC"}}')
+    change.commit(dict(zip(keys, texts, strict=True)))
     ended = change.review(*words, "--new-access", "allow")
     assert ended.status == 1
     for key in keys:
