@@ -235,6 +235,8 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
         how = f"closed {_EARLIER}: {how}"
     if process.alike:
         state = f"{process.pids_text}, which sros cannot tell"
+    elif process.enclave in closed.absent:
+        state = "not running"
     elif process.pid:
         state = f"process {process.pid}" + ("" if runs else f", known by its {process.known_by}")
     elif runs:

@@ -157,6 +157,12 @@ class ClosedProcess(NamedTuple):
         known_by = "command" if pids and self.known_by != "enclave" else self.known_by
         return self._replace(pid=next(iter(pids), 0), known_by=known_by, alike=())
 
+    def is_absent(self, running: RunningProcesses) -> bool:
+        """Return whether its unit runs no such process: the process failed, or was stopped."""
+        may_run = running.hidden or self.pid in {process.pid for process in running.unseen}
+        runs = any(map(self.fits, running.processes))
+        return bool(self.unit and self.pid) and not (may_run or runs)
+
     def open_command(self, domain: int) -> str:
         """Return the shell command that starts the process open, in its ROS domain and RMW."""
         if self.container:

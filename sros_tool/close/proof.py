@@ -211,13 +211,15 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
         for process, enclave in running.secured
         if enclave.name in missing
     }
-    open_pids = {
-        process.enclave: process.pids_text
+    causes = {
+        process.enclave: f"{process.unit} does not run it: systemctl status {process.unit}"
+        if process.is_absent(running.processes)
+        else f"stop {process.pids_text}, which is open"
         for process in observed.processes
         if process.pid or process.alike
     }
+    has_start = {*causes}
     absent = [name for name in missing if name not in outdated]
-    causes = {name: f"stop {text}, which is open" for name, text in open_pids.items()}
     causes |= {
         enclave.name: f"{process.label} has the files of '{keystore_text(enclave)}'"
         for process in running.in_domain
@@ -228,7 +230,7 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
         f"no secured process of {enclaves}; start it as {robot.commands_file} says; "
         f"if it ended: sros explain {shlex.quote(str(robot.export))} --log ITS_LOG"
     ] * bool(absent)
-    if may_end := [name for name in absent if name not in {*open_pids, *robot.without}]:
+    if may_end := [name for name in absent if name not in {*has_start, *robot.without}]:
         options = " ".join(f"--without {name}" for name in may_end)
         reasons.append(f"if it does not always run, add {options}")
     if absent and (in_other_domains := running.in_other_domains()):

@@ -238,6 +238,8 @@ class CloseState(NamedTuple):
     otherwise it has to be restarted."""
     new: Sequence[str]
     """The enclaves of the policy without a process: none was observed, and none runs now."""
+    absent: Sequence[str]
+    """The enclaves whose process is started by a unit, and does not run."""
     without: Sequence[str]
     """The enclaves of `--without`, of which no process has to run."""
     valid_until: datetime | None
@@ -277,7 +279,7 @@ class CloseState(NamedTuple):
         """The enclaves of which no process runs, open or closed."""
         processes = self.observed.processes
         stopped = {other.enclave for other in processes if not (other.pid or other.alike)}
-        return {*self.new, *stopped} - self.secured.keys()
+        return {*self.new, *self.absent, *stopped} - self.secured.keys()
 
     @property
     def pending_by_hand(self) -> Mapping[str, Sequence[ClosedProcess]]:
@@ -302,6 +304,9 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
         observed = running.with_later_processes(robot.observed)
         observed = observed.with_current_pids(running.processes, robot.export)
     observed = observed.within(policy) if policy else observed
+    absent = {
+        process.enclave for process in observed.processes if process.is_absent(running.processes)
+    }
     known = {process.enclave for process in observed.processes} | secured.keys()
     new = set[str]()
     if policy and robot.observed:
@@ -314,6 +319,7 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
         steps=(),
         secured=secured,
         new=sorted(new),
+        absent=sorted(absent - secured.keys()),
         without=robot.without,
         valid_until=_valid_until(robot),
         denied=(),
