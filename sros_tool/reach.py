@@ -228,14 +228,20 @@ class Network:
         ends = _writers_and_readers(by_domains, ignored)
         opened = tuple(dict.fromkeys(unguarded))
         joined = _domains_by_enclave(by_domains) if opened else {}
-        for each, enclave in product(opened, everybody):
-            outside = sorted({*each.without, *ignored})
-            met = tuple(expression for expression in outside if overlap(expression, each.topic))
-            if each.topic in met:
+        for opened_topic, enclave in product(opened, everybody):
+            outside = sorted({*opened_topic.without, *ignored})
+            met = tuple(
+                expression for expression in outside if overlap(expression, opened_topic.topic)
+            )
+            if opened_topic.topic in met:
                 continue
-            for domains in joined.get(enclave, (None,)) if each.join_needs_right else (None,):
-                if common := _common_domain_set(each.domains, domains):
-                    ends[each.direction].append(_Access(enclave, each.topic, met, *common))
+            for domains in (
+                joined.get(enclave, (None,)) if opened_topic.join_needs_right else (None,)
+            ):
+                if common := _common_domain_set(opened_topic.domains, domains):
+                    ends[opened_topic.direction].append(
+                        _Access(enclave, opened_topic.topic, met, *common)
+                    )
         self._sides = {direction: _Direction(accesses) for direction, accesses in ends.items()}
         self._router_of = links.router_of if links else {}
         self._passing = {
@@ -396,7 +402,7 @@ def _exact_names_first(topic: str) -> tuple[bool, bool, bool, bool, str]:
 def _shared_topic(*accesses: _Access) -> str:
     """Return a DDS topic that all accesses allow, or ""."""
     topics = sorted({access.topic for access in accesses})
-    if not all(overlap(one, other) for one, other in combinations(topics, 2)):
+    if not all(overlap(topic, other_topic) for topic, other_topic in combinations(topics, 2)):
         return ""
     exact = next((topic for topic in topics if not is_expression(topic)), "")
     outside = {excluded for access in accesses for excluded in access.without}

@@ -96,7 +96,11 @@ def _merge_robots(
 
     def largest(kinds: _Kinds, which: int, otherwise: Hashable) -> tuple[Hashable, str]:
         kinds_and_robots = ((kind[which], robot) for robot, kind in kinds.items())
-        return max(kinds_and_robots, key=lambda one: len(robots[one[0]]), default=(otherwise, ""))
+        return max(
+            kinds_and_robots,
+            key=lambda kind_and_robot: len(robots[kind_and_robot[0]]),
+            default=(otherwise, ""),
+        )
 
     chosen = [(group, largest(kinds, 0, group), largest(kinds, 1, group)) for group, kinds in read]
     parts: dict[Hashable, set[Hashable]] = defaultdict(set)

@@ -389,9 +389,9 @@ def list_enclaves(
         names = tuple(sorted(select_enclaves(OpenedKeystore(root), (), patterns, robots=robots)))
         hidden = hidden_enclaves(root)
     else:
-        every = enclave_names(root, hidden=True)
-        hidden = hidden_enclaves(root, every)
-        names = tuple(name for name in every if "/." not in name)
+        every_name = enclave_names(root, hidden=True)
+        hidden = hidden_enclaves(root, every_name)
+        names = tuple(name for name in every_name if "/." not in name)
     if as_json:
         from sros_tool.keystore.reader import OpenedKeystore
         from sros_tool.keystore.selection import EnclaveList, robots_of

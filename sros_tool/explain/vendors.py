@@ -674,14 +674,16 @@ class VendorOfKeystore(NamedTuple):
             opened = OpenedParts.joined(outcome.opened for outcome in decisions.values())
             return decision._replace(domains=domains, in_part=in_part, opened=opened)
 
-        every = self.keystore.names
-        names = every if self.names is None else self.names
+        every_name = self.keystore.names
+        names = every_name if self.names is None else self.names
         holders: Sequence[str] = ()
         if len(names) > _MOST_NARROWED:
-            holders = every
-        elif names != every:
+            holders = every_name
+        elif names != every_name:
             own_parts = [{*name.split("/")} for name in names]
-            holders = [n for n in every if any(parts <= {*n.split("/")} for parts in own_parts)]
+            holders = [
+                n for n in every_name if any(parts <= {*n.split("/")} for parts in own_parts)
+            ]
         outcomes = decide_each([*dict.fromkeys((*names, *holders))], outcome)
         asked = {*names}
         return tuple(o for o in self._with_holders(outcomes) if o.enclave in asked)

@@ -895,8 +895,8 @@ def _rules(access: MessageFilter) -> Iterator[tuple[object, tuple[str, ...]]]:
     if isinstance(access, Enforcement):
         for subject in access.subjects:
             for rule in access.rules_of(subject.id):
-                what = subject, rule.allows, rule.flows, rule.messages
-                yield what, rule.key_expressions
+                without_keys = subject, rule.allows, rule.flows, rule.messages
+                yield without_keys, rule.key_expressions
     elif isinstance(access, AccessControl):
         for remote in access.remotes:
             for stated in remote.rules:

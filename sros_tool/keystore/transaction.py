@@ -1271,7 +1271,7 @@ def _move_into_place(folder: Folder, source: str, target: str) -> None:
     CA keys move after their certificates, and enclaves last: a folder without enclaves does not
     count as a keystore yet.
     """
-    for name in sorted(folder.names(source), key=lambda each: (each == ENCLAVES, each == PRIVATE)):
+    for name in sorted(folder.names(source), key=lambda name: (name == ENCLAVES, name == PRIVATE)):
         old, new = f"{source}/{name}", f"{target}/{name}".lstrip("/")
         state = folder.state(old)
         if state is None or not stat.S_ISDIR(state.st_mode):

@@ -1287,7 +1287,8 @@ def _vendors_differ_error(
     denying = [
         number
         for number, rule in enumerate(grant.rules, 1)
-        if not rule.allow and any(matches(each, topic) for each in _topics(getattr(rule, verb)))
+        if not rule.allow
+        and any(matches(expression, topic) for expression in _topics(getattr(rule, verb)))
     ]
     are_alike = len({topic in decision.topics(verb) for decision in decisions.values()}) == 1
     if not are_alike or not denying:

@@ -141,7 +141,9 @@ def keystore_findings(
     wanted = wanted_rights(keystore)
     asked = asked_vendors(vendors)
     stated = {} if vendors else _stated_distributions(keystore, names)
-    deciding = {name: _vendors_of(each) for name, each in stated.items()}
+    deciding = {
+        name: _vendors_of(vendors_of_enclave) for name, vendors_of_enclave in stated.items()
+    }
     if stated:
         union = {vendor for of_enclave in deciding.values() for vendor in of_enclave}
         asked = asked if len(stated) < len(names) else asked_vendors(tuple(union))
@@ -152,7 +154,7 @@ def keystore_findings(
     def work(
         share: Sequence[str],
     ) -> tuple[list[Finding], list[EnclaveSummary], dict[str, frozenset[str]]]:
-        found: list[Finding] = []
+        all_findings: list[Finding] = []
         issued: list[EnclaveSummary] = []
         topics: dict[str, frozenset[str]] = {}
         for name in share:
@@ -171,26 +173,29 @@ def keystore_findings(
                 findings += check_vendors(evaluation, [*about_authorities, *shared, *findings])
             if not on_robot and name not in wanted:  # a policy knows more exactly of its nodes
                 findings = with_start_finding(evaluation, findings)
-            found += findings
-            if each := summary_of(enclave):
-                issued.append(each)
+            all_findings += findings
+            if summary := summary_of(enclave):
+                issued.append(summary)
             grant = enclave.state.grant
             if grant and not keystore.is_original:  # a keystore of many robots has too many names
                 topics[name] = names_without_wildcards(grant)
             tick()
-        return found, issued, topics
+        return all_findings, issued, topics
 
     outcomes = [outcome for _, outcome in map_slices(names, work)]
-    found = [*about_governance, *(finding for findings, *_ in outcomes for finding in findings)]
+    all_findings = [
+        *about_governance,
+        *(finding for findings, *_ in outcomes for finding in findings),
+    ]
     if only_enclaves is None:
         issued = [summary for _, share, _ in outcomes for summary in share]
         of_keystore = [*check_files(keystore), *about_authorities]
-        found = [*of_keystore, *check_issued(keystore, issued), *found]
+        all_findings = [*of_keystore, *check_issued(keystore, issued), *all_findings]
     else:
-        found = [*check_files(keystore, names), *found]
+        all_findings = [*check_files(keystore, names), *all_findings]
     topics = {name: names for *_, share in outcomes for name, names in share.items()}
-    found += check_capitals(topics)
-    found += zenoh_files.check_network(keystore, only_enclaves)
+    all_findings += check_capitals(topics)
+    all_findings += zenoh_files.check_network(keystore, only_enclaves)
     if policies:
         from sros_tool.checks.policies import findings_in
 
@@ -205,15 +210,15 @@ def keystore_findings(
             else policy
             for policy in policies
         ]
-        found += findings_in(parts, distribution)
+        all_findings += findings_in(parts, distribution)
     real_root = os.path.realpath(root)
-    located = (_with_real_file(finding, opened, real_root) for finding in found)
-    found = with_causes(
+    located = (_with_real_file(finding, opened, real_root) for finding in all_findings)
+    all_findings = with_causes(
         with_joined_findings([_with_enclave_names(finding, keystore) for finding in located])
     )
     if not keystore.is_original:
-        return found
-    return _with_cause_of_expiry(_with_cause_of_ros2(found, opened), opened)
+        return all_findings
+    return _with_cause_of_expiry(_with_cause_of_ros2(all_findings, opened), opened)
 
 
 def _stated_distributions(
@@ -337,7 +342,7 @@ def _joined_finding(group: list[Finding]) -> Finding:
         return group[0]
     shown = " ".join(map(quote, subjects)) if len(subjects) <= _MOST_NAMED else "ENCLAVE..."
     remedy = _OF_SEVERAL.sub(
-        lambda found: found[1] + (shown if found[2] == quote(subjects[0]) else found[2]),
+        lambda match: match[1] + (shown if match[2] == quote(subjects[0]) else match[2]),
         group[0].remedy,
     )
     together = group[0]._replace(subject=first_few(subjects, _NAMES_SHOWN))

@@ -368,7 +368,13 @@ def _incompatibility_of(own_side: _Governed, other_side: _Governed) -> _Incompat
     ]
     if not different or not all(disturbed for disturbed, _ in different):
         return None
-    disturbed, values = min(different, key=lambda each: (each[0].everything, len(each[0].names)))
+    disturbed, values = min(
+        different,
+        key=lambda disturbed_and_values: (
+            disturbed_and_values[0].everything,
+            len(disturbed_and_values[0].names),
+        ),
+    )
     return _Incompatibility(
         PEERS_PROTECTION, () if disturbed.everything else disturbed.names, values
     )

@@ -304,8 +304,8 @@ def _file(finding: Finding) -> str:
 
 def refusal_clause(cause: RefusalCause, titles: Sequence[str]) -> str:
     """Return a clause on what vendors with these titles do because of a cause."""
-    several, one = _HIT_PEERS if cause.hits_peers else _SAYS.get(cause.outcome, _REFUSES)
-    says = one if len(titles) == 1 else several
+    plural, singular = _HIT_PEERS if cause.hits_peers else _SAYS.get(cause.outcome, _REFUSES)
+    says = singular if len(titles) == 1 else plural
     return f"{enumerated(titles)} {says} ({cause.text})"
 
 

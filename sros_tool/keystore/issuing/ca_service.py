@@ -170,10 +170,10 @@ def _bounded_output(process: subprocess.Popen[bytes]) -> tuple[bytes | None, byt
     """
     end, answer, errors, ended = time.monotonic() + _SECONDS, b"", b"", False
     assert process.stdout and process.stderr
-    with process.stdout as output, process.stderr as said:
+    with process.stdout as output, process.stderr as errors_pipe:
         ready = select.poll()
         ready.register(output)
-        ready.register(said)
+        ready.register(errors_pipe)
         answers = True
         try:
             while len(answer) <= _MOST_BYTES and _seconds_left(end) and not ended:

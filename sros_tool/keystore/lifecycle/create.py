@@ -612,9 +612,9 @@ def write_governance(
 
     Enclaves in ``names`` that have a copy of the document instead of a link get the new one, too.
     """
-    document, what = render_governance(governance), "the governance document"
-    check_meaning(parse_governance(document), governance, what)
-    message = change.permissions.sign(document, what)
+    document, label = render_governance(governance), "the governance document"
+    check_meaning(parse_governance(document), governance, label)
+    message = change.permissions.sign(document, label)
     change.transaction.write(GOVERNANCE_XML, document)
     change.transaction.write(GOVERNANCE_P7S, message)
     # The governance of the keystore itself is in the folder of the enclave /.

@@ -180,7 +180,8 @@ def rotate_ca(
 def _step(change: KeystoreChange, **more: Any) -> RotationStep:
     """Return the result of a step, with all enclaves reissued, or all kept."""
     reissued = any(
-        each.path.endswith(f"/{CERTIFICATE_FILE}") for each in change.transaction.changes
+        change_of_file.path.endswith(f"/{CERTIFICATE_FILE}")
+        for change_of_file in change.transaction.changes
     )
     outcomes = dict.fromkeys(change.names, "reissued" if reissued else "kept")
     return change.result(RotationStep, outcomes=outcomes, restart=(), **more)

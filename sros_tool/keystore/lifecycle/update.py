@@ -652,17 +652,17 @@ class _Updater:
                 f"Finish it first with `sros rotate_ca {quote(str(self._root))} --next`.",
             )
         (file,) = files
-        for one, private, path_of in (
+        for path, private, path_of in (
             (f"{PUBLIC}/{file}.cert.pem", False, ca_certificate),
             (f"{PRIVATE}/{file}.key.pem", True, ca_key),
         ):
-            if not (self._root / one).is_file():
+            if not (self._root / path).is_file():
                 continue  # a key that is kept elsewhere
-            data = self._change.transaction.read(one)
+            data = self._change.transaction.read(path)
             for role in ROLES:
                 self._change.transaction.write(path_of(role), data, private=private)
-            if one not in map(path_of, ROLES):
-                self._change.transaction.remove(one)
+            if path not in map(path_of, ROLES):
+                self._change.transaction.remove(path)
 
     # ── remarks ────────────────────────────────────────────────────────────────────────────
 
