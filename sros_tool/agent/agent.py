@@ -189,9 +189,12 @@ class _Round:
         now, before = self._machine.now, self._state
         self._attempt(lambda: recover_keystore(self._folder))
         boot = self._machine.boot()
-        if self._machine.restarted or before.boot != boot:
+        # A start counts if both ids are known: a restart that was not seen stays due.
+        has_started = bool(before.boot and boot and before.boot != boot)
+        self._state = replace(before, boot=boot)
+        if self._machine.restarted or has_started:
             # After a start of the machine no process has files of before; what is seen counts.
-            self._state = replace(before, due=(), list_due=(), boot=boot)
+            self._state = replace(self._state, due=(), list_due=())
         # Before files are replaced: processes may have started with those that are here now.
         self._note_due((), self._enclaves())
         if self._machine.restarted:

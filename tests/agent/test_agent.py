@@ -631,6 +631,31 @@ def test_files_that_somebody_else_changed_make_a_restart_due(
     assert not r1.round().restart
 
 
+def test_a_start_that_cannot_be_told_ends_no_restart(r1: Robot) -> None:
+    """The files may have changed since the start that is known again.  Twin: "by a start"."""
+    r1.unseen, r1.release, r1.restarted = True, None, True
+    for r1.boot in ("first", ""):
+        r1.round()
+    r1.restarted = False
+    (r1.folder / "enclaves/r1/a" / CRL_FILE).write_text("x")
+    for r1.boot in ("", "second", "", "second"):
+        assert r1.round().restart == ("/r1/a",), r1.boot
+    r1.boot = "third"
+    assert not r1.round().restart
+
+
+def test_a_process_may_have_started_with_the_list_that_a_round_replaces(
+    home: Home, r1: Robot
+) -> None:
+    r1.unseen, r1.restarted, r1.release = True, True, home.revoked
+    for _ in range(2):
+        assert r1.round().sent and not r1.message().crl_restart
+    r1.restarted = False
+    (r1.folder / "enclaves/r1/b" / CRL_FILE).write_text("x")
+    done, said = r1.round(), r1.message()
+    assert done.changed == done.restart == said.restart == ("/r1/b",) and said.crl_restart is None
+
+
 def governance_again(home: Home) -> dict[str, bytes]:
     """Return the governance of /r1/b, signed again."""
     path = "enclaves/r1/b/governance.p7s"
