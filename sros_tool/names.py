@@ -136,15 +136,25 @@ def check_enclave_name(name: str) -> str:
 
 
 def _enclave_problem(name: str) -> str:
-    if not name:
-        return "It is empty."
-    if not name.startswith("/"):
-        return "It does not start with '/'."
-    if len(name) > MAX_COMMON_NAME:
+    if name.startswith("/") and len(name) > MAX_COMMON_NAME:
         return (
             f"It has {len(name)} characters, but the common name of an X.509 certificate has at "
             f"most {MAX_COMMON_NAME}."
         )
+    return namespace_problem(name)
+
+
+def namespace_problem(name: str) -> str:
+    """Return why ROS would refuse the namespace of a node, as a sentence; "" if it is valid.
+
+    Wildcards are not allowed.  Source: rmw_validate_namespace.
+    """
+    if not name:
+        return "It is empty."
+    if not name.startswith("/"):
+        return "It does not start with '/'."
+    if len(name) > _MAX_NAMESPACE:
+        return f"It has {len(name)} characters, more than {_MAX_NAMESPACE}."
     if name == "/":
         return ""
     if name.endswith("/"):

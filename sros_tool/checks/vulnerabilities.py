@@ -180,24 +180,24 @@ _LONGEST_PATH = 200
 def vulnerability_metrics(
     running: RunningProcesses, advisories: Sequence[Advisory] | None = None
 ) -> tuple[Metric, Metric]:
-    """Return how many vulnerabilities DDS releases have, and how many releases are unknown."""
-    numbers: dict[tuple[str, str], int] = {}
+    """Return how many vulnerabilities each DDS has, and how many releases are unknown.
+
+    Versions are no labels, of which there would be as many as processes, or robots, think of.
+    """
+    most: dict[str, int] = {}
     unknown: Counter[str] = Counter()
     for library in _users(running):
         known = known_vulnerabilities(library.product, library.version, advisories)
         if known is None:
             unknown[library.product] += 1
         else:
-            numbers[library.product, library.version] = len(known.known)
+            most[library.product] = max(most.get(library.product, 0), len(known.known))
     return (
         Metric(
             "sros_dds_known_vulnerabilities",
-            "Number of known vulnerabilities of each DDS release that processes have loaded, "
-            "without regard to fixes of a package.",
-            tuple(
-                Sample(number, {"product": product, "version": version})
-                for (product, version), number in sorted(numbers.items())
-            ),
+            "Number of known vulnerabilities of a DDS that processes have loaded, without regard "
+            "to fixes of a package; of several releases, the largest.",
+            tuple(Sample(number, {"product": name}) for name, number in sorted(most.items())),
         ),
         Metric(
             "sros_dds_unknown_versions",

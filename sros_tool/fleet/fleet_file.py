@@ -29,7 +29,6 @@ from sros_tool.fleet.robots import (
     crossing_problem,
     grace_problem,
     name_problem,
-    namespace_problem,
     pattern_problem,
     renewal_problem,
     robot_of,
@@ -38,7 +37,7 @@ from sros_tool.fleet.robots import (
     size_problem,
     user_problem,
 )
-from sros_tool.names import distribution_problem
+from sros_tool.names import distribution_problem, namespace_problem
 from sros_tool.values import parse_json
 from sros_tool.xml import read_bytes
 

@@ -39,8 +39,6 @@ ROUTERS = "/{robot}/router"
 """Default path of the enclave of each robot's Zenoh router."""
 _MAX_NAME = 64
 """Longest name of a robot or group in characters: longer ones fit into no enclave's name."""
-_MAX_NAMESPACE = 245
-"""Longest ROS namespace (rmw: RMW_NAMESPACE_MAX_LENGTH)."""
 _MAX_HOST = 253
 """Longest host name (RFC 1035)."""
 
@@ -172,29 +170,14 @@ def name_problem(name: str) -> str:
     """Return why ``name`` is not the name of a robot or group, as a sentence; "" if it is."""
     if len(name) > _MAX_NAME:
         return f"It has {len(name)} characters, more than {_MAX_NAME}."
-    if not _TOKEN.fullmatch(name) or "__" in name:
+    if not _TOKEN.fullmatch(name):
         return (
-            "A name is one part of a ROS name: letters, digits and single underscores, and no "
-            "digit at its start, such as r7."
+            "A name is one part of a ROS name: letters, digits and underscores, and no digit at "
+            "its start, such as r7."
         )
     if name in _OF_ANSIBLE:
         return "In an Ansible inventory this name means something else."
     return ""
-
-
-def namespace_problem(namespace: str) -> str:
-    """Return why ``namespace`` is not an absolute ROS namespace, as a sentence; "" if it is."""
-    if len(namespace) > _MAX_NAMESPACE:
-        return f"It has {len(namespace)} characters, more than {_MAX_NAMESPACE}."
-    if namespace == "/":
-        return ""
-    first, *parts = namespace.split("/")
-    if first or not parts or not all(_TOKEN.fullmatch(part) for part in parts):
-        return (
-            "A namespace is absolute, and its parts are letters, digits and underscores, without a "
-            "digit at the beginning, such as /warehouse/r7."
-        )
-    return "It contains '__', which ROS does not allow." if "__" in namespace else ""
 
 
 def address_problem(address: str) -> str:

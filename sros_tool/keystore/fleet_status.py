@@ -1403,23 +1403,23 @@ def _dds_metrics(
     unknown: list[Sample] = []
     for labels, robot in robots:
         unknown_libraries = 0 if robot.dds and robot.dds.libraries else 1
-        releases: dict[tuple[str, str, str], int] = {}
+        most: dict[tuple[str, str], int] = {}
         for library in robot.dds.libraries if robot.dds else ():
             vulnerabilities = known_vulnerabilities(library.product, library.version, advisories)
             if vulnerabilities is None:
                 unknown_libraries += 1
             else:
-                release = library.product, library.version, library.seen.value
-                releases[release] = len(vulnerabilities.known)
+                use = library.product, library.seen.value
+                most[use] = max(most.get(use, 0), len(vulnerabilities.known))
         numbers += (
-            Sample(number, {**labels, "product": product, "version": version, "seen": seen})
-            for (product, version, seen), number in sorted(releases.items())
+            Sample(number, {**labels, "product": product, "seen": seen})
+            for (product, seen), number in sorted(most.items())
         )
         unknown.append(Sample(unknown_libraries, labels))
     yield Metric(
         "sros_fleet_dds_known_vulnerabilities",
-        "Number of known vulnerabilities of each DDS release of a robot, in a process or only "
-        "installed, without regard to fixes of a package.",
+        "Number of known vulnerabilities of a DDS of a robot, in a process or only installed, "
+        "without regard to fixes of a package; of several releases, the largest.",
         tuple(numbers),
     )
     yield Metric(

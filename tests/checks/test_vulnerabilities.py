@@ -85,12 +85,13 @@ def test_installed_and_loaded_library_have_one_finding() -> None:
     assert finding.text.startswith(f"'{library.path}', loaded by process 7 (a), process 8 (b)")
 
 
-def test_the_metric_counts_by_release() -> None:
+def test_the_metric_has_the_largest_number_of_each_product() -> None:
     library = MappedLibrary("Fast DDS", "2.14.5", "/a/libfastrtps.so.2.14.5")
     unknown = MappedLibrary("Fast DDS", "", "/b/libfastrtps.so")
-    known, hidden = vulnerability_metrics(running(library, unknown))
+    mended = library._replace(version="2.14.6")
+    known, hidden = vulnerability_metrics(running(library, mended, unknown))
     (sample,) = known.samples
-    assert (sample.value, sample.labels) == (27, {"product": "Fast DDS", "version": "2.14.5"})
+    assert (sample.value, sample.labels) == (27, {"product": "Fast DDS"})
     assert hidden.samples == (Sample(1, {"product": "Fast DDS"}),)
     assert vulnerability_metrics(running(library))[1].samples == ()
 

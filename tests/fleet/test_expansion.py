@@ -18,10 +18,9 @@ from sros_tool.fleet.robots import (
     Robot,
     enclaves_of,
     name_problem,
-    namespace_problem,
     robot_of,
 )
-from sros_tool.names import is_expression
+from sros_tool.names import is_expression, namespace_problem
 from sros_tool.policy.document import policy_xml, read_policy
 from sros_tool.policy.model import Policy
 from tests.support.children import LONG

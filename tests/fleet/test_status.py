@@ -1138,6 +1138,16 @@ def test_the_dds_of_a_robot(
     assert (bool(known), unknown) == (is_known, ["0" if is_known else "1"])
 
 
+def test_a_robot_decides_about_no_number_of_series(field: Field) -> None:
+    """Or each of its messages fills the database of Prometheus with series of its own."""
+    versions = ["2.14.5", *(f"2.{minor}.0" for minor in range(40, 99))]
+    libraries = [{**OLD, "version": version, "path": f"/{version}"} for version in versions]
+    field.confirm("r1", dds={"libraries": libraries, "unseen": 0})
+    numbers = field.run("fleet", "status", "ks", "--prometheus").out
+    series = re.findall(r'vulnerabilities\{.*robot="r1",(.*)', numbers)
+    assert series == ['product="Fast DDS",seen="process"} 27']
+
+
 def test_an_earlier_confirmation_does_not_name_the_dds(field: Field) -> None:
     kept = field.root / "confirmed/r1.json"
     value = json.loads(kept.read_text())
