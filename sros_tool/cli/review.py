@@ -48,6 +48,7 @@ _TITLES = {
     "requirements-before": "Earlier requirements",
     "files": "Files",
     "keystore": "Keystore",
+    "signed": "Signed for the policies",
     "expiry": "Expiry",
     "policy": "Policy",
     "rights": "Rights",

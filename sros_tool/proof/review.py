@@ -20,6 +20,13 @@ from pathlib import Path
 from shlex import quote
 from typing import Annotated
 
+from sros_tool.checks.keystores.issued import (
+    LESS_PROTECTED,
+    NOT_IN_EXPORT,
+    NOT_IN_KEYSTORE,
+    NOT_IN_POLICY,
+    STALE,
+)
 from sros_tool.checks.kind import WARNING, ChosenFindings, Finding, FindingFilter
 from sros_tool.checks.requirements import VACUOUS
 from sros_tool.checks.targets import Circumstances, path_findings, policy_findings
@@ -33,11 +40,11 @@ from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.folders import Folder
 from sros_tool.keystore.expiry import ExpiryCheck, Threshold, due_enclaves
 from sros_tool.keystore.fleet import load_fleet
-from sros_tool.keystore.layout import FLEET, KEY_FILE, SETTINGS, is_keystore
+from sros_tool.keystore.layout import FLEET, GOVERNANCE_P7S, KEY_FILE, SETTINGS, is_keystore
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import RightsSource, SourcesDifference, compare_sources
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import ALLOW, DENY, Enclave, Profile
+from sros_tool.policy.model import ALLOW, DENY, Enclave, Policy, Profile
 from sros_tool.policy.rights import (
     PlacedRight,
     Right,
@@ -92,6 +99,10 @@ _NOT_USED = (
 )
 _PRIVATE_KEY = regex(rb"-----BEGIN (?:[A-Z0-9]+ )*PRIVATE KEY-----(?:\s|\\[nr])+[\w+/]")
 """A private key in PEM; a text that only mentions the first line does not match."""
+_OF_POLICIES = tuple(
+    kind.id for kind in (STALE, LESS_PROTECTED, NOT_IN_POLICY, NOT_IN_KEYSTORE, NOT_IN_EXPORT)
+)
+"""The findings on a keystore that is not signed for the policies."""
 _OF_TEMPLATES = ("authorities", "certificates", "permissions", "protection")
 _SETTINGS = regex(rf"^[ \t]*\[+(?:{'|'.join((*_OF_TEMPLATES, *KINDS))})\b".encode(), re.MULTILINE)
 """A table of a keystore template or of requirements."""
@@ -188,10 +199,10 @@ class ReviewStep:
     """One step of a review, with its exit status and result.
 
     ``kind`` is "files", "policy", "requirements", "requirements-before", "new-access", "rights",
-    "keystore" or "expiry"; ``subject`` is the path that the step is about.  If the result is an
-    error, it says why the step could not be decided.  ``allowed``: the step found something that
-    the request allows, so that its status is 0.  ``fleet`` are the robots of the examined policy or
-    keystore.
+    "keystore", "signed" (whether the keystore is signed for the reviewed policies) or "expiry".
+    ``subject`` is the path that the step is about.  If the result is an error, it says why the step
+    could not be decided.  ``allowed``: the step found something that the request or its kind
+    allows, so that its status is 0.  ``fleet`` are the robots of the examined policy or keystore.
     """
 
     kind: str
@@ -254,7 +265,7 @@ class Review:
 
 _STEPS = (
     *("files", "policy", "requirements", "requirements-before", "new-access", "rights"),
-    *("keystore", "expiry"),
+    *("keystore", "signed", "expiry"),
 )
 
 
@@ -262,13 +273,17 @@ class StepResult(NamedTuple):
     """The result of one step of a review."""
 
     step: Annotated[str, Words(_STEPS)]
-    """Name of the step; ``requirements-before`` reports requirements that the change drops."""
+    """Name of the step; ``requirements-before`` reports requirements that the change drops,
+    ``signed`` whether a keystore is signed for the reviewed policies.
+    """
     subject: str | None
     """Path that the step checks; null for the whole commit."""
     status: int
     """Exit status of the step: 0, 1 or 2, as for the review."""
     allowed: bool
-    """Whether the step found something that an option allows; its status is 0 then."""
+    """Whether the step found something that is allowed, by an option or always (``signed``); its
+    status is 0 then.
+    """
     result: str
     """The result as a sentence, or why the step could not be decided."""
     lines: Sequence[str]
@@ -329,10 +344,13 @@ class _Review:
     """Map the subject of a step to the fleet of the policy or keystore that it examines."""
 
     def _allows(self, kind: str) -> bool:
-        """Return whether the request allows what steps of this kind find."""
+        """Return whether the request, or the kind itself, allows what steps of a kind find."""
         if kind == "requirements-before":
             return self.request.allow_dropped_requirements
-        return kind in ("new-access", "files") and self.request.allow_new_access
+        # Whoever changes a policy seldom has the keys of the CAs.
+        return kind == "signed" or (
+            kind in ("new-access", "files") and self.request.allow_new_access
+        )
 
     def all(self) -> Iterator[ReviewStep]:
         asked = self.request
@@ -382,7 +400,7 @@ class _Review:
                 only_with_result=bool(of_base),
             )
         for path, keystore in keystores.items():
-            yield from self._keystore(path, keystore)
+            yield from self._keystore(path, keystore, of_head, head_fleet)
         yield from self._step_result("files", "", self._converted_step)
         yield from self._step_result("keystore", " ".join(asked.keystores), self._keys_step)
         if self.base:
@@ -771,8 +789,8 @@ class _Review:
             yield f"policies in '{path}'{but} are not reviewed, as the options say"
         if asked.keystores:
             yield "private keys of keystores are not reviewed"
-        if asked.keystores and asked.policies:
-            yield "whether keystores are signed for the policies is not reviewed"
+        for path in self._unnamed_keystores():
+            yield f"'{path}' is a keystore and is not reviewed"
         for path in self._changed_settings():
             yield f"'{path}' changes and is not reviewed"
         for side in (self.head, self.base):
@@ -790,6 +808,20 @@ class _Review:
         elif differing := self.head.differing_files(top):
             files = first_few([f"'{path}'" for path in differing], 3)
             yield f"the checkout differs from the reviewed commit: {files}"
+
+    def _unnamed_keystores(self) -> list[str]:
+        """Return the folders of HEAD that are keystores, and are not reviewed or left out."""
+        with suppress(SrosError):  # said by the step on changed files
+            known = (*self.request.keystores, *self.request.left_out)
+            folders = (
+                path.removesuffix(GOVERNANCE_P7S)
+                for path, _ in self._changed_files(self.head, None)
+                if f"/{path}".endswith(f"/{GOVERNANCE_P7S}")
+            )
+            return sorted(
+                folder.rstrip("/") or "." for folder in folders if not _is_below(folder, known)
+            )
+        return []
 
     def _changed_settings(self) -> list[str]:
         """Return changed TOML files that look like templates or requirements, and are not read."""
@@ -951,7 +983,9 @@ class _Review:
 
     # ── keystores ──────────────────────────────────────────────────────────────────────────
 
-    def _keystore(self, path: str, folder: Path) -> Iterator[ReviewStep]:
+    def _keystore(
+        self, path: str, folder: Path, policies: Sequence[Path], fleet: Fleet | None
+    ) -> Iterator[ReviewStep]:
         before = None
         if self.base:
             try:
@@ -961,14 +995,28 @@ class _Review:
         settings = f"{path}/{SETTINGS}"
         is_same = before is not None and _is_same_file(self.base, self.head, settings)
 
+        stated: tuple[Policy, ...] = ()
+        with suppress(SrosError, OSError):  # said by the step on policies
+            stated = tuple(read_policy_for(file, fleet) for file in policies)
+        circumstances = replace(self._circumstances(self.robots.get(path)), policies=stated)
+
+        @cache
+        def all_findings() -> list[Finding]:
+            return path_findings([folder], circumstances)
+
         def findings() -> tuple[int, Content]:
             findings = (
                 finding
-                for finding in path_findings([folder], self._circumstances())
+                for finding in all_findings()
                 if (finding.id != _FILE_MISSING or Path(finding.file).name != KEY_FILE)
                 and (not finding.file or _is_below(os.path.normpath(finding.file), (str(folder),)))
             )
-            chosen = FindingFilter(strict=bool(self.base) and not is_same).choose(findings)
+            strict = bool(self.base) and not is_same
+            chosen = FindingFilter(exclude=_OF_POLICIES, strict=strict).choose(findings)
+            return _status(chosen), chosen
+
+        def signed() -> tuple[int, Content]:
+            chosen = FindingFilter(include=_OF_POLICIES).choose(all_findings())
             return _status(chosen), chosen
 
         def access() -> tuple[int, Content]:
@@ -978,6 +1026,7 @@ class _Review:
             return _FOUND, Facts(new)
 
         yield from self._step_result("keystore", path, findings)
+        yield from self._step_result("signed", path, signed, only_with_result=bool(stated))
         if self.base:
             yield from self._step_result("new-access", path, access)
         yield from self._step_result("expiry", path, lambda: self._expiry(before or folder, folder))

@@ -783,6 +783,26 @@ def test_a_keystore_fails_for_a_finding_an_expiry_and_a_link_out_of_it(
     assert (linked.status, "cert.pem' is a link out of 'ks'" in linked.out) == (2, True), linked
 
 
+def test_whether_a_keystore_is_signed_for_the_policies(
+    change: Change, made_keystores: Path
+) -> None:
+    """It never fails: who changes a policy seldom has the keys of the CAs."""
+    copy_of(made_keystores / "before", change.folder / "ks")
+    change.base = change.commit({})
+    change.commit({"README": "x"})
+    words = ("--policy", "robot.xml", "--keystore", "ks")
+    assert "\nsigned ks: nothing found" in change.review(*words).ok().out
+    change.commit({"robot.xml": policy_text({"/a": publish("/x"), "/c": publish("/z")})})
+    ended = change.review(*words, "--new-access", "allow").ok()
+    assert "\nsigned ks: 1 warning, 1 note" in ended.out, ended
+    assert "/c: the keystore does not have this enclave [keystore.enclave-missing]" in ended.out
+    change.commit({"robot.xml": policy_text(ROBOT | {"/a": publish("/x2")})})
+    ended = change.review(*words, "--new-access", "allow").ok()
+    assert "permissions (-) and policy (+) differ: - ALLOW publish topic /x" in ended.out, ended
+    unnamed = change.review("--policy", "robot.xml", "--new-access", "allow").ok().out
+    assert "'ks' is a keystore and is not reviewed" in unnamed
+
+
 def test_private_keys_in_a_commit_are_named(change: Change, made_keystores: Path) -> None:
     """They fail the review, also outside of the keystore, and are expected of no other enclave."""
     copy_of(made_keystores / "before", change.folder / "ks")
@@ -798,7 +818,7 @@ def test_private_keys_in_a_commit_are_named(change: Change, made_keystores: Path
         }
     )
     passed = change.review(*words).ok().out.splitlines()[-1]
-    assert "keystores are signed for the policies is not reviewed; 'own.toml' changes and" in passed
+    assert "private keys of keystores are not reviewed; 'own.toml' changes and" in passed
     assert "pyproject" not in passed
     keys = ("ks/enclaves/a/key.pem", "ks/private/permissions_ca.key.pem", "old/ca.key")
     texts = (f"{begin}\nMHcCAQEE\n", f"{begin}\r\nMHcCAQEE\r\n", rf'{{"key": "{begin}\nMHcC"}}')
