@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from sros_tool.policy.model import Policy
     from sros_tool.proof.growth import Growth
 
-__version__ = "0.3.0"
+__version__ = "0.4.0.dev0"
 
 __all__ = [
     "AccessAnswer",

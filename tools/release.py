@@ -52,6 +52,7 @@ _SMOKE: tuple[tuple[str, ...], ...] = (
 _PATIENCE = 1800
 
 
+GALAXY = "ansible_collections/sros/fleet/galaxy.yml"
 _MANUAL = ".data/data/share/man/man1/sros.1"
 
 
@@ -80,7 +81,7 @@ def versions() -> dict[str, str]:
         "pyproject.toml": r'^version = "(.+)"$',
         "sros_tool/__init__.py": r'^__version__ = "(.+)"$',
         "package.xml": r"<version>(.+)</version>",
-        "ansible_collections/sros/fleet/galaxy.yml": r"^version: (.+)$",
+        GALAXY: r"^version: (.+)$",
         "CHANGELOG.md": r"^## \[(\d.*?)\]",
     }
     found = {}
@@ -90,11 +91,31 @@ def versions() -> dict[str, str]:
     return found
 
 
+def version_problems(stated: Mapping[str, str]) -> list[str]:
+    """Return what is wrong with the version in each file, of a release or after the last one.
+
+    After a release, the version is that of the next one with ``.dev0`` (PEP 440), which
+    package.xml cannot say (REP 149), and the changelog still begins with the last release.
+    """
+    version = stated["pyproject.toml"]
+    release, is_after, _ = version.partition(".dev")
+    expected = dict.fromkeys(stated, version)
+    if is_after:
+        expected |= {GALAXY: version.replace(".dev", "-dev"), "package.xml": release}
+        del expected["CHANGELOG.md"]
+    return [
+        f"{name} states version {stated[name]}, not {wanted}"
+        for name, wanted in expected.items()
+        if stated[name] != wanted
+    ]
+
+
 def check() -> int:
     """Check a release of this checkout; return the exit status."""
     stated = versions()
-    bad = [f"{name} states version {each}" for name, each in stated.items()]
-    bad = bad if len(set(stated.values())) > 1 else []
+    bad = version_problems(stated)
+    if ".dev" in stated["pyproject.toml"]:
+        bad.append(f"{stated['pyproject.toml']} is no version of a release")
     with tempfile.TemporaryDirectory(prefix="sros-release-") as folder:
         wheel = _built(Path(folder))
         for package in Path(folder).glob("sros_tool-*"):

@@ -233,12 +233,49 @@ Exit status: 0 yes or done; 1 no, denied, different or findings; 2 sros could
 not answer or do it."""
 
 
+def _show_version(context: click.Context, _: click.Parameter, asked: bool) -> None:
+    if asked and not context.resilient_parsing:
+        echo(f"sros {__version__}{_commit_of_checkout()}")
+        context.exit()
+
+
+def _commit_of_checkout() -> str:
+    """Return the commit of the git checkout that runs, as a local version (PEP 440), or ""."""
+    import subprocess
+
+    from sros_tool.files import policies_dir
+
+    checkout = policies_dir().parent
+    if not (checkout / ".git").exists():  # an installed package has the folder inside
+        return ""
+    describe = ("describe", "--always", "--exclude=*", "--abbrev=10", "--dirty=.dirty")
+    environment = {name: text for name, text in os.environ.items() if not name.startswith("GIT_")}
+    with suppress(OSError, subprocess.SubprocessError):
+        git = subprocess.run(
+            ("git", "-C", str(checkout), *describe),
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
+        return f"+g{git.stdout.strip()}"
+    return ""
+
+
 @click.group(
     cls=_Program,
     epilog=_EPILOG,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 80},
 )
-@click.version_option(__version__, "--version", "-V", message="sros %(version)s")
+@click.option(
+    *("--version", "-V"),
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_show_version,
+    help="Show the version and exit.",
+)
 def program() -> None:
     """Secure ROS 2 robots: keystores, enclaves and permissions from policies in ROS terms."""
 

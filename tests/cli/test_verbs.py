@@ -9,6 +9,7 @@ import shlex
 import shutil
 import signal
 import stat
+import subprocess
 import sys
 import time
 from datetime import UTC, datetime, timedelta
@@ -16,6 +17,7 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool import __version__
 from sros_tool.cli.program import FAMILIES
 from sros_tool.files import policies_dir
 from sros_tool.keystore.layout import PRIVATE, REQUIRED_FILES
@@ -80,7 +82,15 @@ def test_aliases(alias: str, verb: str) -> None:
 def test_help_and_version() -> None:
     said = sros("--help").ok().out
     assert all(verb in said for verb in VERBS)
-    assert sros("--version").ok().out.startswith("sros ")
+    git = subprocess.run(
+        ["git", "rev-parse", "--short=10", "HEAD"],
+        cwd=policies_dir(),
+        capture_output=True,
+        text=True,
+    )
+    commit = rf"\+g{git.stdout.strip()}(\.dirty)?" if git.returncode == 0 else ""
+    said = sros("--version").ok().out
+    assert re.fullmatch(rf"sros {re.escape(__version__)}{commit}\n", said)
     assert sros().status == 2
 
 

@@ -72,7 +72,14 @@ def test_nothing_else_is_in_it(unpacked: Path) -> None:
 
 def test_what_a_release_checks_is_complete() -> None:
     assert set(release.EXTRAS) == release.extras()
-    assert len(set(release.versions().values())) == 1, release.versions()
+    stated = release.versions()
+    assert release.version_problems(stated) == []
+    released = dict.fromkeys(stated, "1.2.0")
+    assert release.version_problems(released) == []
+    after = released | dict.fromkeys(("pyproject.toml", "sros_tool/__init__.py"), "1.3.0.dev0")
+    assert len(release.version_problems(after)) == 2
+    after |= {release.GALAXY: "1.3.0-dev0", "package.xml": "1.3.0"}
+    assert release.version_problems(after) == []
 
 
 @sometimes("the wheel")
