@@ -42,6 +42,7 @@ from sros_tool.cli.common import (
     keystore_from_environment,
     local_zone,
     moment_of,
+    namespace_of_option,
     now,
     output_option,
     policy_for,
@@ -144,6 +145,14 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
     "dropped since.",
 )
 @click.option(
+    "--namespace",
+    "namespaces",
+    metavar="NS",
+    multiple=True,
+    help="With --requirements: their enclaves, and names that do not begin with '/', are in this "
+    "namespace, such as /left.  Can be repeated: they have to hold in each namespace.",
+)
+@click.option(
     "--template",
     metavar="TEMPLATE",
     shell_complete=complete_template,
@@ -213,6 +222,7 @@ def check(
     fleet_file: Path | None,
     requirements: tuple[Path, ...],
     earlier: tuple[Path, ...],
+    namespaces: tuple[str, ...],
     template: str | None,
     suggest: bool,
     vendor: str | None,
@@ -336,7 +346,9 @@ def check(
         raise UsageError("--template is for --requirements and --suggest", "", "Leave it out.")
     if earlier and not requirements:
         raise UsageError("--requirements-before needs --requirements", "", "Name the new file.")
-    decide = _requirements(family, paths, requirements, earlier)
+    if namespaces and not requirements:
+        raise UsageError("--namespace is for --requirements", "", "Leave it out.")
+    decide = _requirements(family, paths, requirements, earlier, namespaces)
     with progress("checking"):
         findings_of_paths = [*_findings(family, paths, at), *_stated_differences(paths, at)]
         if decide:
@@ -371,6 +383,7 @@ def _requirements(
     paths: tuple[Path, ...],
     files: tuple[Path, ...],
     earlier: tuple[Path, ...],
+    namespaces: tuple[str, ...],
 ) -> Callable[[Callable[[Sequence[Path]], System]], list[Finding]] | None:
     """Return a function that checks the requirements of files; None without files.
 
@@ -382,13 +395,14 @@ def _requirements(
     from sros_tool.proof.requirements import dropped_findings, read_all_requirements
 
     one_robot = _paths_of_one_system(family, paths, "--requirements")
+    places = [namespace_of_option(namespace) for namespace in namespaces] or ["/"]
 
     def decide(load: Callable[[Sequence[Path]], System]) -> list[Finding]:
         system = load(one_robot)
-        wanted = read_all_requirements(files, system.fleet)
+        wanted = read_all_requirements(files, system.fleet, places)
         findings = requirement_findings(wanted, system)
         if earlier:
-            before = read_all_requirements(earlier, system.fleet)
+            before = read_all_requirements(earlier, system.fleet, places)
             findings += dropped_findings(before, wanted, str(files[0]))
         return findings
 

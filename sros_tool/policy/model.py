@@ -127,19 +127,21 @@ def policy_in_namespace(policy: Policy, namespace: str) -> Policy:
     Names that are written with a ``/`` at their beginning stay.
     """
 
-    def path_below_namespace(path: str) -> str:
-        return f"{namespace.rstrip('/')}/{path.lstrip('/')}".rstrip("/") or "/"
-
     enclaves = (
         replace(
             enclave.with_profiles(
-                lambda profile: replace(profile, ns=path_below_namespace(profile.ns))
+                lambda profile: replace(profile, ns=below_namespace(profile.ns, namespace))
             ),
-            path=path_below_namespace(enclave.path),
+            path=below_namespace(enclave.path, namespace),
         )
         for enclave in policy.enclaves
     )
     return replace(policy, enclaves=tuple(enclaves))
+
+
+def below_namespace(path: str, namespace: str) -> str:
+    """Return the path of an enclave, or a namespace, below another namespace."""
+    return f"{namespace.rstrip('/')}/{path.lstrip('/')}".rstrip("/") or "/"
 
 
 def policy_in_enclave(policy: Policy, path: str) -> Policy:

@@ -7,8 +7,9 @@ A requirement is a table of the file, such as::
     enclaves = ["/robot/mux"]
     why = "Commands meet in one place."
 
-Names are absolute ROS names, with the wildcards of policies; enclaves are names or patterns, as for
-``--match``, and ``!`` before a name excepts an enclave from a list.
+Names are ROS names, with the wildcards of policies; enclaves are names or patterns, as for
+``--match``, and ``!`` before a name excepts an enclave from a list.  A file can be read for a
+namespace: then all enclaves, and the names without ``/`` at their beginning, are below it.
 The class of each kind says what such a requirement demands.
 
 Names and enclaves can have the placeholders of policies, which a fleet fills in.  A table with
@@ -34,8 +35,8 @@ from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import DocumentError
 from sros_tool.files import read_toml
 from sros_tool.fleet.robots import Fleet, Robot
-from sros_tool.names import expression_problem, is_expression
-from sros_tool.policy.model import RIGHTS, Level, Source
+from sros_tool.names import expand, expression_problem, is_expression
+from sros_tool.policy.model import RIGHTS, Level, Source, below_namespace
 from sros_tool.policy.patterns import covers, overlap
 from sros_tool.policy.placeholders import (
     Placeholder,
@@ -277,8 +278,12 @@ def _no_fleet() -> None:
     return None
 
 
-def read_requirements(path: Path, fleet: FleetSource = _no_fleet) -> tuple[Requirement, ...]:
+def read_requirements(
+    path: Path, fleet: FleetSource = _no_fleet, namespaces: Sequence[str] = ("/",)
+) -> tuple[Requirement, ...]:
     """Return the requirements in a TOML file, in their order, for the robots of a fleet.
+
+    Each requirement is there for each of the ``namespaces``.
 
     Raises:
         DocumentError: the file cannot be read, or a part of it is not valid; the error has file and
@@ -286,30 +291,42 @@ def read_requirements(path: Path, fleet: FleetSource = _no_fleet) -> tuple[Requi
         SrosError: as ``fleet`` raises it.
     """
     data = read_bytes(path, "requirements file", max_bytes=1024 * 1024)
-    return parse_requirements(data, str(path), fleet)
+    return parse_requirements(data, str(path), fleet, namespaces)
 
 
 def read_all_requirements(
-    paths: Iterable[Path], fleet: FleetSource = _no_fleet
+    paths: Iterable[Path], fleet: FleetSource = _no_fleet, namespaces: Sequence[str] = ("/",)
 ) -> tuple[Requirement, ...]:
-    """Return the requirements in several TOML files.
+    """Return the requirements in several TOML files, for each of the ``namespaces``.
 
     Raises:
         SrosError: as `read_requirements`.
     """
-    return tuple(requirement for path in paths for requirement in read_requirements(path, fleet))
+    return tuple(
+        requirement for path in paths for requirement in read_requirements(path, fleet, namespaces)
+    )
 
 
 def parse_requirements(
-    data: bytes, file: str, fleet: FleetSource = _no_fleet
+    data: bytes,
+    file: str,
+    fleet: FleetSource = _no_fleet,
+    namespaces: Sequence[str] = ("/",),
 ) -> tuple[Requirement, ...]:
-    """Return the requirements in a TOML document; ``file`` is its name in errors and sources.
+    """Return the requirements in a TOML document, for each of the ``namespaces``.
+
+    ``file`` is its name in errors and sources.
 
     Raises:
         DocumentError: a part of it is not valid.
     """
     unfilled_tables = _stated_tables(data, file)
-    filled = (table for unfilled in unfilled_tables for table in _filled_tables(unfilled, fleet))
+    filled = (
+        replace(table, namespace=namespace)
+        for unfilled in unfilled_tables
+        for table in _filled_tables(unfilled, fleet)
+        for namespace in dict.fromkeys(namespaces)
+    )
     requirements = []
     pairs_left = _MOST_PAIRS
     for table in filled:
@@ -317,8 +334,8 @@ def parse_requirements(
         requirements.append(requirement)
         if len(requirements) > _MOST_FILLED:
             raise DocumentError(
-                f"{table.source}: with the robots of the fleet, the tables up to this line are "
-                f"more than {_MOST_FILLED} requirements",
+                f"{table.source}: with the robots of the fleet, or all namespaces, the tables up "
+                f"to this line are more than {_MOST_FILLED} requirements",
                 "",
                 "Name a group of robots, as in {robot:carriers}, or divide the file.",
             )
@@ -419,6 +436,7 @@ class _Table:
     lines: Mapping[str, int]
     robot: str = ""
     of_robots: tuple[RobotNames, ...] = ()
+    namespace: str = "/"
 
     def known(self, *keys: str) -> dict[str, Any]:
         """Return the arguments that all requirements have.
@@ -466,17 +484,19 @@ class _Table:
         return tuple(dict.fromkeys(value))
 
     def names(self, key: str, *, least: int = 1) -> tuple[str, ...]:
-        """Return a list of absolute names, perhaps with wildcards."""
+        """Return a list of names, perhaps with wildcards, in absolute form."""
         names = self.texts(key, least=least)
         for name in names:
             problem = expression_problem(name)
-            if not problem and name[0] not in "/*":
-                problem = "It is not absolute: it does not begin with '/' or '*'."
+            if not problem and name[0] == "~":
+                problem = "It is a name of one node, which a requirement does not name."
             if not problem and name == "/":
                 problem = "It is a namespace."
             if problem:
                 raise self.error(key, f"{_short(name)} is not valid in {key}", problem)
-        return names
+        return tuple(
+            name if name.startswith("*") else expand(name, self.namespace, "") for name in names
+        )
 
     def enclaves(self, key: str) -> tuple[str, ...]:
         """Return a list of enclave names and patterns; excepted enclaves begin with ``!``."""
@@ -494,7 +514,13 @@ class _Table:
                 f"{key} only excludes enclaves",
                 'Begin the list with "*", for all other enclaves.',
             )
-        return enclaves
+        return tuple(map(self.enclave_below, enclaves))
+
+    def enclave_below(self, enclave: str) -> str:
+        """Return an enclave or pattern below the namespace; one for all enclaves stays."""
+        begin = EXCEPT if enclave.startswith(EXCEPT) else ""
+        name = enclave.removeprefix(begin)
+        return begin + below_namespace(name, self.namespace) if name.startswith("/") else enclave
 
     def rights(self, *, least: int = 1) -> RightNames:
         """Return the rights of the table, at least one, with at least ``least`` names each."""
@@ -713,7 +739,7 @@ def _must_from(table: _Table) -> Must:
             f"{_short(enclave)} is not an enclave",
             problem or "An enclave begins with '/'.",
         )
-    return Must(**common, rights=table.rights(), enclave=enclave)
+    return Must(**common, rights=table.rights(), enclave=table.enclave_below(enclave))
 
 
 def _at_most_from(table: _Table) -> AtMost:
@@ -750,7 +776,8 @@ def _not_both_from(table: _Table) -> NotBoth:
                 'Write for example first = { publish = ["/cmd_vel"] }.',
             )
         line = table.lines.get(key, table.source.line)
-        inner = _Table(f"not_both.{key}", value, Source(table.source.file, line), {})
+        place = Source(table.source.file, line)
+        inner = _Table(f"not_both.{key}", value, place, {}, namespace=table.namespace)
         rights.append(inner.rights())
     return NotBoth(**common, first=rights[0], second=rights[1])
 
@@ -887,9 +914,11 @@ def dropped_findings(
     The requirements that one table makes for several robots share a finding.  ``file`` is the path
     of the requirements ``after``.
     """
-    tables: dict[tuple[Source, bool], list[DroppedRequirement]] = {}
+    tables: dict[tuple[Source, bool, str], list[DroppedRequirement]] = {}
     for dropped in dropped_requirements(before, after):
-        tables.setdefault((dropped.requirement.source, bool(dropped.kept)), []).append(dropped)
+        alone = "" if dropped.requirement.robot else dropped.demand
+        table = dropped.requirement.source, bool(dropped.kept), alone
+        tables.setdefault(table, []).append(dropped)
     return [
         DROPPED.found(
             ": ".join(filter(None, (first.name, first.demand))),

@@ -424,3 +424,23 @@ def test_a_template_mends_names_that_it_makes_unique(tmp_path: Path) -> None:
         for template in ("development", "production")
     }
     assert found == {"development": True, "production": False}
+
+
+def test_requirements_of_a_package_in_two_namespaces(tmp_path: Path) -> None:
+    rights = {f"/{side}/mux": publish(f"/{side}/cmd") for side in ("left", "right")}
+    (tmp_path / "p.xml").write_text(policy_text(rights | {"/right/evil": publish("/right/cmd")}))
+    (tmp_path / "r.toml").write_text('[[only]]\npublish = ["cmd"]\nenclaves = ["/mux"]\n')
+    asked = ("check", "p.xml", *ONLY[2:], "--requirements", "r.toml")
+    ended = sros(*asked, "--namespace", "/left", cwd=tmp_path).ok()
+    assert ended.out == ""
+    ended = sros(*asked, "--namespace", "/left", "--namespace", "/right", cwd=tmp_path)
+    assert ended.status == 1 and ended.out.count("but only /right/mux may publish /right/cmd") == 1
+    (tmp_path / "less.toml").write_text('[[must]]\npublish = ["cmd"]\nenclave = "/mux"\n')
+    less = ("check", "p.xml", *ONLY[2:], "--requirements", "less.toml")
+    both = ("--requirements-before", "r.toml", "--namespace", "/left", "--namespace", "/right")
+    ended = sros(*less, *both, cwd=tmp_path)
+    for side in ("left", "right"):
+        dropped = f"only /{side}/mux may publish /{side}/cmd: the new file has no such requirement"
+        assert f"{dropped}\n" in ended.out
+    assert sros(*asked, "--namespace", "/r*", cwd=tmp_path).status == 2
+    assert sros("check", "p.xml", "--namespace", "/left", cwd=tmp_path).status == 2

@@ -141,7 +141,6 @@ WRONG = {
     "[[nobody]]\n\npublish = []": "r.toml:3: publish is not a list of names",
     '[[nobody]]\npublish = "/x"': "r.toml:2: publish is not a list of names",
     "[[nobody]]\npublish = [1]": "r.toml:2: publish is not a list of names",
-    '[[nobody]]\npublish = ["x"]': "'x' is not valid in publish",
     '[[nobody]]\npublish = ["/"]': "'/' is not valid in publish",
     '[[nobody]]\npublish = ["~/x"]': "'~/x' is not valid in publish",
     '[[nobody]]\npublish = ["/x y"]': "'/x y' is not valid in publish",
@@ -212,3 +211,32 @@ def test_proposals_have_no_name_that_the_file_could_not_have() -> None:
     assert [demand(each) for each in found][:1] == ["only /e may publish /ok"]
     assert "* may use wildcards only to publish /fine*" in map(demand, found)
     assert "\x1b" not in text
+
+
+def test_a_file_is_read_for_each_namespace() -> None:
+    text = b"""
+[[only]]
+publish = ["cmd", "/tf", "*/stop"]
+enclaves = ["/mux", "/arm/*", "!/arm/tool"]
+[[must]]
+request = ["open"]
+enclave = "/"
+[[not_both]]
+first = { publish = ["cmd"] }
+second = { call = ["/dock"] }
+[[apart]]
+from = ["*"]
+to = ["/base"]
+"""
+    plain, *_ = parse_requirements(text, "r.toml")
+    assert demand(plain) == ("only /mux, /arm/* (but not /arm/tool) may publish /cmd, /tf, */stop")
+    both = parse_requirements(text, "r.toml", namespaces=("/left", "/right"))
+    assert [demand(each).replace("/right", "/left") for each in both[1::2]] == [
+        demand(each) for each in both[::2]
+    ]
+    assert [demand(each) for each in both[::2]] == [
+        "only /left/mux, /left/arm/* (but not /left/arm/tool) may publish /left/cmd, /tf, */stop",
+        "/left has to be able to request /left/open",
+        "nobody may both publish /left/cmd and call action /dock",
+        "* must not influence /left/base",
+    ]
