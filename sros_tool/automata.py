@@ -15,11 +15,12 @@ import heapq
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import accumulate, count, groupby, pairwise
 from string import ascii_lowercase, ascii_uppercase, digits, punctuation
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import DocumentError
 
 # ── letters ────────────────────────────────────────────────────────────────────────────────

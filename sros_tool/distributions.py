@@ -6,9 +6,9 @@ Source: ``ros2.repos`` of the branches of ros2/ros2 and their release tags, Nove
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 from sros_tool.dds.decision.vendors import TESTED, Vendor
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import Note, UsageError
 from sros_tool.names import DISTRIBUTIONS, distribution_problem
 from sros_tool.wording import enumerated

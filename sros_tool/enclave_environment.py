@@ -6,14 +6,13 @@ import hashlib
 import os
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path, PurePosixPath
 from shlex import quote
 from typing import TYPE_CHECKING
 
-from sros_tool.deferred import dataclass
 from sros_tool.errors import KeystoreError, Note, UsageError
 from sros_tool.keystore.layout import PERMISSIONS_FILE, remedy_in_keystore
 from sros_tool.keystore.reader import read_consistently

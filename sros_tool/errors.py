@@ -6,7 +6,7 @@ could not be asked or done, and is never the answer "no".
 
 from __future__ import annotations
 
-from sros_tool.deferred import NamedTuple
+from typing import NamedTuple
 
 NOT_DONE = 2
 """Exit status of a command that failed; 1 means the answer "no", or findings."""

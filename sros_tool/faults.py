@@ -6,9 +6,8 @@ to some of them.  A command in a remedy works on a keystore with that fault, and
 
 from __future__ import annotations
 
+import re
 from enum import Enum
-
-from sros_tool.deferred import regex
 
 _RCL = "rcl 9 (security.c) and the RMWs of ROS 2 Jazzy."
 _TESTED = "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested."
@@ -471,7 +470,7 @@ def remedy_in_original_keystore(remedy: str) -> str:
     return f"In the {ORIGINAL_KEYSTORE}: {remedy}{then}"
 
 
-NEEDS_CA_KEYS = regex(
+NEEDS_CA_KEYS = re.compile(
     r"`sros (create_\w+|generate_artifacts|update_keystore|renew|revoke|rotate_ca|distribute_key"
     r"|crl KEYSTORE --refresh|zenoh) "
 )

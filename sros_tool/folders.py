@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
 import stat
 import sys
 from collections.abc import Iterable, Iterator
@@ -19,7 +20,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, BinaryIO, Self
 
-from sros_tool.deferred import regex
 from sros_tool.errors import KeystoreError
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ _OLD_FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _MOST_OPEN = 64
 _MOST_BYTES = 128 * 1024 * 1024
 _RENAME_EXCHANGE = 2
-_SIMPLE_LINK = regex(r"(?:\.\./)*(?:[^/.][^/]*/)*[^/.][^/]*")
+_SIMPLE_LINK = re.compile(r"(?:\.\./)*(?:[^/.][^/]*/)*[^/.][^/]*")
 """Targets of links whose leading ``..`` can be resolved as text, without following other links."""
 _NOT_SUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)
 

@@ -7,14 +7,13 @@ fenced block it is none of these (CommonMark 0.31, 6.1 and 4.5; GitHub Flavored 
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from collections.abc import Iterable
 
-from sros_tool.deferred import regex
-
 _LONGEST = 400
-_RUNS = regex(r"`+")
-_PUNCTUATION = regex(r"([\\`*_\[\]<>#~|!&@])")
+_RUNS = re.compile(r"`+")
+_PUNCTUATION = re.compile(r"([\\`*_\[\]<>#~|!&@])")
 
 
 def code(text: str) -> str:

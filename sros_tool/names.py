@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple, regex
 from sros_tool.errors import InvalidNameError
 
 MAX_COMMON_NAME = 64
@@ -38,7 +38,7 @@ GLOBAL_TOPICS = frozenset(
 )
 """Topics that packages use with a leading slash, so that they stay the same in any namespace."""
 
-_NODE_SERVICE = regex(rf"(?P<node>/.+)/(?:{'|'.join(NODE_SERVICES)})\Z")
+_NODE_SERVICE = re.compile(rf"(?P<node>/.+)/(?:{'|'.join(NODE_SERVICES)})\Z")
 
 
 def node_of_service(service: str) -> str:
@@ -91,11 +91,13 @@ find an error in it.
 """
 
 # Most names need no further check: relative, private or absolute, without wildcards.
-_PLAIN = regex(r"(?:~?/)?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*\Z")
-_TOKEN = regex(r"[A-Za-z_][A-Za-z0-9_]*\Z")
+_PLAIN = re.compile(r"(?:~?/)?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*\Z")
+_TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 # A name in a policy: the characters of ROS names, ``*``, ``?`` and plain [sets].
-_EXPRESSION = regex(r"(?:~(?=/|\Z))?(?:[A-Za-z0-9_/*?]|\[!?[A-Za-z0-9_/]+(?:-[A-Za-z0-9_]+)*\])*\Z")
-_RANGE = regex(r"(.)-(.)")
+_EXPRESSION = re.compile(
+    r"(?:~(?=/|\Z))?(?:[A-Za-z0-9_/*?]|\[!?[A-Za-z0-9_/]+(?:-[A-Za-z0-9_]+)*\])*\Z"
+)
+_RANGE = re.compile(r"(.)-(.)")
 _MAX_NAMESPACE = 245
 """Maximum length of a node's namespace, in characters (RMW_NAMESPACE_MAX_LENGTH)."""
 _MAX_NODE_NAME = 255

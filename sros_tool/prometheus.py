@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.values import DryRun, FileChange, NamedKeystore, Notes
 
-_NAME = regex(r"[a-z][a-z0-9_]*\Z", re.ASCII)
+_NAME = re.compile(r"[a-z][a-z0-9_]*\Z", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,13 +16,13 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import defaultdict, deque
 from collections.abc import Collection, Container, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations, product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.names import ACTION_SEPARATOR, READING_SERVICES, SERVICE_ENDS, is_expression
 from sros_tool.policy.model import DENY
 from sros_tool.policy.patterns import common_name, covers, literal_prefix, matches, overlap

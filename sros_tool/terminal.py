@@ -10,8 +10,7 @@ import os
 import sys
 from collections.abc import Callable
 from functools import cache
-
-from sros_tool.deferred import NamedTuple
+from typing import NamedTuple
 
 _CONTROLS = [
     *(code for code in range(0x20) if chr(code) not in "\n\t"),

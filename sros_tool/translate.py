@@ -6,7 +6,7 @@ Names are mapped as in ros2/sros2, so that both tools give the same rights for a
 from __future__ import annotations
 
 from collections.abc import Iterable, Set
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sros_tool.dds.decision.matching import ExpressionIndex
 from sros_tool.dds.decision.vendors import Style
@@ -21,7 +21,6 @@ from sros_tool.dds.permissions import (
     Rule,
     grant,
 )
-from sros_tool.deferred import NamedTuple
 from sros_tool.names import (
     GOAL,
     ROS_DISCOVERY_TOPIC,

@@ -7,10 +7,11 @@ callers pass the current time.
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import UsageError
 
 BACKDATE = timedelta(hours=24)
@@ -23,7 +24,7 @@ valid at least 14 hours before its creation in UTC to work in every time zone.
 _FIRST_YEAR = 1950
 _EPOCH = datetime.fromtimestamp(0, UTC)
 
-_DURATION = regex(r"(\d{1,10})([smhdwy])\Z", re.ASCII)
+_DURATION = re.compile(r"(\d{1,10})([smhdwy])\Z", re.ASCII)
 _SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86400, "w": 604800, "y": 365 * 86400}
 _LONGEST = 100 * _SECONDS["y"]
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from datetime import datetime
 from enum import Enum
 from pathlib import Path, PurePath
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
-from sros_tool.deferred import NamedTuple, regex
 from sros_tool.errors import Note
 from sros_tool.validity import iso
 
@@ -36,7 +36,7 @@ def parse_json(data: bytes) -> Any:
         raise ValueError("it is nested too deeply") from error
 
 
-_PLAIN_YAML = regex(r"[A-Za-z/][A-Za-z0-9_./-]*\Z")
+_PLAIN_YAML = re.compile(r"[A-Za-z/][A-Za-z0-9_./-]*\Z")
 _YAML_WORDS = frozenset(("y", "n", "yes", "no", "on", "off", "true", "false", "null"))
 """Words, in lower case, that YAML 1.1 or 1.2 does not read as a string, such as ``yes``."""
 

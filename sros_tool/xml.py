@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import stat
 from functools import cache
 from pathlib import Path
@@ -11,7 +12,6 @@ from typing import BinaryIO
 
 from lxml import etree
 
-from sros_tool.deferred import regex
 from sros_tool.errors import DocumentError
 from sros_tool.terminal import log_step
 
@@ -199,7 +199,7 @@ def tag_of(element: etree._Element) -> str:
 # `xml.sax.saxutils` has these, too, but imports an HTTP client: a fifth of a node's start.
 
 
-_NOT_XML = regex("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
+_NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 
 
 def escape(text: str) -> str:

@@ -24,7 +24,6 @@ PACKAGE = PROJECT / "sros_tool"
 LAYERS = {
     1: {
         "automata",
-        "deferred",
         "errors",
         "faults",
         "names",
@@ -223,26 +222,6 @@ def test_the_documentation_has_the_same_layers() -> None:
     assert documented == {
         package: layer for package, layer in LAYER_OF.items() if not package.startswith("__")
     }
-
-
-def test_classes_and_expressions_cost_nothing_until_they_are_used() -> None:
-    """Python compiles them when a module is imported, which every verb would wait for."""
-    found = [
-        f"{module}: {name}"
-        for module in MODULES
-        if module != "deferred.py"
-        for _, name in imported((PACKAGE / module).read_text(), ("sros_tool", *Path(module).parts))
-        if name in ("dataclasses.dataclass", "typing.NamedTuple")
-    ]
-    found += [
-        f"{module}: {ast.unparse(node)}"
-        for module in MODULES
-        for statement in tree_of((PACKAGE / module).read_text()).body
-        if isinstance(statement, (ast.Assign, ast.AnnAssign))
-        for node in of_kind(statement, ast.Attribute)
-        if ast.unparse(node) == "re.compile"
-    ]
-    assert found == []
 
 
 # ── every module of a tree by its name, and the names in it ────────────────────────────────

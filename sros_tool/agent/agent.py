@@ -14,10 +14,10 @@ import ssl
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 from urllib.parse import quote, urlsplit
 
 from cryptography.hazmat.primitives.serialization import Encoding
@@ -42,7 +42,6 @@ from sros_tool.checks.keystores.installed import (
     open_installed,
     unusable_sentences,
 )
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.files import remove_file, replace_file, staged_file
 from sros_tool.folders import Folder

@@ -13,10 +13,9 @@ from contextlib import suppress
 from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from sros_tool.agent.connection import REFUSALS, ended_tls
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.files import remove_file, replace_file
 from sros_tool.fleet.robots import name_problem

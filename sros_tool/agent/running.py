@@ -10,6 +10,7 @@ from dataclasses import replace
 from datetime import datetime, tzinfo
 from pathlib import Path
 from types import MappingProxyType
+from typing import NamedTuple
 
 from sros_tool.agent.settings import AgentSettings
 from sros_tool.checks.processes import (
@@ -19,7 +20,6 @@ from sros_tool.checks.processes import (
     other_folder_findings,
     process_findings,
 )
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.confirmation import (
     RobotClock,

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import DocumentError, InvalidNameError, KeystoreError
 from sros_tool.files import read_toml, replace_file
 from sros_tool.fleet.robots import name_problem
@@ -23,9 +24,9 @@ from sros_tool.owners import other_writers, replaceable_on_the_way, user_name
 from sros_tool.xml import read_bytes
 
 SETTINGS_FILE = "agent.toml"
-_UNIT = regex(r"[A-Za-z0-9:_.\\@-]{1,250}\.(?:service|target)\Z")
-_DIGEST = regex(r"[0-9a-f]{64}\Z")
-_SOURCE = regex(r"(?:https?://[!-~]+|/.*)\Z")
+_UNIT = re.compile(r"[A-Za-z0-9:_.\\@-]{1,250}\.(?:service|target)\Z")
+_DIGEST = re.compile(r"[0-9a-f]{64}\Z")
+_SOURCE = re.compile(r"(?:https?://[!-~]+|/.*)\Z")
 
 
 class Unit(NamedTuple):

@@ -11,13 +11,12 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from sros_tool.agent.settings import agent_folder, read_settings
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.files import staged_file
 from sros_tool.folders import Folder

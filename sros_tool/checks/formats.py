@@ -10,13 +10,13 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from sros_tool.checks.kind import ChosenFindings, Finding, FindingKind, Severity, group_by_cause
-from sros_tool.deferred import dataclass
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import Fleet, named_robots, with_robot_placeholder
 from sros_tool.keystore.layout import (

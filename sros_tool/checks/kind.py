@@ -6,14 +6,15 @@ It also knows all kinds, and selects the findings to report.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from fnmatch import fnmatchcase
 from functools import cache
 from importlib import import_module
 from types import ModuleType
+from typing import NamedTuple
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import UsageError
 from sros_tool.values import shows
 from sros_tool.wording import counted, first_few

@@ -7,7 +7,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from difflib import get_close_matches
 from functools import cache, cached_property
@@ -37,7 +37,6 @@ from sros_tool.dds.permissions import (
     pairs_text,
     portability_problems,
 )
-from sros_tool.deferred import dataclass, regex
 from sros_tool.errors import DocumentError, Note, PolicyError, SrosError
 from sros_tool.files import policies_dir
 from sros_tool.fleet.expansion import FleetPolicy
@@ -259,9 +258,9 @@ SEVERAL_INSTANCES = FindingKind(
 )
 
 _LONGEST = 247
-_DIGIT_FIRST = regex(r"/(?:[0-9]|\[[0-9-]+\])")
-_DDS_PREFIX = regex(r"/?(?:rt|rq|rr|rs)/")
-_ALL = regex(r"/?[*?]*\*[*?]*\Z")
+_DIGIT_FIRST = re.compile(r"/(?:[0-9]|\[[0-9-]+\])")
+_DDS_PREFIX = re.compile(r"/?(?:rt|rq|rr|rs)/")
+_ALL = re.compile(r"/?[*?]*\*[*?]*\Z")
 _ASKING_SIDE = {offering: asking for asking, offering in OFFERING_SIDE.items()}
 
 
@@ -1168,11 +1167,11 @@ _CHECKS = (
 )
 _CHECKS_TOGETHER = (_check_counterparts, _check_instances)
 """Checks for which the policies of a robot count as one policy."""
-_PLACE = regex(r"(?P<file>.+?):(?P<line>\d+): (?P<text>.*)", re.DOTALL)
-_SYNTAX = regex(r", line (?P<line>\d+), column \d+")  # in messages of libxml2
+_PLACE = re.compile(r"(?P<file>.+?):(?P<line>\d+): (?P<text>.*)", re.DOTALL)
+_SYNTAX = re.compile(r", line (?P<line>\d+), column \d+")  # in messages of libxml2
 _INCLUDES = tuple(f"{{http://www.w3.org/{year}/XInclude}}include" for year in (2001, 2003))
 _MANY = 1000
-_NUMBER = regex(r"[0-9]+")
+_NUMBER = re.compile(r"[0-9]+")
 
 
 def findings_in(policies: Sequence[Policy], distribution: str = "") -> Iterator[Finding]:
@@ -1439,8 +1438,8 @@ class _IncludeGraph:
 # ── names that are nearly equal ────────────────────────────────────────────────────────────
 
 
-_PARTS = regex(r"([/_])")
-_DIGITS = regex(r"\d+")
+_PARTS = re.compile(r"([/_])")
+_DIGITS = re.compile(r"\d+")
 _SHORTEST = 4  # letters of a part: /arm_l and /arm_r are two arms, and min and max two words
 
 

@@ -6,6 +6,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from enum import StrEnum
 from math import isfinite
@@ -31,7 +32,6 @@ from sros_tool.dds.advisories import Advisory
 from sros_tool.dds.decision.grants import read_moment
 from sros_tool.dds.decision.vendors import FAST_DDS, Moments, Vendor
 from sros_tool.dds.permissions import Grant, parse_permissions
-from sros_tool.deferred import dataclass, regex
 from sros_tool.errors import SrosError
 from sros_tool.faults import ORIGINAL_KEYSTORE, Fault
 from sros_tool.keystore.layout import (
@@ -396,7 +396,7 @@ def _local_time_findings(
     yield PROCESS_LOCAL_TIME.found(process.label, text)
 
 
-_POSIX_ZONE = regex(r"(?:[A-Za-z]{3,}|<[^>]+>)([+-]?)(\d{1,2})(?::(\d\d))?\Z", re.ASCII)
+_POSIX_ZONE = re.compile(r"(?:[A-Za-z]{3,}|<[^>]+>)([+-]?)(\d{1,2})(?::(\d\d))?\Z", re.ASCII)
 
 
 def _zone(text: str, otherwise: tzinfo) -> tzinfo:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 
@@ -11,7 +11,6 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import Finding
 from sros_tool.dds.advisories import Advisory
 from sros_tool.dds.decision.vendors import ZENOH
-from sros_tool.deferred import dataclass
 from sros_tool.errors import DocumentError
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.layout import (

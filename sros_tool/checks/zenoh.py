@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations, islice, product
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import DocumentError
 from sros_tool.policy.patterns import ComparisonLimit
 from sros_tool.translate_zenoh.rights import RightsBehindRules, is_self_limiting

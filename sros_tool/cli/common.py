@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from click.core import ParameterSource
 
-from sros_tool.deferred import regex
 from sros_tool.errors import DocumentError, Note, PkiError, SrosError, UsageError
 from sros_tool.terminal import (
     Colored,
@@ -631,7 +630,7 @@ def moment_of(text: str | None) -> datetime:
     )
 
 
-_OFFSET = regex(r"([+-])(\d\d):?(\d\d)\Z")
+_OFFSET = re.compile(r"([+-])(\d\d):?(\d\d)\Z")
 _LOCALTIME = Path("/etc/localtime")
 
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
@@ -43,7 +43,6 @@ from sros_tool.cli.common import (
     save,
 )
 from sros_tool.cli.program import VerbGroup
-from sros_tool.deferred import NamedTuple, regex
 from sros_tool.errors import NOT_DONE, Note, SrosError, UsageError
 from sros_tool.terminal import echo, echo_document, visible_line
 from sros_tool.values import file_change, shows
@@ -694,7 +693,7 @@ _WORDS = {
     "another": "another's files",
 }
 """State of a file or robot → its words in the output, if they differ from the state's name."""
-_DIGITS = regex(r"(\d+)")
+_DIGITS = re.compile(r"(\d+)")
 _MOST_LINES, _MOST_GROUPS = 50, 3
 """Maximum number of listed files of a robot, and of listed groups or unrecorded enclaves."""
 
@@ -954,9 +953,9 @@ _ROBOT = "{robot}"
 """Placeholder, as in policies, for the names of the robots that share a row."""
 
 
-_DURATION = regex(r"(?<![\w.])\d+ (?:d|h|min|s)(?: \d+ (?:h|min|s))?(?![\w.])")
+_DURATION = re.compile(r"(?<![\w.])\d+ (?:d|h|min|s)(?: \d+ (?:h|min|s))?(?![\w.])")
 """A duration as `elapsed` writes it."""
-_CLOCK = regex(r" The clock here shows \S+\.")
+_CLOCK = re.compile(r" The clock here shows \S+\.")
 """The time at which a robot reported a problem, which the row shows as well."""
 _UNITS = {"d": 86400, "h": 3600, "min": 60, "s": 1}
 

@@ -27,7 +27,6 @@ from sros_tool.cli.common import (
     read_log,
     verb,
 )
-from sros_tool.deferred import regex
 from sros_tool.errors import SrosError, UnavailableError, UsageError
 from sros_tool.terminal import echo, echo_document
 from sros_tool.values import FileChange, file_change
@@ -44,7 +43,7 @@ if TYPE_CHECKING:
 
 
 _FOREVER = "until Ctrl-C"
-_DURATION = regex(r"\d+[smhdwy]\Z", re.ASCII)
+_DURATION = re.compile(r"\d+[smhdwy]\Z", re.ASCII)
 
 
 class Watching(Verb):

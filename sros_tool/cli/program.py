@@ -9,12 +9,11 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
 from sros_tool import __version__
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import NOT_DONE, SrosError
 from sros_tool.terminal import echo, echo_lines
 

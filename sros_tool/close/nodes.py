@@ -7,9 +7,9 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from itertools import chain
+from typing import NamedTuple
 
 from sros_tool.close.robot import OBSERVER, LocalRobot
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.explain.audit import DeniedRight, audit, audited_enclaves
 from sros_tool.graph.learn import stable_name

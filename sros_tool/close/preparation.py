@@ -12,6 +12,7 @@ import stat
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from sros_tool.checks.requirements import VIOLATED
 from sros_tool.close.nodes import ObservedNodes
@@ -20,7 +21,6 @@ from sros_tool.close.robot import MOST_NAMES, OBSERVER, TEMPLATE, LocalRobot
 from sros_tool.close.start_files import write_start_files
 from sros_tool.close.state import CloseState, CloseStep, RunningRobot, current_state
 from sros_tool.close.watch import check_watchable, watch
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.files import replace_file
 from sros_tool.folders import Folder

@@ -9,9 +9,8 @@ import shutil
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
-from sros_tool.deferred import NamedTuple
 from sros_tool.enclave_environment import RMWS
 from sros_tool.errors import DocumentError
 from sros_tool.policy.model import Policy

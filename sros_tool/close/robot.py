@@ -10,11 +10,10 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 from datetime import datetime, tzinfo
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from sros_tool.checks.environment import secured_by
 from sros_tool.close.processes import ObservedProcesses, read_processes
-from sros_tool.deferred import NamedTuple
 from sros_tool.enclave_environment import loadable_environment
 from sros_tool.errors import SrosError, UnavailableError, UsageError
 from sros_tool.files import replace_file

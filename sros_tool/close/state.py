@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from sros_tool.checks.processes import newer_files
 from sros_tool.close.processes import (
@@ -17,7 +17,6 @@ from sros_tool.close.processes import (
     is_in_domain,
 )
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot, check_enclaves
-from sros_tool.deferred import NamedTuple
 from sros_tool.keystore.layout import (
     KEY_FILE,
     enclave_path,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 import threading
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -19,7 +20,6 @@ from sros_tool.close.nodes import ObservedNodes, node_name
 from sros_tool.close.processes import ObservedProcesses
 from sros_tool.close.robot import MOST_NAMES, LocalRobot
 from sros_tool.close.state import RunningRobot
-from sros_tool.deferred import regex
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.explain.explanation import likely_meaning
 from sros_tool.files import policies_dir, remove_file, replace_file
@@ -40,7 +40,7 @@ _LOOK_SECONDS = 1.0
 """How often processes are looked at while the robot is watched; shorter ones can be missed."""
 _MOST_COMMANDS = 10_000
 """Number of commands of processes that are kept; of others, the start command is not known."""
-_SHELL_VARIABLES = regex(
+_SHELL_VARIABLES = re.compile(
     r"_|SHLVL|PWD|OLDPWD|COLUMNS|LINES|PS[0-4]|PROMPT_COMMAND|HIST\w+|TERM\w*|COLORTERM|LS_COLORS"
     rf"|LESS(OPEN|CLOSE)|debian_chroot|VIRTUAL_ENV_PROMPT|{DOMAIN}"
 )

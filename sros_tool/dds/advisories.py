@@ -20,9 +20,8 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from sros_tool.deferred import NamedTuple, regex
 from sros_tool.errors import DocumentError
 from sros_tool.values import parse_json
 from sros_tool.xml import read_bytes
@@ -37,8 +36,8 @@ PRODUCTS = tuple(_REPOSITORIES.values())
 """The products that advisories can be about."""
 _MOST_BYTES = 4 * 1024 * 1024
 _MOST_ADVISORIES = 10_000
-_ID = regex(r"[A-Za-z][A-Za-z0-9]*(?:-[A-Za-z0-9]+){1,6}", re.ASCII)
-_VERSION = regex(r"v?(\d{1,6})(?:\.(\d{1,6}))?(?:\.(\d{1,6}))?(?:\.0)?", re.ASCII)
+_ID = re.compile(r"[A-Za-z][A-Za-z0-9]*(?:-[A-Za-z0-9]+){1,6}", re.ASCII)
+_VERSION = re.compile(r"v?(\d{1,6})(?:\.(\d{1,6}))?(?:\.(\d{1,6}))?(?:\.0)?", re.ASCII)
 _LONGEST_ID, _LONGEST_SUMMARY = 60, 200
 
 Version = tuple[int, int, int]
@@ -205,7 +204,7 @@ def _advisories_of(record: Mapping[str, Any]) -> Iterator[Advisory]:
         raise ValueError("an advisory has no id such as CVE-2025-62599")
     is_withdrawn = bool(_text(record.get("withdrawn") or ""))
     aliases = _list(record.get("aliases", []), "aliases")
-    cve = (name for name in aliases if isinstance(name, str) and _CVE.fullmatch(name))
+    cve = (name for name in aliases if isinstance(name, str) and re.fullmatch(_CVE, name))
     database_data = _object(record.get("database_specific", {}))
     by_product: dict[str, list[Mapping[str, Any]]] = {}
     for part in map(_object, _list(record.get("affected", []), "affected")):
@@ -239,7 +238,7 @@ def _advisories_of(record: Mapping[str, Any]) -> Iterator[Advisory]:
         )
 
 
-_CVE = regex(r"CVE-\d{4}-\d{4,9}", re.ASCII)
+_CVE = re.compile(r"CVE-\d{4}-\d{4,9}", re.ASCII)
 
 
 def _product(affected: Mapping[str, Any]) -> str:

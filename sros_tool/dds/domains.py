@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 
-from sros_tool.deferred import dataclass, regex
 from sros_tool.errors import UsageError
 
 MAX_DOMAIN = 230
 """Largest domain id that every vendor accepts: Cyclone DDS 0.10 refuses documents above it."""
 
-_ONE = regex(r"(\d{1,9})(?:-(\d{1,9}))?\Z", re.ASCII)
+_ONE = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?\Z", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)

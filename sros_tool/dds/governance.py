@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import MISSING, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from enum import StrEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 from lxml import etree
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import XSI, domain_lines, read_domains
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import DocumentError
 from sros_tool.values import shows
 from sros_tool.xml import escape, parse, require_child, tag_of

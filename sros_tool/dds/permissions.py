@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from itertools import combinations
+from typing import NamedTuple
 
 from lxml import etree
 
 from sros_tool.dds.domains import DomainRange, DomainSet
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import DocumentError, Note
 from sros_tool.validity import Window, iso, parse_iso
 from sros_tool.wording import first_few

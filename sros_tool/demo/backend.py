@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -22,7 +23,6 @@ from pathlib import Path
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import ProtectionKind
-from sros_tool.deferred import dataclass
 from sros_tool.demo.casting import naming_arguments
 from sros_tool.demo.nodes import STRING
 from sros_tool.demo.scenarios.model import Condition, Role

@@ -15,11 +15,11 @@ from dataclasses import replace
 from datetime import datetime
 from itertools import permutations
 from pathlib import Path
+from typing import NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
 from sros_tool.dds.permissions import Grant, Rule, parse_permissions
-from sros_tool.deferred import NamedTuple
 from sros_tool.demo.scenarios.attacks import (
     WIDEST,
     WIDEST_CLIENT,

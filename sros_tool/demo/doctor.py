@@ -21,14 +21,15 @@ import socket
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import datetime
 from os import getuid
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 from sros_tool import __version__
 from sros_tool.dds.domains import DomainSet
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.demo.keystores import KeystoreSpec, create_keystores
 from sros_tool.demo.scenarios.communication import ISOLATION
 from sros_tool.demo.scenarios.model import DEFAULT_TOPIC
@@ -204,8 +205,8 @@ def _interpreter(script: Path) -> list[str]:
     return []
 
 
-_NUMBER = regex(r"\d{1,3}\Z", re.ASCII)
-_VERSION = regex(r"v?\d[\w.+!-]{0,40}\Z", re.ASCII)
+_NUMBER = re.compile(r"\d{1,3}\Z", re.ASCII)
+_VERSION = re.compile(r"v?\d[\w.+!-]{0,40}\Z", re.ASCII)
 _KNOWN_VALUES: Mapping[str, frozenset[str] | re.Pattern[str]] = {
     "ROS_DISTRO": frozenset(("humble", "iron", "jazzy", "kilted", "lyrical", "rolling")),
     "ROS_DOMAIN_ID": _NUMBER,
@@ -251,7 +252,7 @@ _PACKAGES = (
     "ros2cli",
     "sros2",
 )
-_SECRET_NAME = regex(r"PASS|PIN\b|_PIN|SECRET|TOKEN|KEY|CREDENTIAL|AUTH", re.IGNORECASE)
+_SECRET_NAME = re.compile(r"PASS|PIN\b|_PIN|SECRET|TOKEN|KEY|CREDENTIAL|AUTH", re.IGNORECASE)
 _SYSTEM = ("/dev/", "/etc/", "/lib/", "/lib64/", "/opt/ros/", "/proc/", "/sys/", "/usr/")
 
 
@@ -304,7 +305,7 @@ def _environment(environment: Mapping[str, str]) -> list[str]:
     for name, known in _KNOWN_VALUES.items():
         value = environment.get(name)
         if value is not None:
-            fits = value in known if isinstance(known, frozenset) else known.match(value)
+            fits = known.match(value) if isinstance(known, re.Pattern) else value in known
             lines.append(f"{name}={value}" if fits else f"{name} has another value")
     return lines + [f"{name} is set" for name in _PRESENT if name in environment]
 

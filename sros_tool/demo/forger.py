@@ -10,9 +10,10 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
+from typing import NamedTuple
 
 from cryptography import x509
 
@@ -33,7 +34,6 @@ from sros_tool.dds.permissions import (
     parse_permissions,
     render_permissions,
 )
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import DocumentError, KeystoreError, UnavailableError
 from sros_tool.keystore.issuing.authority import Authorities, load_authorities
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring

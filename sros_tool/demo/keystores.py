@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable, Mapping
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from pathlib import Path
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
-from sros_tool.deferred import dataclass
 from sros_tool.demo.casting import CastMember, UserKeystore, enclave_grant, node_names
 from sros_tool.demo.forger import (
     Forge,

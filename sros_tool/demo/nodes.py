@@ -12,12 +12,12 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Protocol
 
-from sros_tool.deferred import dataclass
 from sros_tool.runtime.events import EventKind, EventWriter
 from sros_tool.wording import counted
 

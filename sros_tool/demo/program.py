@@ -23,16 +23,16 @@ import time
 import uuid
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
+from typing import NamedTuple
 
 from sros_tool.dds.advisories import Advisory
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.demo.backend import (
     AUTO,
     RCLPY,

@@ -16,9 +16,7 @@ import time
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
-
-from sros_tool.deferred import NamedTuple
+from typing import Literal, NamedTuple
 
 _ETH_P_ALL = 0x0003
 _PACKET_OUTGOING = 4

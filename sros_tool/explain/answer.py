@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from sros_tool.dds.decision.access import (
     Access,
@@ -26,7 +26,6 @@ from sros_tool.dds.decision.grants import read_moment
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import DomainRule, ProtectionKind, TopicRule
 from sros_tool.dds.permissions import Grant
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import UsageError
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,

@@ -11,11 +11,10 @@ from contextlib import suppress
 from datetime import datetime, tzinfo
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import parse_permissions
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError
 from sros_tool.explain.answer import Evaluator, Question, about_action, ask
 from sros_tool.keystore.layout import (

@@ -13,11 +13,10 @@ decides.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.deferred import dataclass
 from sros_tool.errors import Note, UsageError
 from sros_tool.files import policies_dir
 from sros_tool.graph.learn import (

@@ -9,10 +9,10 @@ from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
+from typing import NamedTuple
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.permissions import parse_permissions
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import Note, SrosError
 from sros_tool.explain.answer import Evaluator, Question, acting_parts
 from sros_tool.explain.asking import AskingContext, domains_decided_alike

@@ -10,15 +10,15 @@ import re
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import islice
 from pathlib import Path
 from shlex import quote
+from typing import NamedTuple
 
 from sros_tool.dds.decision.access import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import Note, SrosError, UsageError
 from sros_tool.explain.answer import Answer, Evaluator, Part, Question, ask
 from sros_tool.explain.asking import AskingContext, signed_enclave
@@ -61,10 +61,10 @@ from sros_tool.translate import grant_rights
 from sros_tool.translate_zenoh.rights import name_of_key
 from sros_tool.values import shows
 
-_WORDS = (regex(r"[\w/]+"), regex(r"[^\s(]+"), regex(r"\S+"))
+_WORDS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))
 """Patterns that split a log line into words: without punctuation, or with the punctuation of
 topics."""
-_NUMBERS = regex(r"\b[0-9a-f]{2}(?:\.[0-9a-f]{2}){5,}\S*|\d+")
+_NUMBERS = re.compile(r"\b[0-9a-f]{2}(?:\.[0-9a-f]{2}){5,}\S*|\d+")
 _LONGEST = 8000
 """Number of characters of a line that are read, because a line may have many megabytes."""
 
@@ -893,7 +893,7 @@ def _with_name(text: str, word: str, name: str) -> str:
     return plain.join(re.split(rf"\b{word}\b", text))
 
 
-_COMMAND = regex(r"(`sros\b[^`]*`)")
+_COMMAND = re.compile(r"(`sros\b[^`]*`)")
 _MOST_PEERS = 5
 """Highest number of peers that are examined for one message."""
 _OF_ROTATION = ("peer-signature", "peer-permissions-ca")

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import datetime
 from enum import Enum, auto
 from fnmatch import fnmatchcase
+from typing import NamedTuple
 
 from sros_tool.dds.decision.access import AccessVerb, Outcome, OutcomeWord, ReasonWord
 from sros_tool.dds.decision.grants import other_fitting_enclaves
 from sros_tool.dds.decision.vendors import PRINCIPAL, Vendor
 from sros_tool.dds.domains import DomainSet
-from sros_tool.deferred import NamedTuple
 from sros_tool.distributions import SUPPORTED, Shipped
 from sros_tool.errors import Note, SrosError
 from sros_tool.explain.answer import (

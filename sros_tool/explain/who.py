@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from sros_tool.dds.decision.access import is_open_to_unauthenticated
 from sros_tool.dds.decision.grants import other_fitting_enclaves
 from sros_tool.dds.decision.vendors import CYCLONE_DDS, TESTED
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.explain.answer import Question, about_action, ask
 from sros_tool.explain.asking import taken_for_action

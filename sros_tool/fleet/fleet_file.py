@@ -16,7 +16,6 @@ from types import MappingProxyType
 from typing import Any
 
 from sros_tool.dds.domains import MAX_DOMAIN
-from sros_tool.deferred import regex
 from sros_tool.errors import DocumentError, UnavailableError
 from sros_tool.files import read_toml
 from sros_tool.fleet.robots import (
@@ -104,7 +103,7 @@ def read_connections(path: Path) -> dict[str, str]:
 
 
 _OF_INVENTORIES = (".yml", ".yaml", ".json")
-_INI_HOST = regex(rb"^[A-Za-z0-9_.-]+[ \t]*(?:$|[ \t][A-Za-z_]+=)", re.MULTILINE)
+_INI_HOST = re.compile(rb"^[A-Za-z0-9_.-]+[ \t]*(?:$|[ \t][A-Za-z_]+=)", re.MULTILINE)
 """Matches a host line of an INI inventory: a host name, perhaps with variables after it."""
 
 

@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import lru_cache
 from ipaddress import ip_address
 from itertools import permutations
 from types import MappingProxyType
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import DocumentError, InvalidNameError, UsageError
 from sros_tool.names import check_enclave_name, expression_problem
 from sros_tool.policy.placeholders import (
@@ -45,9 +45,9 @@ _MAX_HOST = 253
 _OF_ANSIBLE = frozenset({"all", "ungrouped", "_meta", "localhost"})
 """Names that Ansible reserves in an inventory; "localhost" is the machine that runs Ansible."""
 
-_TOKEN = regex(r"[A-Za-z_][A-Za-z0-9_]*", re.ASCII)
-_HOST = regex(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]*[A-Za-z0-9_])?\.?", re.ASCII)
-_USER = regex(r"[A-Za-z_][A-Za-z0-9_.-]{0,31}\$?", re.ASCII)
+_TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*", re.ASCII)
+_HOST = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]*[A-Za-z0-9_])?\.?", re.ASCII)
+_USER = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,31}\$?", re.ASCII)
 
 
 class Robot(NamedTuple):

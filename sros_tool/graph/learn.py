@@ -16,16 +16,15 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import lru_cache
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Criteria, Rule, name_notes
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import DocumentError, InvalidNameError, Note, PolicyError
 from sros_tool.files import new_files, replace_file
 from sros_tool.graph.observation import (
@@ -314,11 +313,11 @@ def groups_of(rights: Iterable[NodeRight], ns: str, node: str) -> tuple[Group, .
 
 _CHANGING = (
     # tf2_ros puts a memory address into the name of a listener's node; the others a process id.
-    (regex(r"(transform_listener_impl_)[0-9a-f]+\Z"), r"\1*"),
-    (regex(r"(launch_ros_)[0-9]+\Z"), r"\1*"),
-    (regex(r"(rqt_gui_(?:py|cpp)_node_)[0-9]+\Z"), r"\1*"),
+    (re.compile(r"(transform_listener_impl_)[0-9a-f]+\Z"), r"\1*"),
+    (re.compile(r"(launch_ros_)[0-9]+\Z"), r"\1*"),
+    (re.compile(r"(rqt_gui_(?:py|cpp)_node_)[0-9]+\Z"), r"\1*"),
 )
-_TOOLS = regex(r"_ros2cli(_.*)?\Z|(?P<observer>_sros_observer)(_.*)?\Z")
+_TOOLS = re.compile(r"_ros2cli(_.*)?\Z|(?P<observer>_sros_observer)(_.*)?\Z")
 _OF_OBSERVER = frozenset({Endpoint("rt/parameter_events", PUBLISH)})
 """The endpoints of an observer of sros. A node with its name but other endpoints is no
 observer."""

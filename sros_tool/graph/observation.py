@@ -19,9 +19,9 @@ import select
 import sys
 import time
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, Protocol
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple, Protocol
 
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.values import Words, shows
 
 PUBLISH, SUBSCRIBE = "publish", "subscribe"

@@ -27,11 +27,10 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self
 
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import UnavailableError
 from sros_tool.graph.observation import Endpoint, Observation, ObservedNode, make_observation
 from sros_tool.pki.certificates import IDENTITY_DIGITS

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
 from itertools import combinations
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
-from sros_tool.deferred import dataclass
 from sros_tool.errors import UsageError
 from sros_tool.keystore.template import EVERYTHING, Template
 from sros_tool.names import is_expression, service_of

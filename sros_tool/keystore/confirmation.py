@@ -14,13 +14,13 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from sros_tool.dds.advisories import PRODUCTS
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import DocumentError, InvalidNameError, SrosError
 from sros_tool.files import staged_file
 from sros_tool.fleet.robots import name_problem
@@ -93,16 +93,16 @@ MOST_REQUESTS = 500
 _LONGEST_REQUEST = 16 * 1024
 LONGEST_LIST = 1024 * 1024
 """Maximum number of characters of a revocation list in a confirmation."""
-_LIBRARY_VERSION = regex(r"\d{1,6}\.\d{1,6}\.\d{1,6}\Z", re.ASCII)
-_LIBRARY_PATH = regex(r"/[\w.+/ ?-]{1,199}\Z")
+_LIBRARY_VERSION = re.compile(r"\d{1,6}\.\d{1,6}\.\d{1,6}\Z", re.ASCII)
+_LIBRARY_PATH = re.compile(r"/[\w.+/ ?-]{1,199}\Z")
 """Paths of plain characters; they are shown, and never opened."""
-_DIGEST = regex(r"[0-9a-f]{64}\Z")
-_MOMENT = regex(r"[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z\Z")
-_REQUEST = regex(
+_DIGEST = re.compile(r"[0-9a-f]{64}\Z")
+_MOMENT = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z\Z")
+_REQUEST = re.compile(
     r"-----BEGIN CERTIFICATE REQUEST-----\n[A-Za-z0-9+/=\n]+-----END CERTIFICATE REQUEST-----\n\Z"
 )
-_LIST = regex(r"-----BEGIN X509 CRL-----\n[A-Za-z0-9+/=\n]+-----END X509 CRL-----\n\Z")
-_PEM = regex(rb"-----BEGIN CERTIFICATE-----([A-Za-z0-9+/=\s]*)-----END CERTIFICATE-----")
+_LIST = re.compile(r"-----BEGIN X509 CRL-----\n[A-Za-z0-9+/=\n]+-----END X509 CRL-----\n\Z")
+_PEM = re.compile(rb"-----BEGIN CERTIFICATE-----([A-Za-z0-9+/=\s]*)-----END CERTIFICATE-----")
 
 
 class Seen(StrEnum):

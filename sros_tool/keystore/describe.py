@@ -11,13 +11,12 @@ from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
 from shlex import quote
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from cryptography import x509
 
 from sros_tool.dds.governance import DomainRule, TopicRule, parse_governance
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
-from sros_tool.deferred import NamedTuple, regex
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -959,7 +958,7 @@ def _content_problems(path: Path, now: datetime) -> list[str]:
 
 
 _ISSUED = (CERTIFICATE_FILE, PERMISSIONS_FILE)
-_PEM = regex(rb"-----BEGIN ([A-Z0-9 ]+)-----(.*?)-----END \1-----\n?", re.DOTALL)
+_PEM = re.compile(rb"-----BEGIN ([A-Z0-9 ]+)-----(.*?)-----END \1-----\n?", re.DOTALL)
 
 
 # ── the history ────────────────────────────────────────────────────────────────────────────

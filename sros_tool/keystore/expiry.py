@@ -5,14 +5,15 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 from shlex import quote
+from typing import NamedTuple
 
 from cryptography import x509
 
 from sros_tool.dds.permissions import Grant
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.layout import CERTIFICATE_FILE, remedy_in_keystore
 from sros_tool.keystore.reader import OpenedKeystore

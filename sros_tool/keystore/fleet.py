@@ -13,10 +13,9 @@ from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.fleet.robots import (
     Fleet,

@@ -11,15 +11,14 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from enum import StrEnum
 from functools import cached_property
 from itertools import chain
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from sros_tool.dds.advisories import Advisory, known_vulnerabilities
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import (
     Fleet,

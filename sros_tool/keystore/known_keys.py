@@ -8,6 +8,7 @@ compared by the SHA-256 of their SubjectPublicKeyInfo (DER).
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -17,7 +18,6 @@ from shlex import quote
 
 from cryptography import x509
 
-from sros_tool.deferred import regex
 from sros_tool.errors import KeystoreError, Note, PkiError, SrosError
 from sros_tool.keystore.delivery.published import (
     later_revoked_serials,
@@ -160,7 +160,7 @@ class IssuedEarlier:
         )
 
 
-_UNIQUE_PART = regex(r"(?:^|,)OU=[0-9a-f]{16}(?:,|$)")
+_UNIQUE_PART = re.compile(r"(?:^|,)OU=[0-9a-f]{16}(?:,|$)")
 _NEVER = "9999"
 """A moment after every moment of the ledger."""
 _MOST_NAMES = 200

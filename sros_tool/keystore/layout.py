@@ -13,9 +13,8 @@ from contextlib import suppress
 from itertools import chain, islice
 from pathlib import Path
 from shlex import quote
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
-from sros_tool.deferred import NamedTuple, regex
 from sros_tool.errors import DocumentError, KeystoreError
 from sros_tool.faults import remedy_in_original_keystore
 
@@ -41,7 +40,7 @@ LEDGER = "ledger.jsonl"
 
 For a long ledger, it is a link to the last part, whose name matches `SEALED_LEDGER`.
 """
-SEALED_LEDGER = regex(r"ledger\.[0-9]{4,9}\.jsonl")
+SEALED_LEDGER = re.compile(r"ledger\.[0-9]{4,9}\.jsonl")
 """Names of the parts of a long ledger, which are sealed except for the last one."""
 LEDGER_HEAD = "ledger.p7s"
 """The number of lines of the ledger and the digest of the last one, signed by a CA."""

@@ -28,6 +28,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import stat
 from array import array
 from bisect import bisect_right
@@ -39,12 +40,11 @@ from itertools import chain
 from pathlib import Path
 from shlex import quote
 from sys import intern
-from typing import TYPE_CHECKING, BinaryIO, TypeAlias
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple, TypeAlias
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 
-from sros_tool.deferred import NamedTuple, regex
 from sros_tool.errors import IndexDamagedError, KeystoreError, PkiError, SrosError
 from sros_tool.keystore.layout import (
     LEDGER,
@@ -157,7 +157,7 @@ _LONGEST_LINE = 4 * 1024**2
 _END_BYTES = 64 * 1024
 _BLOCK = 1024**2
 _TEXTS = tuple(name for name in Entry._fields if name != "number")
-_SERIAL = regex(r"[0-9a-f]{1,40}")
+_SERIAL = re.compile(r"[0-9a-f]{1,40}")
 _MOST_BITS = 159
 """Largest length of a serial number, in bits (RFC 5280, 4.1.2.2)."""
 _MOST_NUMBER = 10**12
@@ -166,7 +166,7 @@ _SEALED_FROM = 16 * 1024 * 1024
 """Size in bytes from which a part is sealed: each change copies the last part."""
 _LINE_BYTES = 450
 """Length of most lines."""
-_HEAD = regex(
+_HEAD = re.compile(
     rb"sros ledger [12]\nlines ([0-9]{1,12})\nsha256 ([0-9a-f]{64})\n(?:index ([0-9a-f]{64})\n)?"
 )
 _INDEXED_FROM = 2000
@@ -180,7 +180,7 @@ _VALUES = {
     "number": r"([1-9][0-9]{0,11})",
 }
 _TEXT = r'"([^"\\\x00-\x1f]+)"'
-_WRITTEN = regex(
+_WRITTEN = re.compile(
     r"\{"
     + r"".join(
         f'{"," if index else ""}"{name}":{_VALUES.get(name, _TEXT)}'

@@ -25,10 +25,9 @@ import struct
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self
 from urllib.parse import quote
 
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import IndexDamagedError, SrosError
 from sros_tool.keystore.layout import LEDGER_INDEX
 from sros_tool.pki.crl import SUPERSEDED

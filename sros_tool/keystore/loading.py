@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from datetime import datetime, timedelta
 from functools import lru_cache
 from itertools import dropwhile
+from typing import NamedTuple
 
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import dsa, ec, rsa
@@ -24,7 +25,6 @@ from sros_tool.dds.decision.vendors import (
     VendorTraits,
     joined_titles,
 )
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import PkiError
 from sros_tool.faults import Fault
 from sros_tool.keystore.layout import (

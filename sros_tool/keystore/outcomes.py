@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Generic, TypeVar
+from typing import TYPE_CHECKING, Annotated, Generic, NamedTuple, TypeVar
 
 from cryptography import x509
 
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import Note, SrosError
 from sros_tool.keystore.expiry import read_credentials
 from sros_tool.keystore.layout import ROLES

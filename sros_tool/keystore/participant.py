@@ -12,6 +12,7 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta, tzinfo
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 from cryptography import x509
 
@@ -35,7 +36,6 @@ from sros_tool.dds.decision.vendors import (
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance, render_governance
 from sros_tool.dds.permissions import Permissions, render_permissions
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import SrosError
 from sros_tool.faults import Fault
 from sros_tool.keystore.layout import (

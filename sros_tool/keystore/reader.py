@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import field
+from dataclasses import dataclass, field
 from datetime import datetime
 from functools import cached_property, lru_cache, wraps
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Concatenate, Generic, ParamSpec, TypeVar, overload
+from typing import TYPE_CHECKING, Concatenate, Generic, NamedTuple, ParamSpec, TypeVar, overload
 
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import rsa
@@ -24,7 +25,6 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import DocumentError, KeystoreError, PkiError, SrosError
 from sros_tool.faults import Fault
 from sros_tool.keystore.layout import (
@@ -759,8 +759,8 @@ _EXPIRY_OF_CA = (Fault.CA_EXPIRED, Fault.CA_NOT_YET_VALID)
 _EXPIRY_OF_PERMISSIONS = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_VALID)
 
 _IDENTITY_FILES = (IDENTITY_CA_FILE, CERTIFICATE_FILE, KEY_FILE)
-_ENCRYPTED = regex(rb"ENCRYPTED")
-_SIGNED = regex(rb"(?i)multipart/signed|application/(?:x-)?pkcs7-mime")
+_ENCRYPTED = re.compile(rb"ENCRYPTED")
+_SIGNED = re.compile(rb"(?i)multipart/signed|application/(?:x-)?pkcs7-mime")
 
 # The enclaves of a keystore share some files, which are parsed only once.
 _parse_governance = lru_cache(maxsize=8)(parse_governance)

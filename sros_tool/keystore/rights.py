@@ -7,21 +7,21 @@ rights that its access control gives other enclaves.
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
 from sros_tool.fleet.robots import Fleet, robot_of
@@ -67,7 +67,7 @@ if TYPE_CHECKING:
     from sros_tool.zenoh.access import Enforcement
     from sros_tool.zenoh.document import ConfigurationDocument
 
-_COMMON_NAME = regex(r"(?:^|[,/])\s*CN\s*=\s*(/[^,]*?)\s*(?:,|$)")
+_COMMON_NAME = re.compile(r"(?:^|[,/])\s*CN\s*=\s*(/[^,]*?)\s*(?:,|$)")
 
 
 SourceKind = Annotated[str, Words(("policy", "permissions", "enclave", "keystore", "zenoh"))]

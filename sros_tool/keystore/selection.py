@@ -10,8 +10,8 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from fnmatch import fnmatchcase
 from shlex import quote
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import InvalidNameError, KeystoreError, Note, SrosError
 from sros_tool.fleet.robots import (
     Fleet,

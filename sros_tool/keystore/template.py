@@ -8,14 +8,13 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from datetime import timedelta
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sros_tool.dds.domains import MAX_DOMAIN
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.files import parse_toml, templates_dir, toml_error
 from sros_tool.keystore.layout import IDENTITY

@@ -37,13 +37,13 @@ import stat
 import time
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
-from typing import Self, TypeVar, overload
+from typing import NamedTuple, Self, TypeVar, overload
 
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.folders import Folder, make_folders, remove_folders
 from sros_tool.keystore.layout import (
@@ -256,8 +256,8 @@ def _move(path: str, before: str | None, after: str | None, to: str = "") -> Mov
     return Move(path, before, after, to)
 
 
-_OF_ENCLAVE = regex(rf"{ENCLAVES}/.+/{re.escape(CERTIFICATE_FILE)}")
-_MOVED = regex(rf"{REVOKED}/[0-9a-f]+")
+_OF_ENCLAVE = re.compile(rf"{ENCLAVES}/.+/{re.escape(CERTIFICATE_FILE)}")
+_MOVED = re.compile(rf"{REVOKED}/[0-9a-f]+")
 
 
 def _stays_inside(path: str, target: str) -> bool:
@@ -266,8 +266,10 @@ def _stays_inside(path: str, target: str) -> bool:
     return not target.startswith("/") and not target_path.startswith("..")
 
 
-_KNOWN = regex(rf"{_BEFORE}|{_AFTER}|{_ADDED}|{re.escape(MANIFEST)}|{_LIVE}(\.next)?|spare(\.\d+)?")
-_STAGED_NAME = regex(r"[0-9a-f]{16}")
+_KNOWN = re.compile(
+    rf"{_BEFORE}|{_AFTER}|{_ADDED}|{re.escape(MANIFEST)}|{_LIVE}(\.next)?|spare(\.\d+)?"
+)
+_STAGED_NAME = re.compile(r"[0-9a-f]{16}")
 
 
 def _check_stage(folder: Folder) -> str | None:

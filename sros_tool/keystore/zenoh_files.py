@@ -17,15 +17,16 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from enum import Enum, StrEnum
 from functools import cache
 from pathlib import Path
 from shlex import quote
 from string import ascii_letters, digits
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from cryptography import x509
 
@@ -36,7 +37,6 @@ from sros_tool.dds.decision.expressions import names_of as names_of_expressions
 from sros_tool.dds.decision.vendors import TESTED, DocumentReader, Style, Vendor, joined_titles
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule, parse_permissions
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import (
     DocumentError,
     KeystoreError,
@@ -679,7 +679,7 @@ def _domains(
 # ── the rights of each enclave ─────────────────────────────────────────────────────────────
 
 
-_UNCERTAIN = regex(rb"[\x00\x80-\xff*?\[&]|<!|ALLOW")
+_UNCERTAIN = re.compile(rb"[\x00\x80-\xff*?\[&]|<!|ALLOW")
 """Matches text in permissions that may give a right to a name that they do not contain.
 
 It may be a wildcard, markup that splits or encodes a name, or a default that allows.
@@ -877,7 +877,7 @@ _PROOF = {
 """The message of each right, repeated here on purpose, so that errors of the translation show."""
 _ANNOUNCED = {"NN": "", "MP": "publish", "MS": "subscribe", "SC": "request", "SS": "reply"}
 """What each kind of graph token announces: a node, or the use of a right to a name."""
-_TOKEN = regex(r"@ros2_lv/([0-9]+)/\*/\*/\*/(..)/([^/]+)/[^/]+/[^/]+(?:/([^/]+)/\*\*)?")
+_TOKEN = re.compile(r"@ros2_lv/([0-9]+)/\*/\*/\*/(..)/([^/]+)/[^/]+/[^/]+(?:/([^/]+)/\*\*)?")
 
 
 def _prove(

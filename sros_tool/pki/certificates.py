@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from enum import Enum
 from functools import cache, lru_cache
 from hashlib import sha256
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
@@ -25,7 +25,6 @@ from cryptography.x509.oid import (
     SignatureAlgorithmOID,
 )
 
-from sros_tool.deferred import NamedTuple, regex
 from sros_tool.errors import PkiError
 from sros_tool.pki import der, tolerant
 from sros_tool.pki import pem as pem_file
@@ -60,9 +59,9 @@ _ENCODINGS = {
     0x1E: "utf-16-be",
 }
 """ASN.1 string type → encoding by which OpenSSL decodes it (a_strex.c, tag2nbyte)."""
-_ESCAPED = regex(r'[,+"\\<>;]|^[# ](?!\Z)| \Z')
-_UNIQUE = regex(r"[0-9a-f]{16}")
-_CONTROL = regex(r"[\x00-\x1f\x7f]")
+_ESCAPED = re.compile(r'[,+"\\<>;]|^[# ](?!\Z)| \Z')
+_UNIQUE = re.compile(r"[0-9a-f]{16}")
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
 _SIGNING_KEYS: dict[x509.ObjectIdentifier, type] = {
     SignatureAlgorithmOID.ED25519: ed25519.Ed25519PublicKey,
@@ -654,7 +653,7 @@ def identity_of(subject: bytes) -> str:
 
 _EXTENSIONS = 0xA3
 _LONGEST_SERIAL = 20
-_TIME = regex(r"\d{14}Z", re.ASCII)
+_TIME = re.compile(r"\d{14}Z", re.ASCII)
 _NETSCAPE_TYPE = "2.16.840.1.113730.1.1"
 _JUDGED = {
     der.encode_oid(oid)
@@ -671,7 +670,7 @@ _JUDGED = {
     )
 }
 """The extensions, other than names, whose values OpenSSL evaluates."""
-_UNUSUAL = regex(rb"[^A-Za-z0-9/_]")
+_UNUSUAL = re.compile(rb"[^A-Za-z0-9/_]")
 
 
 class CertificateForm(NamedTuple):

@@ -18,7 +18,6 @@ from urllib.parse import urlsplit
 from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID, ExtensionOID, NameOID, ObjectIdentifier
 
-from sros_tool.deferred import regex
 from sros_tool.errors import PkiError
 from sros_tool.pki import der, tolerant
 from sros_tool.pki.certificates import (
@@ -508,7 +507,7 @@ def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
 
 
 _IA5_MAIL = der.encode(der.OID, der.encode_oid(NameOID.EMAIL_ADDRESS.dotted_string)) + b"\x16"
-_HOST = regex(r"(?!.*(?:\.-|-\.))\w(?:[\w-]*\w)?(?:\.[\w-]*\w)+", re.ASCII)
+_HOST = re.compile(r"(?!.*(?:\.-|-\.))\w(?:[\w-]*\w)?(?:\.[\w-]*\w)+", re.ASCII)
 """Matches a common name that OpenSSL takes for a host name: it contains a dot."""
 
 

@@ -11,13 +11,12 @@ from contextlib import AbstractContextManager
 from datetime import datetime
 from enum import Enum
 from functools import lru_cache
-from typing import cast
+from typing import NamedTuple, cast
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.x509.oid import CRLEntryExtensionOID, ExtensionOID
 
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import PkiError
 from sros_tool.pki import der, pem, tolerant
 from sros_tool.pki.certificates import (

@@ -6,7 +6,8 @@ its verification primitives need.  The writer is for keys that are encrypted by 
 
 from __future__ import annotations
 
-from sros_tool.deferred import NamedTuple
+from typing import NamedTuple
+
 from sros_tool.errors import PkiError
 
 BOOLEAN, INTEGER, BIT_STRING, OCTET_STRING, OID, SEQUENCE, SET = 1, 2, 3, 4, 6, 0x30, 0x31

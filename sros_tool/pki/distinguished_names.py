@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache, lru_cache
@@ -12,7 +13,6 @@ from pathlib import Path
 
 from cryptography import x509
 
-from sros_tool.deferred import regex
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
 
@@ -26,7 +26,7 @@ _ENCODINGS = {
     0x1E: "utf-16-be",
 }
 """ASN.1 string type → encoding, for types compared as text; all others are compared by bytes."""
-_SPACES = regex(rb"[ \t\n\v\f\r]+")
+_SPACES = re.compile(rb"[ \t\n\v\f\r]+")
 
 
 def same_name(first: x509.Name, second: x509.Name) -> bool:

@@ -13,7 +13,6 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import dsa, ec, rsa
 from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 
-from sros_tool.deferred import regex
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
 from sros_tool.pki import pem as pem_file
@@ -220,7 +219,7 @@ _MAX_BYTES = 16 * 1024
 _MAX_RSA_BITS = 4096
 _MAX_ROUNDS = 2_000_000
 _MAX_SCRYPT_MEMORY, _MAX_SCRYPT_WORK = 2**19, 2**22  # N * r, of 128 bytes each; N * r * p
-_ENCRYPTED = regex(rb"-----BEGIN ENCRYPTED PRIVATE KEY-----([^-]*)")
+_ENCRYPTED = re.compile(rb"-----BEGIN ENCRYPTED PRIVATE KEY-----([^-]*)")
 
 
 def _validated(key: rsa.RSAPrivateKey, name: str) -> rsa.RSAPrivateKey:
@@ -237,7 +236,7 @@ def _validated(key: rsa.RSAPrivateKey, name: str) -> rsa.RSAPrivateKey:
         raise _unreadable_key_error(name) from error
 
 
-_INITIAL_VALUE = regex(rb"^DEK-Info: *([^,\s]*),([0-9A-Fa-f]*)", re.MULTILINE)
+_INITIAL_VALUE = re.compile(rb"^DEK-Info: *([^,\s]*),([0-9A-Fa-f]*)", re.MULTILINE)
 _HEX_DIGITS = {b"DES-CBC": 16, b"DES-EDE3-CBC": 16}
 """Hexadecimal digits of the initialization vector of 64-bit block ciphers; RFC 1421, 4.6.1.3."""
 

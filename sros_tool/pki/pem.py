@@ -9,21 +9,21 @@ from __future__ import annotations
 import base64
 import re
 from collections.abc import Iterator
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple, regex
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
 
 CERTIFICATES = ("CERTIFICATE", "X509 CERTIFICATE", "TRUSTED CERTIFICATE")
 """Labels of certificates; a block with the last label can also contain trust settings."""
 
-_PIECE = regex(rb"[^\n]{0,253}\n|[^\n]{1,254}")
+_PIECE = re.compile(rb"[^\n]{0,253}\n|[^\n]{1,254}")
 """Matches a line as OpenSSL reads it: a whole line, or 254 characters of a longer line."""
-_BEGIN = regex(rb"-----BEGIN (.*)-----", re.DOTALL)
+_BEGIN = re.compile(rb"-----BEGIN (.*)-----", re.DOTALL)
 _END = b"-----END "
-_NOT_AT_START = regex(rb"[^\n]-----BEGIN ")
-_BASE64 = regex(rb"[A-Za-z0-9+/]*={0,2}")
-_ALONE = regex(
+_NOT_AT_START = re.compile(rb"[^\n]-----BEGIN ")
+_BASE64 = re.compile(rb"[A-Za-z0-9+/]*={0,2}")
+_ALONE = re.compile(
     rb"-----BEGIN ([A-Z0-9 ]{1,60})-----\n((?:[A-Za-z0-9+/]{1,76}\n)*[A-Za-z0-9+/]{1,76}={0,2}\n)"
     rb"-----END \1-----\n"
 )
@@ -155,7 +155,7 @@ _MARKS = (
 )
 """First bytes of a file → the kind of file, as a noun with its article."""
 
-_LABEL = regex(rb"^-----BEGIN ([^\r\n]{1,60})-----[ \t\r]*$", re.MULTILINE)
+_LABEL = re.compile(rb"^-----BEGIN ([^\r\n]{1,60})-----[ \t\r]*$", re.MULTILINE)
 _OF_LABEL = {
     "CERTIFICATE": "a certificate",
     "X509 CERTIFICATE": "a certificate",
@@ -183,8 +183,8 @@ _CERTIFICATE_IN_DER = "a certificate in DER, not in PEM (`openssl x509 -inform D
 _LIST_IN_DER = "a revocation list in DER, not in PEM (`openssl crl -inform DER` writes PEM)"
 _PKCS12 = "a PKCS#12 container (.p12, .pfx)"
 
-_HEADER = regex(rb"(?i)\s*(?:mime-version|content-type|content-transfer-encoding)[ \t]*:")
-_BASE64_WITHOUT_PEM = regex(rb"[A-Za-z0-9+/\s]{40,}={0,2}\s*")
+_HEADER = re.compile(rb"(?i)\s*(?:mime-version|content-type|content-transfer-encoding)[ \t]*:")
+_BASE64_WITHOUT_PEM = re.compile(rb"[A-Za-z0-9+/\s]{40,}={0,2}\s*")
 _MOST = 4096
 """Number of bytes at the start of a text that are examined."""
 

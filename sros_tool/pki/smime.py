@@ -12,12 +12,13 @@ in the same way are read, and of CMS, only DER (tests/integration/forged_signatu
 from __future__ import annotations
 
 import base64
+import re
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from functools import lru_cache
 from hashlib import sha256
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
@@ -25,7 +26,6 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, padding, rsa
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import PkiError, SrosError
 from sros_tool.pki import der, tolerant
 from sros_tool.pki.certificates import digest as fingerprint
@@ -39,13 +39,13 @@ _TEXT_HEADER = b"Content-Type: text/plain\r\n\r\n"
 
 # The grammar of the MIME headers that are read: what OpenSSL's reader (asn_mime.c) and RFC 2045
 # understand in the same way.  A longer line is read by OpenSSL as several lines.
-_FOLD = regex(rb";[ \t]{0,9}\n[ \t]{1,9}(?=\S)")
-_FIELD = regex(rb"([A-Za-z][A-Za-z-]*):[ \t]{0,9}([!-~](?:[ -~]{0,900}[!-~])?)")
+_FOLD = re.compile(rb";[ \t]{0,9}\n[ \t]{1,9}(?=\S)")
+_FIELD = re.compile(rb"([A-Za-z][A-Za-z-]*):[ \t]{0,9}([!-~](?:[ -~]{0,900}[!-~])?)")
 _PARAMETER = rb"""; {0,9}([\w-]+)=("[ !#-'*-\[\]-~]+"|[\w'+,./:=?-]+)"""
-_TYPE = regex(rb"([\w-]+/[\w-]+)((?:" + _PARAMETER + rb")*)")
-_PARAMETERS = regex(_PARAMETER)
-_BOUNDARY = regex(rb"[\w'+,./:=?-]{2,200}")  # OpenSSL reads no boundary of one character
-_BASE64 = regex(
+_TYPE = re.compile(rb"([\w-]+/[\w-]+)((?:" + _PARAMETER + rb")*)")
+_PARAMETERS = re.compile(_PARAMETER)
+_BOUNDARY = re.compile(rb"[\w'+,./:=?-]{2,200}")  # OpenSSL reads no boundary of one character
+_BASE64 = re.compile(
     rb"(?:(?:[A-Za-z0-9+/]{4}){1,19}\n)*"
     rb"(?:[A-Za-z0-9+/]{4}){0,18}[A-Za-z0-9+/]{2}(?:[A-Za-z0-9+/]{2}|[A-Za-z0-9+/]=|==)\n*"
 )
@@ -66,7 +66,7 @@ _ANY_VALUES = (
     der.SEQUENCE, der.OCTET_STRING, der.OID, der.UTC_TIME, der.GENERALIZED_TIME, _NULL
 )  # fmt: skip
 """Types of attributes and parameters that OpenSSL re-encodes without changing a byte."""
-_OID = regex(rb"(?:(?:[\x81-\xff][\x80-\xff]*)?[\x00-\x7f])+")
+_OID = re.compile(rb"(?:(?:[\x81-\xff][\x80-\xff]*)?[\x00-\x7f])+")
 
 
 _DIGESTS: dict[bytes, hashes.HashAlgorithm] = {

@@ -9,7 +9,7 @@ import stat
 from collections.abc import Callable, Sequence, Set
 from pathlib import Path
 from shlex import quote as shell_quote
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote, unquote
 
 from cryptography.exceptions import InvalidSignature
@@ -18,7 +18,6 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.utils import Prehashed, encode_dss_signature
 from cryptography.hazmat.primitives.serialization import load_der_public_key
 
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import DocumentError, PkiError, UnavailableError, UsageError
 from sros_tool.owners import file_of_root
 from sros_tool.xml import read_bytes

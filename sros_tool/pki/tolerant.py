@@ -12,16 +12,16 @@ from __future__ import annotations
 import base64
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from hashlib import sha256
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 from cryptography import x509
 from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.x509.oid import CRLEntryExtensionOID, ExtensionOID, ObjectIdentifier
 
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
 from sros_tool.pki.distinguished_names import read_name_der, short_names

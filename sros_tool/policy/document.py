@@ -23,14 +23,14 @@ import os
 import re
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
+from typing import NamedTuple
 from urllib.parse import unquote
 
 from lxml import etree
 
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import DocumentError, InvalidNameError, Note, PolicyError, UsageError
 from sros_tool.names import (
     check_enclave_name,
@@ -69,12 +69,12 @@ INCLUDES = frozenset(f"{{{ns}}}include" for ns in _NAMESPACES)
 FALLBACKS = frozenset(f"{{{ns}}}fallback" for ns in _NAMESPACES)
 _XML_BASE = "{http://www.w3.org/XML/1998/namespace}base"
 # libxml2 evaluates any XPath, for minutes if it is made for that, and no signal ends it.
-_STEP = regex(
+_STEP = re.compile(
     r"/(?P<tag>\*|[A-Za-z_][\w.-]*)"
     r"(?:\[@(?P<attribute>[A-Za-z_][\w.-]*)(?:=(?P<value>'[^']*'|\"[^\"]*\"))?\])?",
     re.ASCII,
 )
-_SCHEME = regex(r"[A-Za-z][A-Za-z0-9+.-]*:")
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 NAME_THE_FLEET = (
     "Name the fleet's file with --fleet FILE. If the verb has no --fleet, write the robot's name "
     "in place of the placeholder."
@@ -330,7 +330,7 @@ def _missing_remedy(file: Path) -> str:
 _ITEMS = frozenset(kind.removesuffix("s") for kind in RIGHTS)
 _INSTRUCTION = "sros"
 _EXAMPLE = 'Write for example <topic>scan<?sros protect="encrypt"?></topic>.'
-_PROTECT = regex(r"""protect\s*=\s*(?:"(?P<double>[^"]*)"|'(?P<single>[^']*)')\s*\Z""")
+_PROTECT = re.compile(r"""protect\s*=\s*(?:"(?P<double>[^"]*)"|'(?P<single>[^']*)')\s*\Z""")
 
 
 def _check_instructions(root: etree._Element, file: Path) -> None:
@@ -373,7 +373,7 @@ def _too_large_error(where: str, limit: str) -> PolicyError:
 
 
 _XML_ATTRIBUTES = ("{http://www.w3.org/XML/1998/namespace}",)
-_VERSION = regex(r"0\.2\.[0-9]+\Z")
+_VERSION = re.compile(r"0\.2\.[0-9]+\Z")
 _EARLIER = "Version 0.1.0, of ROS 2 Crystal to Eloquent, has nodes in place of enclaves."
 _EARLIER_BLOCKS = ("profiles", "contexts")
 _EARLIER_ROOTS = ("profiles",)

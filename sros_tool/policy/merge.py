@@ -14,13 +14,13 @@ import codecs
 import re
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
+from typing import NamedTuple
 
 from lxml import etree
 
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import DocumentError, Note, PolicyError
 from sros_tool.names import check_namespace, expand
 from sros_tool.policy.document import instruction_text, read_policy
@@ -199,13 +199,13 @@ def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
     return tuple(notes)
 
 
-_MARKUP = regex(
+_MARKUP = re.compile(
     r"<!--.*?-->|<\?.*?\?>|<!\[CDATA\[.*?\]\]>"
     r"|</(?P<close>[^\s>]+)\s*>"
     r"|<(?P<open>[^\s/>!?]+)(?:[^>\"']|\"[^\"]*\"|'[^']*')*?(?P<empty>/?)>",
     re.DOTALL,
 )
-_COMMENTS_OF_THE_LINE = regex(r"(?>[ \t]*<!--.*?-->)++(?=[ \t]*(?:\r?\n|\Z))", re.DOTALL)
+_COMMENTS_OF_THE_LINE = re.compile(r"(?>[ \t]*<!--.*?-->)++(?=[ \t]*(?:\r?\n|\Z))", re.DOTALL)
 
 
 @dataclass(slots=True)

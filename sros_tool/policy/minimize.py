@@ -10,12 +10,13 @@ allowed do not count either: they cannot have worked.
 
 from __future__ import annotations
 
+import re
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import PolicyError
 from sros_tool.names import expand, is_expression
 from sros_tool.policy.model import (
@@ -448,7 +449,7 @@ def _name_written_like(fqn: str, like: str, profile: Profile) -> str:
 
 # ── wildcards in place of names ────────────────────────────────────────────────────────────
 
-_DIGITS = regex(r"\d+")
+_DIGITS = re.compile(r"\d+")
 _FEWEST = 3  # names that a wildcard must replace
 
 

@@ -7,11 +7,10 @@ Names follow SROS2 policy XML 0.2.0.  Values are equal if they state the same; t
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.names import expand, is_expression
 from sros_tool.values import Words, shows
 

@@ -23,7 +23,6 @@ from operator import and_
 from string import ascii_letters, digits
 from typing import TYPE_CHECKING
 
-from sros_tool.deferred import regex
 from sros_tool.errors import DocumentError
 from sros_tool.names import has_parts, is_expression
 
@@ -31,15 +30,15 @@ if TYPE_CHECKING:
     from sros_tool.automata import Letters, NameSet
 
 _MANY = 4096
-_WILDCARD = regex(r"[*?\[]")
-_PIECE = regex(r"\*+|\?|\[(!?)([^\]]+)\]|(.)", re.DOTALL)
-_RANGE = regex(r"(.)-(.)|(.)", re.DOTALL)
+_WILDCARD = re.compile(r"[*?\[]")
+_PIECE = re.compile(r"\*+|\?|\[(!?)([^\]]+)\]|(.)", re.DOTALL)
+_RANGE = re.compile(r"(.)-(.)|(.)", re.DOTALL)
 _ALPHABET = frozenset(map(chr, range(33, 127)))  # wider than ROS names: DDS topics may be foreign
 _ANY = frozenset([""])
 """The pattern piece for ``*``."""
 _ROS_LETTERS = f"_{digits}{ascii_letters}/"
-_CHOICE = regex(r"\[(!?)([^\]]+)\]|(\?)|([^?\[]+)")
-_STARS = regex(r"\*\*+")
+_CHOICE = re.compile(r"\[(!?)([^\]]+)\]|(\?)|([^?\[]+)")
+_STARS = re.compile(r"\*\*+")
 
 
 @lru_cache(maxsize=_MANY)
@@ -242,9 +241,9 @@ class ComparisonLimit:
 _FEW = 16
 """Up to this number, expressions are compared one by one, without an index."""
 _LAST = "\U0010ffff"
-_END = regex(r".*[*?\]]", re.DOTALL)
+_END = re.compile(r".*[*?\]]", re.DOTALL)
 _BETWEEN = "\0"
-_RUN = regex(r"[^\0]+")
+_RUN = re.compile(r"[^\0]+")
 _GRAM = 4
 
 

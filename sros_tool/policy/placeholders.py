@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import re
 from functools import lru_cache
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple, regex
-
-_BRACES = regex(r"\{([^{}]*)\}")
-_KIND = regex(r"(robot|namespace)(s?)(?::([A-Za-z_][A-Za-z0-9_]{0,63}))?", re.ASCII)
+_BRACES = re.compile(r"\{([^{}]*)\}")
+_KIND = re.compile(r"(robot|namespace)(s?)(?::([A-Za-z_][A-Za-z0-9_]{0,63}))?", re.ASCII)
 _WILDCARDS = frozenset("*?[]!")
 _SAMPLES = {"robot": "r", "namespace": "/r"}
 

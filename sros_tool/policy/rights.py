@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from typing import Annotated
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
 
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.names import (
     ACTION_PARTS,
     GOAL,

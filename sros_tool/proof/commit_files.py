@@ -12,13 +12,12 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
 from lxml import etree
 
-from sros_tool.deferred import dataclass, regex
 from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.folders import Folder
 from sros_tool.names import has_parts
@@ -409,14 +408,14 @@ _OF_POLICIES = (
 """Texts that mark an XML file as a policy, or as a part of one."""
 _EBCDIC = b"\x4c\x6f\xa7\x94"
 """The beginning of an XML file in EBCDIC (XML 1.0, appendix F)."""
-_ENCODING = regex(rb"encoding ?= ?[\"']([^\"']*)")
+_ENCODING = re.compile(rb"encoding ?= ?[\"']([^\"']*)")
 _READABLE = (b"utf-8", b"utf8", b"utf-16", b"us-ascii", b"ascii", b"iso-8859-", b"windows-125")
 _BEFORE = b"\xef\xbb\xbf\xfe\xff \t\r\n"
 """Byte order marks and white space, which may precede the first XML element."""
 _BEGIN = 4096
 _NAMES = frozenset(kind.removesuffix("s") for kind in RIGHTS)
 _WITH_PARTS = ("policy", "enclaves", "enclave", "profiles", "profile", *RIGHTS)
-_WHOLE = regex(r"(?:xpointer\(/(?:\*|[\w.-]+)(?P<below>/\*)?\))?")
+_WHOLE = re.compile(r"(?:xpointer\(/(?:\*|[\w.-]+)(?P<below>/\*)?\))?")
 """An xpointer that selects all of a file, or all below its root element."""
 
 

@@ -21,12 +21,12 @@ from collections.abc import (
     Mapping,
     Sequence,
 )
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import product, takewhile
 from operator import eq
 
 from sros_tool.automata import NameSet, SearchLimit
-from sros_tool.deferred import dataclass
 from sros_tool.names import (
     ROS_DISCOVERY_TOPIC,
     SERVICE_ENDS,

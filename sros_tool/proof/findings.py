@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from sros_tool.automata import SearchLimit
 from sros_tool.checks.kind import Finding, RelatedPlace
@@ -17,7 +17,6 @@ from sros_tool.checks.requirements import (
     VIOLATED,
 )
 from sros_tool.dds.decision.vendors import joined_titles
-from sros_tool.deferred import dataclass
 from sros_tool.faults import REFUSE_STRANGERS
 from sros_tool.keystore.template import DEFAULT_TEMPLATE
 from sros_tool.names import (

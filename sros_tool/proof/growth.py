@@ -15,10 +15,10 @@ from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from itertools import chain, islice, product, takewhile
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from sros_tool.automata import NameSet, SearchLimit
 from sros_tool.dds.decision.access import Access, AccessVerb, GovernedDomain
@@ -34,7 +34,6 @@ from sros_tool.dds.decision.vendors import TESTED, Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance
 from sros_tool.dds.permissions import Grant, Permissions, Rule
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import DocumentError, Note
 from sros_tool.fleet.robots import robot_of
 from sros_tool.keystore.comparison import Effect, SettingChange

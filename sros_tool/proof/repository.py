@@ -15,10 +15,10 @@ import re
 import shutil
 import subprocess
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from sros_tool.deferred import dataclass, regex
 from sros_tool.errors import DocumentError, UnavailableError, UsageError
 
 FOLDER, LINK, SUBMODULE = "40000", "120000", "160000"
@@ -60,10 +60,10 @@ _OF_SETTINGS = ("HOME", "XDG_CONFIG_HOME", "GIT_CONFIG_GLOBAL", "GIT_CONFIG_SYST
 """Environment variables that tell git where it finds settings outside of the repository."""
 _NO_BASE = "none"
 _FIRST_PARENT = "^1"
-_HASH = regex(r"[0-9a-f]{40}(?:[0-9a-f]{24})?\Z")
-_ABBREVIATED = regex(r"[0-9a-fA-F]{4,64}\Z")
-_NO_REFERENCE = regex(r"[\x00-\x20\x7f*?\[\\~^:]|\A-|\A\Z")
-_EXPRESSION = regex(r"(?P<name>(?:[^~^@:]|@(?!\{))+|@)(?P<rest>.*)\Z", re.DOTALL)
+_HASH = re.compile(r"[0-9a-f]{40}(?:[0-9a-f]{24})?\Z")
+_ABBREVIATED = re.compile(r"[0-9a-fA-F]{4,64}\Z")
+_NO_REFERENCE = re.compile(r"[\x00-\x20\x7f*?\[\\~^:]|\A-|\A\Z")
+_EXPRESSION = re.compile(r"(?P<name>(?:[^~^@:]|@(?!\{))+|@)(?P<rest>.*)\Z", re.DOTALL)
 
 _known: dict[tuple[Path, str], tuple[str, bytes]] = {}
 """Small commits and trees that were read and verified, by repository and id."""
@@ -660,7 +660,7 @@ def _entries(data: bytes, id_length: int) -> dict[str, TreeEntry]:
     return entries
 
 
-_OCTAL = regex(rb"[0-7]{1,11}")
+_OCTAL = re.compile(rb"[0-7]{1,11}")
 _TYPE_BITS, _EXECUTABLE = 0o170000, 0o100
 
 

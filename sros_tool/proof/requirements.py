@@ -22,16 +22,16 @@ requirements of the new file together demand at least as much, whatever their na
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 from sros_tool.checks.kind import Finding, RelatedPlace
 from sros_tool.checks.requirements import DROPPED
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import DocumentError
 from sros_tool.files import read_toml
 from sros_tool.fleet.robots import Fleet, Robot
@@ -402,8 +402,8 @@ def _pairs(requirement: Requirement) -> int:
             return 0
 
 
-_HEADER = regex(r"[ \t]*\[\[?[ \t]*([A-Za-z0-9_-]+)[ \t]*\]")
-_KEY = regex(r"[ \t]*([A-Za-z0-9_-]+)[ \t]*=")
+_HEADER = re.compile(r"[ \t]*\[\[?[ \t]*([A-Za-z0-9_-]+)[ \t]*\]")
+_KEY = re.compile(r"[ \t]*([A-Za-z0-9_-]+)[ \t]*=")
 
 
 def _headers(text: str) -> Iterator[tuple[int, str]]:

@@ -12,13 +12,13 @@ import re
 import secrets
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, tzinfo
 from functools import cache, partial
 from itertools import chain, islice
 from pathlib import Path
 from shlex import quote
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from sros_tool.checks.keystores.issued import (
     LESS_PROTECTED,
@@ -30,7 +30,6 @@ from sros_tool.checks.keystores.issued import (
 from sros_tool.checks.kind import WARNING, ChosenFindings, Finding, FindingFilter
 from sros_tool.checks.requirements import VACUOUS
 from sros_tool.checks.targets import Circumstances, path_findings, policy_findings
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
 from sros_tool.files import policies_dir
@@ -97,14 +96,16 @@ _NOT_USED = (
     "changes and is not reviewed: no reviewed policy uses it. Name it with --policy, leave it out "
     "with"
 )
-_PRIVATE_KEY = regex(rb"-----BEGIN (?:[A-Z0-9]+ )*PRIVATE KEY-----(?:\s|\\[nr])+[\w+/]")
+_PRIVATE_KEY = re.compile(rb"-----BEGIN (?:[A-Z0-9]+ )*PRIVATE KEY-----(?:\s|\\[nr])+[\w+/]")
 """A private key in PEM; a text that only mentions the first line does not match."""
 _OF_POLICIES = tuple(
     kind.id for kind in (STALE, LESS_PROTECTED, NOT_IN_POLICY, NOT_IN_KEYSTORE, NOT_IN_EXPORT)
 )
 """The findings on a keystore that is not signed for the policies."""
 _OF_TEMPLATES = ("authorities", "certificates", "permissions", "protection")
-_SETTINGS = regex(rf"^[ \t]*\[+(?:{'|'.join((*_OF_TEMPLATES, *KINDS))})\b".encode(), re.MULTILINE)
+_SETTINGS = re.compile(
+    rf"^[ \t]*\[+(?:{'|'.join((*_OF_TEMPLATES, *KINDS))})\b".encode(), re.MULTILINE
+)
 """A table of a keystore template or of requirements."""
 _LARGEST_SETTINGS = 1024 * 1024
 _IS_KEY = (

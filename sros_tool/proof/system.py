@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, tzinfo
 from functools import partial
 from itertools import product
@@ -22,7 +22,6 @@ from sros_tool.dds.decision.vendors import TESTED, Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, TopicRule, parse_governance
 from sros_tool.dds.permissions import Grant
-from sros_tool.deferred import dataclass
 from sros_tool.errors import KeystoreError, PolicyError, SrosError, UsageError
 from sros_tool.explain.answer import Evaluator
 from sros_tool.fleet.expansion import read_policy_for

@@ -7,9 +7,10 @@ of both releases decide whether it joins and which topics it may use, for all na
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
+from typing import NamedTuple
 
 from sros_tool.checks.keystores.enclaves import fault_remedy
 from sros_tool.checks.keystores.keystore import with_joined_findings
@@ -41,7 +42,6 @@ from sros_tool.dds.decision.access import Access, Outcome
 from sros_tool.dds.decision.grants import other_fitting_enclaves
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.distributions import (
     Distribution,
     Shipped,

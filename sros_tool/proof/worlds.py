@@ -11,17 +11,18 @@ import re
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import count
 from string import ascii_letters, digits
 from types import MappingProxyType
+from typing import NamedTuple
 
 from sros_tool.automata import Automaton, Letters, NameSet, SearchLimit, Surroundings
 from sros_tool.dds.decision.access import Access, AccessVerb
 from sros_tool.dds.decision.expressions import names_of
 from sros_tool.dds.decision.vendors import Style
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.names import SERVICE_ENDS, is_expression
 from sros_tool.policy.model import ALLOW, Level
 from sros_tool.policy.rights import Right
@@ -619,7 +620,7 @@ def domains_of(
     return tuple(sorted(kinds.values()))
 
 
-_DOMAIN = regex(r"(?:0|[1-9][0-9]{0,8})\Z", re.ASCII)
+_DOMAIN = re.compile(r"(?:0|[1-9][0-9]{0,8})\Z", re.ASCII)
 
 
 @lru_cache(maxsize=65536)

@@ -9,11 +9,12 @@ This module reads no files.
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 
-from sros_tool.deferred import dataclass, regex
 from sros_tool.keystore.comparison import Effect, SettingChange
 from sros_tool.zenoh.configuration import Mode, render_configuration
 from sros_tool.zenoh.document import ConfigurationDocument, parse_configuration
@@ -99,14 +100,14 @@ _OPEN: tuple[tuple[str, Callable[[ConfigurationDocument], bool], bool, str], ...
 )
 """Settings with two values: path, function that reads it, value that permits more, and a clause."""
 
-_COMPARED = regex(
+_COMPARED = re.compile(
     r"mode|namespace|(?:listen|connect)/endpoints(?:/\w+)?|transport/link/protocols"
     r"|adminspace/enabled|adminspace/permissions/(?:read|write)"
     r"|transport/link/tls/(?:enable_mtls|verify_name_on_connect|close_link_on_expiration)"
     r"|transport/shared_memory/enabled|scouting/(?:multicast|gossip)/enabled"
 )
 """Paths of the compared settings: `_OPEN`, endpoints and access control."""
-_HARMLESS = regex(
+_HARMLESS = re.compile(
     r"metadata(?:/.*)?|timestamping/.*|queries_default_timeout|open/.*|stats/.*"
     r"|transport/unicast/.*|transport/link/[tr]x/.*|transport/link/tls/so_(?:snd|rcv)buf"
     r"|(?:listen|connect)/(?:timeout_ms|exit_on_failure|retry)(?:/.*)?|scouting/(?:timeout|delay)"
@@ -114,14 +115,14 @@ _HARMLESS = regex(
 )
 """Paths of settings that give nobody access: times, sizes, names, order of connecting."""
 _GIVING = (
-    (regex(r"plugins(?:/.*)?"), "a plugin answers others by its own rules"),
-    (regex(r"plugins_loading(?:/.*)?"), "it loads plugins, which answer others"),
+    (re.compile(r"plugins(?:/.*)?"), "a plugin answers others by its own rules"),
+    (re.compile(r"plugins_loading(?:/.*)?"), "it loads plugins, which answer others"),
     (
-        regex(r"transport/auth(?:/.*)?"),
+        re.compile(r"transport/auth(?:/.*)?"),
         "anyone with the password or key that it now asks for gets a connection",
     ),
     (
-        regex(r"transport/link/tls/root_ca_certificate(?:_base64)?"),
+        re.compile(r"transport/link/tls/root_ca_certificate(?:_base64)?"),
         "anyone with a certificate of that CA gets a connection",
     ),
 )

@@ -11,14 +11,13 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from sros_tool.dds.decision.access import is_open_to_unauthenticated
 from sros_tool.dds.decision.vendors import TESTED
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule
-from sros_tool.deferred import dataclass
 from sros_tool.keystore.layout import is_original_keystore
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import compared_enclaves

@@ -14,12 +14,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import accumulate
+from typing import NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import UsageError
 from sros_tool.keystore.selection import likely_names
 from sros_tool.names import ACTION_SEPARATOR, dds_names, is_expression

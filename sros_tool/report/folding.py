@@ -24,11 +24,11 @@ from collections.abc import (
     Sequence,
     Set,
 )
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import chain
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.fleet.robots import Robot
 from sros_tool.names import is_expression
 from sros_tool.policy.model import ALLOW
@@ -49,7 +49,7 @@ from sros_tool.wording import counted
 
 _MARKS = "{}…"
 """Characters of labels, which ROS names cannot have; a picture with one is not folded."""
-_WORD = regex(r"[A-Za-z0-9_]+")
+_WORD = re.compile(r"[A-Za-z0-9_]+")
 _MOST_PIECES = 16
 """Maximum number of pieces of a word (split at underscores) that are compared with unit names."""
 _SELF = -1

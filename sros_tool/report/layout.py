@@ -12,9 +12,9 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.policy.model import ALLOW, Qualifier
 from sros_tool.report.picture import (
     SENDS,

@@ -9,10 +9,11 @@ compared, and nothing else of them is in the picture.
 from __future__ import annotations
 
 import hashlib
+import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple, regex
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import Robot
 from sros_tool.keystore.layout import PERMISSIONS_FILE
@@ -25,8 +26,8 @@ from sros_tool.xml import read_bytes
 
 _LARGE = 1000
 """Number of enclaves up to which a picture reads all of them."""
-_BOUNDARY = regex(rb'(?i)multipart/signed[^\r\n]*boundary="([^"\r\n]+)"')
-_VALIDITY = regex(r"<not_(before|after)>[^<]*</not_\1>")
+_BOUNDARY = re.compile(rb'(?i)multipart/signed[^\r\n]*boundary="([^"\r\n]+)"')
+_VALIDITY = re.compile(r"<not_(before|after)>[^<]*</not_\1>")
 _MARKS = "\x01\x02"
 """Characters that stand for the name of a unit and its namespace; XML cannot have them."""
 
@@ -119,7 +120,7 @@ def _is_ambiguous(word: str, words: Collection[str]) -> bool:
     )
 
 
-_UNIQUE = regex(",OU=[0-9a-f]{16}(?=</subject_name>)")
+_UNIQUE = re.compile(",OU=[0-9a-f]{16}(?=</subject_name>)")
 """What makes the subject of a certificate unique; it says nothing about rights."""
 
 

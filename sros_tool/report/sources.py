@@ -7,9 +7,10 @@ enclaves are read only to report faults, such as a key that does not fit its cer
 from __future__ import annotations
 
 import os
+import re
 from collections import defaultdict
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence, Set
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime, tzinfo
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,7 +19,6 @@ from cryptography import x509
 
 from sros_tool.dds.governance import Governance
 from sros_tool.dds.permissions import Grant
-from sros_tool.deferred import dataclass, regex
 from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet, Robot, robot_of
@@ -78,7 +78,7 @@ from sros_tool.xml import read_bytes
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
 
-_LINK = regex(r"(it is a broken link) \([^)]*\)")
+_LINK = re.compile(r"(it is a broken link) \([^)]*\)")
 _AUTHORITY_FILES = "*_ca.cert.pem"
 
 

@@ -27,9 +27,8 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
-from sros_tool.deferred import NamedTuple, regex
 from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.files import unpacked_dds_dir
 from sros_tool.terminal import echo
@@ -57,7 +56,7 @@ INSTALL_ADVICE = (
 _SUPPORTED = ("0.10", "11.0")
 _NEEDED_FIRST = ("_platform", "_hoofs", "_posh.", "_posh_roudi", "_posh", "_binding_c")
 _KEPT_LOG_MESSAGES = 200
-_LOG_HEADER = regex(r"^ *\d+\.\d{6} \[\d*\] .*?: ", re.MULTILINE)
+_LOG_HEADER = re.compile(r"^ *\d+\.\d{6} \[\d*\] .*?: ", re.MULTILINE)
 """Time, domain and thread, which libddsc writes before a message."""
 
 STRING_TYPE = "std_msgs::msg::dds_::String_"

@@ -27,11 +27,11 @@ import re
 import shlex
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import KeystoreError, Note, UsageError
 from sros_tool.runtime.rmw import RMW
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
@@ -175,9 +175,9 @@ _UNREADABLE: dict[str, Callable[[str], bool]] = {
 # ── the command line of a node ─────────────────────────────────────────────────────────────
 
 ROS_ARGS = "--ros-args"
-_ENCLAVE_OPTION = regex(r"(?:-e|--enclave)\Z")
+_ENCLAVE_OPTION = re.compile(r"(?:-e|--enclave)\Z")
 _ZENOH_ROUTER = "rmw_zenohd"
-_PYTHON = regex(r"python[\d.]*\Z")
+_PYTHON = re.compile(r"python[\d.]*\Z")
 
 
 def with_enclave(command: Sequence[str], enclave: str) -> tuple[str, ...]:
@@ -423,9 +423,9 @@ _LOGS = {"ROS_LOG_DIR": "/tmp"}  # noqa: S108 (a path in the container, which ha
 _ENCLAVE_VOLUME, _LOG_VOLUME = "sros-enclave", "tmp"
 _NAME_LABEL = "app.kubernetes.io/name"
 
-_SERVICE = regex(r"[A-Za-z0-9][A-Za-z0-9._-]*\Z")
-_RFC_1123 = regex(r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?\Z")
-_PLAIN = regex(r"(/[a-z][a-z0-9]*)+\Z")
+_SERVICE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*\Z")
+_RFC_1123 = re.compile(r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?\Z")
+_PLAIN = re.compile(r"(/[a-z][a-z0-9]*)+\Z")
 _LONGEST_PLAIN = 40
 
 

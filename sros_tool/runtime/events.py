@@ -12,12 +12,11 @@ import os
 import signal
 import time
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from sros_tool.deferred import dataclass
 from sros_tool.errors import DocumentError
 
 

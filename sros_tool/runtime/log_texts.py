@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import re
 from enum import Enum, auto
+from typing import NamedTuple
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.deferred import NamedTuple, regex
 from sros_tool.faults import Fault
 from sros_tool.runtime.rmw import denial_trace_variables
 
@@ -69,7 +69,7 @@ def _log_text(
     vagueness: int = 0,
     refuses: RefusedObject | None = None,
 ) -> LogText:
-    expression = regex(pattern, re.IGNORECASE)
+    expression = re.compile(pattern, re.IGNORECASE)
     return LogText(
         name, vendor, expression, cause, remedy, faults, remedy_without_fault, vagueness, refuses
     )
@@ -711,7 +711,7 @@ _FAILURE_WORDS = (
 UNKNOWN = LogText(
     "not-understood",
     _ROS,
-    regex(
+    re.compile(
         r"\[\w{0,40}SECURITY\w{0,40} (?:Error|Warning)\]"
         # Any line of the file of ROS_SECURITY_LOG_FILE: without trouble, it stays empty.
         r"|\[[A-Z]{4,13}\] [^\s|]+\|[^\s|]+ \d+ \w+::\w+ :"

@@ -24,9 +24,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import SrosError
 
 _CLONE_NEWUSER = 0x10000000

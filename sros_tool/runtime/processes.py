@@ -23,11 +23,11 @@ import stat
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.owners import other_writers
 from sros_tool.runtime.cyclone import ENCLAVE_FILES
 from sros_tool.runtime.environment import (
@@ -41,18 +41,18 @@ from sros_tool.runtime.environment import (
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE
 
-_LIBRARIES = regex(
+_LIBRARIES = re.compile(
     rb"/(lib(?:rcl|rmw_[a-z_]+?|ddsc|dds_security_auth|fastrtps|fastdds|nddsc|nddscore|zenohc"
     rb"|zenohpico)|zenoh)(?:-[0-9a-f]{6,40})?(?:\.abi3|\.cpython-[\w-]+)?\.so"
 )
-_DDS_LIBRARIES = regex(
+_DDS_LIBRARIES = re.compile(
     rb"^[^/\n]*(/(?:[^\n]*/)?lib(fastrtps|fastdds|ddsc)(?:-[0-9a-f]{6,40})?"
     rb"(?:\.abi3|\.cpython-[\w-]+)?\.so[^/\n]*?)( \(deleted\))?$",
     re.MULTILINE,
 )
 """Matches a mapped DDS library, only at a line's start: a process may map thousands of files."""
 _PRODUCTS = {b"fastrtps": "Fast DDS", b"fastdds": "Fast DDS", b"ddsc": "Cyclone DDS"}
-_THREE_NUMBERS = regex(r"\.so\.(\d+\.\d+\.\d+)(?:\.\d+)?\Z", re.ASCII)
+_THREE_NUMBERS = re.compile(r"\.so\.(\d+\.\d+\.\d+)(?:\.\d+)?\Z", re.ASCII)
 _MOST_ENTRIES = 10_000
 _MOST_COPIES_SOUGHT = 20
 """Maximum number of libraries of a process whose copies are searched; the version of others is
@@ -61,7 +61,7 @@ unknown.
 _DAEMON = ("_ros2_daemon", "ros2cli.daemon", "ros2-daemon")
 _ROUTERS = ("rmw_zenohd", "zenohd")
 _BRIDGES = ("zenoh-bridge-ros2dds", "zenoh-bridge-dds")
-_INTERPRETER = regex(r"(?:python[\d.]*|sh|bash|dash|perl|ruby|node)\Z")
+_INTERPRETER = re.compile(r"(?:python[\d.]*|sh|bash|dash|perl|ruby|node)\Z")
 _SCRIPTS_OF_SROS = ("sros", "sros_tool")
 
 _LOADING = timedelta(milliseconds=20)
@@ -70,7 +70,9 @@ _MOST_BYTES = 4 * 1024 * 1024
 _MOST_MAPS = 32 * 1024 * 1024
 _MOST_TRIES = 3
 _KERNEL_THREAD = 0x00200000
-_DOMAIN_NUMBER = regex(r"\s*\+?(0[xX][0-9a-fA-F]{1,16}|0[0-7]{0,22}|[1-9][0-9]{0,19})", re.ASCII)
+_DOMAIN_NUMBER = re.compile(
+    r"\s*\+?(0[xX][0-9a-fA-F]{1,16}|0[0-7]{0,22}|[1-9][0-9]{0,19})", re.ASCII
+)
 _LONGEST = 40
 
 
@@ -483,7 +485,7 @@ def _forked_by(folder: int, command: tuple[str, ...]) -> tuple[int, tuple[str, .
     return first
 
 
-_CHILD = regex(r"from multiprocessing\.(?:spawn|forkserver) import ")
+_CHILD = re.compile(r"from multiprocessing\.(?:spawn|forkserver) import ")
 
 
 def _mapped_dds(maps: bytes) -> tuple[MappedLibrary, ...]:
@@ -529,7 +531,7 @@ _LIBRARY_FOLDERS = (
     *("opt/ros/*/lib", "opt/ros/*/lib/*-linux-gnu*"),
     *("usr/lib", "usr/lib/*-linux-gnu*", "usr/local/lib"),
 )
-_LIBRARY_FILE = regex(rf"lib({'|'.join(map(re.escape, map(bytes.decode, _PRODUCTS)))})\.so")
+_LIBRARY_FILE = re.compile(rf"lib({'|'.join(map(re.escape, map(bytes.decode, _PRODUCTS)))})\.so")
 
 
 class ProcessOrigin(NamedTuple):
@@ -576,11 +578,11 @@ def launch_verb(command: Sequence[str]) -> int:
 
 SERVICE_NAME = r"\w[\w:.@\\-]*\.service"
 """The name of a systemd service, as a regular expression."""
-_SERVICE = regex(
+_SERVICE = re.compile(
     r"^(?:0:|\d+:name=systemd):/system\.slice/(?:.*/)?(" + SERVICE_NAME + r")$", re.M | re.A
 )
 """A line of /proc/PID/cgroup, of version 2 or 1 (cgroups(7)); not for users' own services."""
-_DOCKER = regex(r"/docker[-/]([0-9a-f]{64})(?:\.scope)?(?:/|$)", re.M | re.A)
+_DOCKER = re.compile(r"/docker[-/]([0-9a-f]{64})(?:\.scope)?(?:/|$)", re.M | re.A)
 """The same for a container, as Docker's two cgroup drivers name it."""
 
 

@@ -11,11 +11,10 @@ import re
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.deferred import dataclass, regex
 from sros_tool.distributions import ROS_DISTRO, Distribution, sourced_distribution
 from sros_tool.errors import SrosError
 
@@ -127,7 +126,7 @@ def package_version(rmw: str, environment: Mapping[str, str]) -> tuple[int, int,
     return None
 
 
-_VERSION = regex(r"(\d{1,9})\.(\d{1,9})\.(\d{1,9})", re.ASCII)
+_VERSION = re.compile(r"(\d{1,9})\.(\d{1,9})\.(\d{1,9})", re.ASCII)
 
 
 def chosen_rmw(named: str | None, environment: Mapping[str, str]) -> str:

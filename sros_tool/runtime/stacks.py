@@ -26,9 +26,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import SrosError
 from sros_tool.runtime.cyclone import (
     INSTALL_ADVICE,

@@ -14,8 +14,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import timedelta
 from enum import StrEnum
 from pathlib import Path
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple, regex
 from sros_tool.errors import UsageError
 from sros_tool.files import new_files, replace_file, write_new_folder
 from sros_tool.owners import other_writers, replaceable_on_the_way
@@ -47,8 +47,8 @@ METRICS_FILE = "/var/lib/sros-metrics/sros.prom"
 FLEET_FILE = "/var/lib/sros-metrics/fleet.prom"
 
 _MADE = "# Made by `sros units`; change it with `systemctl edit`, and this file stays as it is."
-_PLAIN_PATH = regex(r"(/[A-Za-z0-9_][A-Za-z0-9._+-]*)+\Z")
-_USER = regex(r"[A-Za-z_][A-Za-z0-9_-]{0,30}\Z")
+_PLAIN_PATH = re.compile(r"(/[A-Za-z0-9_][A-Za-z0-9._+-]*)+\Z")
+_USER = re.compile(r"[A-Za-z_][A-Za-z0-9_-]{0,30}\Z")
 
 _CLOSED = """\
 # The process can neither change the system nor gain privileges.

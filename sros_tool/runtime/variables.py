@@ -12,9 +12,9 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.deferred import NamedTuple, regex
 from sros_tool.errors import SrosError, UsageError
 
 KEYSTORE = "ROS_SECURITY_KEYSTORE"
@@ -23,7 +23,7 @@ STRATEGY = "ROS_SECURITY_STRATEGY"
 ENCLAVE = "ROS_SECURITY_ENCLAVE_OVERRIDE"
 DOMAIN = "ROS_DOMAIN_ID"
 
-_DOMAIN_ID = regex(r"(?:0|[1-9]\d*)\Z", re.ASCII)
+_DOMAIN_ID = re.compile(r"(?:0|[1-9]\d*)\Z", re.ASCII)
 
 
 def domain_from(environment: Mapping[str, str]) -> int | None:

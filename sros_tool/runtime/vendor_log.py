@@ -14,14 +14,15 @@ import re
 from collections.abc import Mapping
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.deferred import regex
 from sros_tool.runtime.log_texts import LOG_TEXTS, LogText, RefusedObject
 
 _LINE_FORMATS = (
-    (Vendor.CYCLONE, regex(r"\A\d+\.\d+ \[\d*\]\s+\S+: ")),
+    (Vendor.CYCLONE, re.compile(r"\A\d+\.\d+ \[\d*\]\s+\S+: ")),
     (
         Vendor.FAST,
-        regex(r"\[\w{0,40} (?:Error|Warning)\]|\[[A-Z]{4,13}\] [^\s|]+\|[^\s|]+ \d+ \w+::\w+ :"),
+        re.compile(
+            r"\[\w{0,40} (?:Error|Warning)\]|\[[A-Z]{4,13}\] [^\s|]+\|[^\s|]+ \d+ \w+::\w+ :"
+        ),
     ),
 )
 
@@ -34,40 +35,40 @@ def vendor_of_line(line: str) -> Vendor | None:
     return next((vendor for vendor, form in _LINE_FORMATS if form.search(line)), None)
 
 
-SECURITY_DIRECTORY = regex(
+SECURITY_DIRECTORY = re.compile(
     r"Found security directory: (?P<folder>\S*?/enclaves(?P<enclave>/\S*)?)(?:\s|\Z)"
 )
 """The line in which rcl names the enclave of a process, and its folder (groups)."""
 
-_PROCESS_LABEL = regex(
+_PROCESS_LABEL = re.compile(
     r"\[(?P<launch>[\w.-]+-\d+)\] "  # ros2 launch: [talker-1]
     r"|(?:\S+ +){2,4}?(?P<journald>[\w.@-]+\[\d+\]): "  # Nov 21 06:00:00 robot talker[12]:
     r"|(?P<compose>[\w.-]+) +\| "  # Docker Compose: talker-1  |
 )
 """The label at the start of a line that distinguishes the processes in one log."""
 
-LINE_DOMAIN = regex(r"\] \S+\|\S+ (\d{1,9}) \w+::\w+ :")
+LINE_DOMAIN = re.compile(r"\] \S+\|\S+ (\d{1,9}) \w+::\w+ :")
 """The domain in a line of ROS_SECURITY_LOG_FILE, after the participant's identifier."""
 
-CONTINUATION = regex(r"^(?:[0-9A-F]{8,}:error:|\(code: )")
+CONTINUATION = re.compile(r"^(?:[0-9A-F]{8,}:error:|\(code: )")
 """The start of a line that continues the line before it: OpenSSL's error stack."""
 
-REMOTE_ENDPOINT = regex(r"check_remote_data|remote (?:writer|reader)")
+REMOTE_ENDPOINT = re.compile(r"check_remote_data|remote (?:writer|reader)")
 """The words that show that the permissions of a remote participant deny a topic."""
 
 ENDPOINT_KINDS: Mapping[str, re.Pattern[str]] = {
-    "writer": regex(
+    "writer": re.compile(
         r"Writer is not|local writer|create a writer on|check_create_datawriter|datawriter_sec"
         r"|associated Writer|DATA_WRITER|create(?:_p| p|P)ublisher|register_local_writer"
         r"|/rcl/publisher\.c:"
     ),
-    "reader": regex(
+    "reader": re.compile(
         r"Reader is not|local reader|create a reader on|check_create_datareader|datareader_sec"
         r"|associated Reader|DATA_READER|create(?:_s| s|S)ubscri|register_local_reader"
         r"|/rcl/subscription\.c:"
     ),
-    "client": regex(r"create(?:_c| c|C)lient|/rcl/client\.c:"),
-    "server": regex(r"create(?:_s| s|S)ervice|/rcl/service\.c:"),
+    "client": re.compile(r"create(?:_c| c|C)lient|/rcl/client\.c:"),
+    "server": re.compile(r"create(?:_s| s|S)ervice|/rcl/service\.c:"),
 }
 """The words in lines near a denied topic that show the kind of the denied endpoint."""
 
@@ -151,9 +152,9 @@ def plain_refusal(line: str) -> str:
     return _NO_REASON.format(function[1].replace("_", " ") + " failed") if function else line
 
 
-_COLOR_CODE = regex(r"\x1b\[[0-9;]*m")
+_COLOR_CODE = re.compile(r"\x1b\[[0-9;]*m")
 
-_REASON_CONTEXT = regex(
+_REASON_CONTEXT = re.compile(
     # rcutils: level, time and logger.
     r"^\[[A-Z]+\] \[[\d.]+\] \[\w+\]: "
     # Fast DDS: time, `[SECURITY Error]`, source position, and function.
@@ -169,5 +170,5 @@ _REASON_CONTEXT = regex(
 """The text that vendors put around the reason of a refusal, such as times and positions."""
 
 _NO_REASON = "{}, and Fast DDS gives no reason"
-_FAILED_FUNCTION = regex(r"(?:-> Function |::)(\w+)(?: :)?\s*\Z")
+_FAILED_FUNCTION = re.compile(r"(?:-> Function |::)(\w+)(?: :)?\s*\Z")
 """The failed function, in a line of Fast DDS without a message."""

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple, regex
 from sros_tool.runtime.log_texts import LogText
 
 _RUN_IN_ENCLAVE = "Start it in its enclave: `sros run KEYSTORE ENCLAVE -- COMMAND`."
@@ -24,12 +24,14 @@ _WRITE_AGAIN = "Let `sros zenoh KEYSTORE` write the file, and do not edit it."
 
 ZENOH_IDS = "zenoh-"
 """Prefix of the ids of Zenoh's log texts."""
-ZENOH_LINE = regex(r"\A\s*(?:\S+Z\s+)?(?:TRACE|DEBUG|INFO|WARN|ERROR)\b.*?\bzenoh[\w:]*: ")
+ZENOH_LINE = re.compile(r"\A\s*(?:\S+Z\s+)?(?:TRACE|DEBUG|INFO|WARN|ERROR)\b.*?\bzenoh[\w:]*: ")
 """Pattern of a line of Zenoh's log; lines that match no text are no security problem."""
 
 
 def _zenoh_text(name: str, pattern: str, cause: str, remedy: str, vagueness: int = 0) -> LogText:
-    return LogText(f"{ZENOH_IDS}{name}", None, regex(pattern), cause, remedy, vagueness=vagueness)
+    return LogText(
+        f"{ZENOH_IDS}{name}", None, re.compile(pattern), cause, remedy, vagueness=vagueness
+    )
 
 
 _LISTENING_TEXTS = (
@@ -218,12 +220,12 @@ class DroppedMessage(NamedTuple):
     key: str
 
 
-_DENIED = regex(
+_DENIED = re.compile(
     r"(?P<cached>Using cached result: )?(?P<zid>[0-9a-f]{1,32}) (?:on (?P<subject>\S{1,400}) )?"
     r"is unauthorized to (?P<message>[A-Z][\w/ ]{1,40}) \((?P<flow>ingress|egress)\) on "
     r"(?:Some\()?(?P<key>[^\s)]{1,1000})"
 )
-_NAME = regex(r"CertCommonName\((?P<name>[^)]{1,200})\)")
+_NAME = re.compile(r"CertCommonName\((?P<name>[^)]{1,200})\)")
 _DECLARED_OR_UNDECLARED = "Declare/Undeclare"
 
 

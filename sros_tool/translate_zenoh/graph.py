@@ -12,11 +12,12 @@ too: a process takes wildcards in a token literally, as a name that no node or t
 
 from __future__ import annotations
 
+import re
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from string import ascii_lowercase
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple, regex
 from sros_tool.names import NODE_SERVICES, is_expression
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.patterns import Names, TooManyNames, covers, listed_expressions, overlap
@@ -323,7 +324,7 @@ def shared_nodes(announced: Mapping[str, AnnouncedNodes]) -> Iterator[SharedNode
             )
 
 
-_CHANGING = regex("[/%](?:" + "|".join(CHANGING_NODES) + ")[^/]*[*]")
+_CHANGING = re.compile("[/%](?:" + "|".join(CHANGING_NODES) + ")[^/]*[*]")
 
 
 def _is_wide(node: str) -> bool:

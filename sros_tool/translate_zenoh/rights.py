@@ -12,10 +12,11 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import DocumentError, InvalidNameError, PolicyError
 from sros_tool.names import check_enclave_name, expression_problem, is_expression
 from sros_tool.policy.model import (
@@ -244,9 +245,9 @@ def crossing_rules(names: Iterable[str], domains: Iterable[int]) -> tuple[Access
 # ── names and denials ──────────────────────────────────────────────────────────────────────
 
 
-_EXACT_NAMES = regex(r"(?:/[^/#$*?\[]+)+")
+_EXACT_NAMES = re.compile(r"(?:/[^/#$*?\[]+)+")
 """Matches absolute names without wildcards, one or several joined, that are valid keys of Zenoh."""
-_NO_KEY = regex(r"[#$]|//|/\Z")
+_NO_KEY = re.compile(r"[#$]|//|/\Z")
 """Text that no key of Zenoh may have."""
 
 
@@ -602,7 +603,7 @@ def _without_type(chunks: list[str]) -> list[str]:
 _BELOW_KEYS = "@adv"
 _MOST_NAMES = 65536
 _EVERY_NAME = ("*", *_UNTYPED, ANY_CHUNKS)
-_DOMAIN = regex(r"\*|0|[1-9][0-9]{0,2}")
+_DOMAIN = re.compile(r"\*|0|[1-9][0-9]{0,2}")
 """Matches the first chunk of a key of rmw_zenoh: a ROS domain, or a wildcard."""
 
 

@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import field, fields
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from functools import cached_property, lru_cache
 from itertools import count, product
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from sros_tool.automata import NameSet
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.zenoh.key_expressions import KeyExpressions, includes, names_of
 from sros_tool.zenoh.subtraction import Difference, RuleKeys, keys_of
 

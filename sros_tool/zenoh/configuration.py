@@ -11,16 +11,15 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum, StrEnum
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from hashlib import sha256
 from itertools import combinations
 from json.encoder import encode_basestring_ascii
-from typing import Any
+from typing import Any, NamedTuple
 
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import DocumentError, UsageError
 from sros_tool.zenoh.access import (
     AccessControl,
@@ -357,7 +356,7 @@ def parse_rendered(data: bytes, name: str) -> Configuration:
     return configuration
 
 
-_SECTIONS = regex(
+_SECTIONS = re.compile(
     r'  "enabled": true,\n  "default_permission": "deny",\n'
     r'  "rules": \[(.*)\n  \],\n  "subjects": \[(.*)\n  \],\n  "policies": \[(.*)\n  \]\n }\n}\n',
     re.DOTALL,
@@ -473,7 +472,7 @@ def _lines(section: str) -> list[str]:
     return section.removeprefix("\n").split(",\n") if section else []
 
 
-_ENDPOINT = regex(r"(?:[A-Za-z0-9.-]+|\[[0-9A-Fa-f:.]+\]):(\d{1,5})\Z", re.ASCII)
+_ENDPOINT = re.compile(r"(?:[A-Za-z0-9.-]+|\[[0-9A-Fa-f:.]+\]):(\d{1,5})\Z", re.ASCII)
 _MOST_PORT = 65535
 
 

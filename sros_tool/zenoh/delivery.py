@@ -9,9 +9,9 @@ the result on random rules (``tests/integration/test_zenoh_deliveries.py``).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
-from sros_tool.deferred import dataclass
 from sros_tool.values import shows
 from sros_tool.zenoh.access import AccessDecision, Flow, Message, MessageFilter, Remote
 from sros_tool.zenoh.configuration import Mode

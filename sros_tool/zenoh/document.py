@@ -14,12 +14,11 @@ import json
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import field
+from dataclasses import dataclass, field
 from enum import StrEnum
 from math import prod
 from typing import TypeVar
 
-from sros_tool.deferred import dataclass, regex
 from sros_tool.errors import DocumentError
 from sros_tool.zenoh.access import (
     PROPERTIES,
@@ -68,11 +67,11 @@ _AS_YAML = (".yaml", ".yml")
 _AS_TOML = (".toml",)
 ENDINGS = (".json5", ".json", *_AS_YAML, *_AS_TOML)
 """Endings of the file names that Zenoh reads (1.10.2, tested)."""
-_OTHER_IN_YAML = regex(r"\\u|[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028\u2029\ufeff]")
+_OTHER_IN_YAML = re.compile(r"\\u|[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028\u2029\ufeff]")
 """Characters and escapes that YAML reads differently from JSON, or refuses."""
 _MOST_MEANT = 1_000_000
 _MOST_PARTS = 10
-_ZID = regex(r"[1-9a-f][0-9a-f]{0,31}", re.ASCII)
+_ZID = re.compile(r"[1-9a-f][0-9a-f]{0,31}", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)

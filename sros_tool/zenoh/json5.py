@@ -11,9 +11,7 @@ import json
 import re
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import Any
-
-from sros_tool.deferred import NamedTuple, regex
+from typing import Any, NamedTuple
 
 MOST_BYTES = 16 * 1024 * 1024
 _MOST_DEPTH = 100
@@ -48,7 +46,7 @@ class Json5Object(dict[str, Any]):
         self.lines: dict[str, int] = {}
 
 
-_TOKEN = regex(
+_TOKEN = re.compile(
     r"""
       (?P<space>(?:[\s\ufeff]+|//[^\n\r\u2028\u2029]*|/\*.*?\*/)+)
     | (?P<mark>[{}\[\]:,])
@@ -61,10 +59,10 @@ _TOKEN = regex(
     """,
     re.VERBOSE | re.DOTALL,
 )
-_NOT_IN_JSON5 = regex(r"\\u|[\u2028\u2029]")
+_NOT_IN_JSON5 = re.compile(r"\\u|[\u2028\u2029]")
 """Text in strings that JSON allows and JSON5 does not: half characters, and U+2028, U+2029."""
-_LINE = regex(r"\r\n|[\n\r\u2028\u2029]")
-_ESCAPE = regex(r"\\(?:u([0-9a-fA-F]{4})|x([0-9a-fA-F]{2})|(\r\n|.))", re.DOTALL)
+_LINE = re.compile(r"\r\n|[\n\r\u2028\u2029]")
+_ESCAPE = re.compile(r"\\(?:u([0-9a-fA-F]{4})|x([0-9a-fA-F]{2})|(\r\n|.))", re.DOTALL)
 _ESCAPED = {"b": "\b", "f": "\f", "n": "\n", "r": "\r", "t": "\t", "v": "\v", "0": "\0"}
 _CONTINUED = ("\r\n", "\n", "\r", "\u2028", "\u2029")
 _WORDS = {"true": True, "false": False, "null": None}

@@ -7,17 +7,17 @@ Source: zenoh.io "Key Expressions"; tested with the wheel 1.10.2.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache, cached_property, lru_cache
 from itertools import count
 
 from sros_tool.automata import Automaton, Letters, NameSet
-from sros_tool.deferred import regex
 from sros_tool.names import has_parts
 
 ANY_PART, ANY_CHUNK, ANY_CHUNKS = "$*", "*", "**"
 _MANY = 65536
-_LITERAL = regex(r"(?<![^/])[^/*]+(?![^/])")
+_LITERAL = re.compile(r"(?<![^/])[^/*]+(?![^/])")
 """A chunk without wildcards."""
 _MOST_COMPARED = 100_000
 """Maximum number of comparisons to find expressions that others include (under a second)."""

@@ -6,7 +6,7 @@ rmw_publisher_data.cpp and rmw_subscription_data.cpp.
 
 from __future__ import annotations
 
-from sros_tool.deferred import NamedTuple
+from typing import NamedTuple
 
 _LEAST_ZENOH = "1.3"
 """The first Zenoh that accepts all settings of the files; rmw_zenoh 0.2.3 has one from shortly

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from functools import lru_cache
 from string import ascii_letters, digits
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.zenoh.key_expressions import (
     ANY_CHUNK,
     ANY_CHUNKS,
@@ -381,7 +381,7 @@ class _Place(NamedTuple):
     letters: str
 
 
-@dataclass(slots=True)
+@dataclass
 class _Letters:
     """The search for chunks that denied chunks do not match.
 
@@ -689,7 +689,7 @@ def keys_of(expressions: frozenset[str], differences: tuple[Difference, ...] = (
 
 _TYPE = "/$*::$*/*"
 """Any type with its hash, which follow the name in a key."""
-_ENDS = regex(rf"{re.escape(_TYPE)}(?:/\*\*)?(?:/@adv/\*\*)?\Z")
+_ENDS = re.compile(rf"{re.escape(_TYPE)}(?:/\*\*)?(?:/@adv/\*\*)?\Z")
 
 
 def _expression_parts(expression: str) -> tuple[str, str, str]:

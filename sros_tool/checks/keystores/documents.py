@@ -6,8 +6,10 @@ Vendors read documents outside of the portable profile differently, and decide d
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from itertools import chain, islice
 from math import isfinite
@@ -28,7 +30,6 @@ from sros_tool.dds.decision.vendors import (
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
 from sros_tool.dds.permissions import Criteria, Grant, Rule, portability_problems
-from sros_tool.deferred import dataclass, regex
 from sros_tool.errors import SrosError
 from sros_tool.faults import REFUSE_STRANGERS
 from sros_tool.keystore.fleet import EnclaveDomains
@@ -214,8 +215,8 @@ FEWER_DOMAINS = FindingKind(
     "Nothing to do if the robot is in this domain.",
 )
 
-_MOMENT = regex(r"(\d{4})-\d\d-\d\dT\d\d:\d\d:\d\dZ\Z")
-_SUBJECT = regex(
+_MOMENT = re.compile(r"(\d{4})-\d\d-\d\dT\d\d:\d\d:\d\dZ\Z")
+_SUBJECT = re.compile(
     r"(?:[A-Za-z0-9.]+=[^,|\"\s/][^,|\"]*|CN=/[^,|\"\s]*)(?:,(?! )[A-Za-z0-9.]+=[^,|\"/]+)*"
     r"(?:,CN=/)?\Z"
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -11,7 +12,6 @@ from shlex import quote
 
 from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, names_text
-from sros_tool.deferred import regex
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.layout import (
     AGENT,
@@ -229,9 +229,11 @@ _KNOWN = (
     "governance.xml",
 )
 _TOP = (SETTINGS, FLEET, FLEET_ROOT, PUBLISHED, LEDGER, LEDGER_HEAD, ROTATION)
-_KNOWN_ANYWHERE = regex(r".*\.(?:cert|key|crl)\.pem\Z|.*\.p11\Z|.*\.srl\Z|index\.txt.*|serial.*")
+_KNOWN_ANYWHERE = re.compile(
+    r".*\.(?:cert|key|crl)\.pem\Z|.*\.p11\Z|.*\.srl\Z|index\.txt.*|serial.*"
+)
 
-_ARCHIVES = regex(
+_ARCHIVES = re.compile(
     r"(?i)\.(?:tar|tgz|tbz2?|txz|gz|bz2|xz|zst|zip|7z|rar|p12|pfx|jks|keystore|bak|old|orig)\Z|~\Z"
 )
 """File name suffixes of archives, key containers and backup copies."""

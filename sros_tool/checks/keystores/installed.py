@@ -7,11 +7,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
+from typing import NamedTuple
 
 from sros_tool.checks.keystores.files import KEY_READABLE, check_files
 from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import SrosError
 from sros_tool.keystore.confirmation import COULD_NOT_START
 from sros_tool.keystore.layout import enclave_path, waits_for_answer

@@ -6,7 +6,7 @@ import hashlib
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from cryptography.hazmat.primitives import hashes, serialization
 
@@ -17,7 +17,6 @@ from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import parse_governance
 from sros_tool.dds.permissions import Grant, mistaken_names, pairs_text
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import robot_of
 from sros_tool.keystore.layout import (

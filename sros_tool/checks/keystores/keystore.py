@@ -55,7 +55,6 @@ from sros_tool.checks.keystores.vendors import (
 from sros_tool.checks.kind import WARNING, Cause, Finding, names_text
 from sros_tool.dds.decision.vendors import TESTED, ZENOH, Vendor
 from sros_tool.dds.governance import parse_governance
-from sros_tool.deferred import regex
 from sros_tool.distributions import Distribution, find_distribution
 from sros_tool.errors import SrosError
 from sros_tool.faults import NEEDS_CA_KEYS, ORIGINAL_KEYSTORE, remedy_in_original_keystore
@@ -313,7 +312,7 @@ def _with_real_file(finding: Finding, keystore: OpenedKeystore, real_root: str) 
     return finding._replace(file=str(keystore.root / real.relative_to(real_root)))
 
 
-_OF_SEVERAL = regex(
+_OF_SEVERAL = re.compile(
     r"(\bsros (?:renew|revoke|create_permission|create_enclave|distribute_key) \S+ )([^\s`]+)"
 )
 """The beginning of a command that takes several enclaves, and its first enclave."""

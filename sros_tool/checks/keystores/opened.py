@@ -5,17 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import field
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, tzinfo
 from functools import cache, cached_property
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from cryptography import x509
 
 from sros_tool.checks.kind import ERROR, FindingKind
 from sros_tool.dds.governance import Governance
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import edited_fleet, load_fleet

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 
 from sros_tool.checks.keystores.opened import CheckedEnclave
 from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, names_text
 from sros_tool.dds.permissions import Criteria, Grant
-from sros_tool.deferred import regex
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.patterns import overlap
 from sros_tool.wording import first_few
@@ -59,14 +59,14 @@ _PREFIXES = ("ra", "rp", "rq", "rr", "rs", "rt")
 _OF_ROS = (ROS_DISCOVERY_TOPIC, "rq/*Request", "rr/*Reply", "ra/*", "rp/*", "rs/*", "rt/*")
 _ENDS = {"rq/": "Request", "rr/": "Reply"}
 _TOKENS = r"(?:/[A-Za-z_][A-Za-z0-9_]*)+"
-_ROS_NAME = regex(
+_ROS_NAME = re.compile(
     rf"(?:r[apst]{_TOKENS}|rq{_TOKENS}(?<=Request)|rr{_TOKENS}(?<=Reply)|{ROS_DISCOVERY_TOPIC})\Z"
 )
-_OF_DDS = regex(r"DCPS[A-Z]\w*\Z")
+_OF_DDS = re.compile(r"DCPS[A-Z]\w*\Z")
 """Built-in topics of DDS, which need no right but appear in some permissions."""
-_TYPE = regex(r"[a-z][a-z0-9_]*/(?:msg|srv|action)/[A-Z][A-Za-z0-9]*\Z")
-_WILDCARD = regex(r"\[[^\]]*\]|[*?]")
-_FOREIGN = regex(r"[^A-Za-z0-9_/]")
+_TYPE = re.compile(r"[a-z][a-z0-9_]*/(?:msg|srv|action)/[A-Z][A-Za-z0-9]*\Z")
+_WILDCARD = re.compile(r"\[[^\]]*\]|[*?]")
+_FOREIGN = re.compile(r"[^A-Za-z0-9_/]")
 _SHOWN = 3
 
 

@@ -8,13 +8,13 @@ from contextlib import suppress
 from datetime import datetime
 from functools import cached_property, lru_cache
 from itertools import chain, combinations, product
+from typing import NamedTuple
 
 from cryptography import x509
 
 from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, names_text
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import SrosError
 from sros_tool.keystore.comparison import Mismatch, compare_governance, mismatch
 from sros_tool.keystore.layout import (

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from typing import NamedTuple
 
 from sros_tool.checks.keystores.documents import PARTITIONS, UNREACHABLE
 from sros_tool.checks.keystores.enclaves import fault_remedy, grant_of
@@ -19,7 +20,6 @@ from sros_tool.dds.decision.access import Access, AccessVerb, Outcome
 from sros_tool.dds.decision.vendors import TESTED, Vendor, joined_titles
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
-from sros_tool.deferred import NamedTuple
 from sros_tool.distributions import Distribution, shipped_title
 from sros_tool.errors import DocumentError
 from sros_tool.faults import FAULTS, Fault

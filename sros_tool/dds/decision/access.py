@@ -14,7 +14,7 @@ from enum import Enum, StrEnum, auto
 from functools import cache, cached_property, lru_cache
 from itertools import groupby, takewhile
 from string import ascii_letters, digits
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from sros_tool.dds.decision.grants import ComparisonCrash, certified_text, read_moment, same_subject
 from sros_tool.dds.decision.matching import ExpressionIndex, matches
@@ -30,7 +30,6 @@ from sros_tool.dds.decision.vendors import (
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
-from sros_tool.deferred import NamedTuple
 from sros_tool.values import shows
 
 if TYPE_CHECKING:

@@ -26,7 +26,6 @@ from sros_tool.dds.governance import (
     attributes,
 )
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
-from sros_tool.deferred import regex
 
 _BLANKS = " \t\v\r\n"
 _CDATA = "<![CDATA["
@@ -34,13 +33,13 @@ _ROOM = len(_CDATA) - 2  # Cyclone DDS looks for more text only if this many byt
 _DEEPEST = (
     200  # nesting of elements; a deeper document has unknown elements, so it is refused anyway
 )
-_NAME = regex("[A-Za-z][A-Za-z0-9_:-]*")
-_SKIPPED = regex(
+_NAME = re.compile("[A-Za-z][A-Za-z0-9_:-]*")
+_SKIPPED = re.compile(
     rf"(?:[{_BLANKS}]++|<!--.*?-->|<\?(?:.*?\?>|.*)|<!(?!--|\[CDATA\[)(?:[^>]*>|.*))*+", re.DOTALL
 )
 _QUOTES = {'"': '"', "'": "'", "\xe2\x80\x9c": "\xe2\x80\x9d", "\xe2\x80\x98": "\xe2\x80\x99"}
-_REFERENCE = regex("&(.{0,15}?;)?", re.DOTALL)
-_NUMBER = regex(rf"#(?:x[{_BLANKS}\f]*([+-]?(?:0[xX])?[0-9a-fA-F]+)|[{_BLANKS}\f]*([+-]?\d+))")
+_REFERENCE = re.compile("&(.{0,15}?;)?", re.DOTALL)
+_NUMBER = re.compile(rf"#(?:x[{_BLANKS}\f]*([+-]?(?:0[xX])?[0-9a-fA-F]+)|[{_BLANKS}\f]*([+-]?\d+))")
 _ENTITIES = {"lt": "<", "gt": ">", "amp": "&", "apos": "'", "quot": '"'}
 
 
@@ -203,7 +202,7 @@ _NOTHING = "["
 """An expression that matches no name: a set of characters without its closing bracket."""
 _LONGEST_NUMBER = 4000
 """Maximum number of digits that are converted; a 64-bit number has at most 20."""
-_INTEGER = regex(r"[+-]?(?:0[xX][0-9a-fA-F]*|0[0-7]*|[1-9]\d*)\Z", re.ASCII)
+_INTEGER = re.compile(r"[+-]?(?:0[xX][0-9a-fA-F]*|0[0-7]*|[1-9]\d*)\Z", re.ASCII)
 
 
 def _names(rule: type[DomainRule | TopicRule]) -> tuple[str, ...]:

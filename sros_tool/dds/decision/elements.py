@@ -7,7 +7,7 @@ Source: DDS-Security 1.1, the schemas omg_shared_ca_permissions and omg_shared_c
 from __future__ import annotations
 
 import re
-from dataclasses import field
+from dataclasses import dataclass, field
 from enum import Enum, auto
 
 from lxml import etree
@@ -22,7 +22,6 @@ from sros_tool.dds.governance import (
     parse_governance,
 )
 from sros_tool.dds.permissions import Permissions, parse_permissions
-from sros_tool.deferred import dataclass
 from sros_tool.xml import tag_of
 
 

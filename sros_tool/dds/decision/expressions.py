@@ -12,11 +12,10 @@ from functools import lru_cache
 
 from sros_tool.automata import ANY_LETTER, Automaton, Letters, NameSet
 from sros_tool.dds.decision.vendors import Style
-from sros_tool.deferred import regex
 from sros_tool.names import is_expression
 
-_CLASS = regex(r"\[:([a-y]*):\]")
-_EQUIVALENT = regex(r"\[=(.)=\]", re.DOTALL)
+_CLASS = re.compile(r"\[:([a-y]*):\]")
+_EQUIVALENT = re.compile(r"\[=(.)=\]", re.DOTALL)
 _NOTHING = Letters(())
 _OPENING = Letters.of("[")
 _DIGIT, _LOWER, _UPPER = (Letters.between([ends]) for ends in (("0", "9"), ("a", "z"), ("A", "Z")))

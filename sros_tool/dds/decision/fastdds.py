@@ -25,7 +25,6 @@ from sros_tool.dds.governance import (
     attributes,
 )
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
-from sros_tool.deferred import regex
 
 _BLANKS = " \t\n\v\f\r"
 _MARK = "\xef\xbb\xbf"
@@ -33,13 +32,13 @@ _DEEPEST = 99  # nesting of elements
 _NAME = "[A-Za-z_:\x80-\xff][A-Za-z0-9_:.\x80-\xff-]*+"
 _VALUE = "(?:\"[^\"]*\"|'[^']*')"
 _ATTRIBUTE = f"({_NAME})[{_BLANKS}]*=[{_BLANKS}]*({_VALUE})"
-_TAG = regex(f"<[{_BLANKS}]*(/?)({_NAME})((?:[{_BLANKS}]*{_ATTRIBUTE})*+)[{_BLANKS}]*(/?)>")
-_ATTRIBUTES = regex(_ATTRIBUTE)
-_TEXT = regex(f"[{_BLANKS}]*([^<]*)<")
-_LINE_END = regex("\r\n?|\n\r?")
+_TAG = re.compile(f"<[{_BLANKS}]*(/?)({_NAME})((?:[{_BLANKS}]*{_ATTRIBUTE})*+)[{_BLANKS}]*(/?)>")
+_ATTRIBUTES = re.compile(_ATTRIBUTE)
+_TEXT = re.compile(f"[{_BLANKS}]*([^<]*)<")
+_LINE_END = re.compile("\r\n?|\n\r?")
 _SPECIAL = (("<?", "?>"), ("<!--", "-->"), ("<![CDATA[", "]]>"), ("<!", ">"))
 _ENTITIES = {"quot": '"', "amp": "&", "apos": "'", "lt": "<", "gt": ">"}
-_REFERENCE = regex("&(?:#x?([^;]*)|(quot|amp|apos|lt|gt));")
+_REFERENCE = re.compile("&(?:#x?([^;]*)|(quot|amp|apos|lt|gt));")
 
 
 def read(xml: bytes) -> XmlElement:
@@ -188,7 +187,7 @@ def _utf8(number: int) -> str:
     return ""
 
 
-_INTEGER = regex(r"\s*(?:0[xX]([0-9a-fA-F]+)|([+-]?\d+))", re.ASCII)
+_INTEGER = re.compile(r"\s*(?:0[xX]([0-9a-fA-F]+)|([+-]?\d+))", re.ASCII)
 _TRUE, _FALSE = ("true", "True", "TRUE"), ("false", "False", "FALSE")
 
 

@@ -14,7 +14,6 @@ from functools import lru_cache, partial
 from math import inf
 
 from sros_tool.dds.decision.vendors import Moments, Subjects, VendorTraits
-from sros_tool.deferred import regex
 from sros_tool.validity import parse_iso
 
 _BLANK = ord(" ")
@@ -130,7 +129,7 @@ def _part_end(text: bytes, start: int) -> int:
 
 _MOST_ATTRIBUTES = 20  # the ones that Fast DDS 2.14 uses
 _BEFORE = {
-    wanted: regex(rf'(?:\\.|"(?:\\.|[^"\\])*(?:"|\\?\Z)|[^"\\{wanted}])*', re.DOTALL)
+    wanted: re.compile(rf'(?:\\.|"(?:\\.|[^"\\])*(?:"|\\?\Z)|[^"\\{wanted}])*', re.DOTALL)
     for wanted in "=,"
 }
 """Maps a character to a pattern for the text before it, outside of escapes and quotes."""
@@ -173,8 +172,8 @@ def _outside_quotes(text: str, wanted: str) -> int:
     return end if text[end : end + 1] == wanted else -1
 
 
-_PART = regex(r'(?:\\.|"(?:\\.|[^"\\])*"|[^,"\\])*', re.DOTALL)
-_EQUALS = regex(r'(?:\\.|"(?:\\.|[^"\\])*"|[^="\\])*', re.DOTALL)
+_PART = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*"|[^,"\\])*', re.DOTALL)
+_EQUALS = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*"|[^="\\])*', re.DOTALL)
 
 
 def _attributes(name: str) -> list[tuple[str, str]]:
@@ -196,7 +195,7 @@ def _plain_subject(text: str) -> str:
     return text.strip(" ").replace("\\", "").replace('"', "")
 
 
-_SEPARATORS = regex(r"[,/|]")
+_SEPARATORS = re.compile(r"[,/|]")
 
 
 def _has_granted_parts(
@@ -241,13 +240,13 @@ _COMPARE: dict[Subjects, Callable[[str, str], bool]] = {
 
 # ── dates ──────────────────────────────────────────────────────────────────────────────────
 
-_CYCLONE = regex(
+_CYCLONE = re.compile(
     r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d):(\d\d)(\.\d{1,12})?(?:Z|([+Z-])(\d\d):(\d\d))?\Z",
     re.ASCII,
 )
 # std::get_time of libstdc++ with %Y-%m-%dT%H:%M:%S: the text may end after the year, the month or
 # the day; one blank may precede the day; anything may follow the seconds.
-_LOCAL = regex(
+_LOCAL = re.compile(
     r"\s*(\d{1,4})(?:-(\d\d?)(?:-\s?(\d\d?)(?:[Tt](\d\d?):(\d\d?):(\d\d?))?)?)?", re.ASCII
 )
 _LAST_YEAR = 2262  # of 64 bits of nanoseconds

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 
 from sros_tool.dds.decision.vendors import Style
-from sros_tool.deferred import regex
 
 _Matcher = Callable[[str], object]
 """A function of a name; its result is truthy if the name matches."""
@@ -15,7 +14,7 @@ _Matcher = Callable[[str], object]
 _SPECIAL = frozenset("*?[")
 """Wildcard characters: every vendor takes an expression without them literally."""
 
-_BEFORE_SPECIAL = regex(r"[^*?\[]*")
+_BEFORE_SPECIAL = re.compile(r"[^*?\[]*")
 
 
 @lru_cache(maxsize=65536)

@@ -9,10 +9,8 @@ are assumed to follow the standard, as their manuals say.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import Enum, StrEnum, auto
-
-from sros_tool.deferred import dataclass
 
 
 class Style(Enum):

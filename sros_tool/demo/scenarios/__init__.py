@@ -46,9 +46,8 @@ import difflib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from sros_tool.deferred import NamedTuple, regex
 from sros_tool.demo.scenarios.attacks import ATTACKS
 from sros_tool.demo.scenarios.communication import (
     ACTIONS,
@@ -123,7 +122,7 @@ _ZENOH_ROLES = (Role.ROUTER, Role.RELAY, Role.FLOODER, Role.ERASER)
 
 _VARIABLES = (DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY)
 """Environment variables that a party may set; others, such as LD_PRELOAD, could run code."""
-_NAME = regex(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}")
 """Pattern of party names; they become file names in one folder."""
 
 _KEYS = {

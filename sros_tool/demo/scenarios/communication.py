@@ -7,8 +7,8 @@ messages, or the same program in an enclave with permission.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple
 from sros_tool.demo import forger
 from sros_tool.demo.forger import Undefended
 from sros_tool.demo.scenarios.model import (

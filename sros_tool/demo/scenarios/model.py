@@ -6,12 +6,12 @@ which prove that silence is not caused by a crash.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Final
 
-from sros_tool.deferred import dataclass, regex
 from sros_tool.demo.forger import Forge, Undefended
 from sros_tool.errors import UsageError
 from sros_tool.files import policies_dir
@@ -472,7 +472,7 @@ _GUEST_TOPIC: Final = "/guest_book"
 SERVICE: Final = "/add_two_ints"
 ACTION: Final = "/fibonacci"
 
-_ROS_TOPIC = regex(r"/?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*\Z")
+_ROS_TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*\Z")
 _MAX_TOPIC_LENGTH = 200
 _TOPICS_OF_EVERY_NODE = ("/rosout", "/parameter_events", "/clock", DENIED_TOPIC)
 

@@ -8,8 +8,8 @@ without the defence that stops it.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple
 from sros_tool.demo import forger
 from sros_tool.demo.forger import STOLEN
 from sros_tool.demo.scenarios import zenoh_forger

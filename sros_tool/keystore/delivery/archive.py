@@ -8,8 +8,8 @@ import io
 import tarfile
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
+from typing import NamedTuple
 
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import DocumentError
 from sros_tool.keystore.layout import folder_mode
 

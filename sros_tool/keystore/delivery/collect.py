@@ -13,18 +13,17 @@ import hashlib
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from shlex import quote
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from cryptography import x509
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError
 from sros_tool.fleet.robots import RENEWAL_ALLOWED, Fleet, Robot, enclaves_of, robot_of
 from sros_tool.folders import Folder

@@ -6,13 +6,13 @@ import os
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
 from shlex import quote
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.faults import Fault
 from sros_tool.files import staged_file

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime, timedelta
@@ -17,13 +18,12 @@ from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from cryptography import x509
 from cryptography.x509.oid import ExtensionOID
 
 from sros_tool import __version__
-from sros_tool.deferred import NamedTuple, regex
 from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.files import remove_file, staged_file
 from sros_tool.fleet.robots import Fleet
@@ -104,7 +104,7 @@ _ONLINE = _ROLES[1:]
 _METADATA, _TARGETS, _ARCHIVES = "metadata", "targets", "targets/robots"
 _KEPT = timedelta(days=2)
 """How long unused files stay: robots may be in the middle of an update."""
-_OURS = regex(
+_OURS = re.compile(
     r"metadata/[0-9]+\.(?:targets|snapshot|robots-[0-9a-f]+)\.json"
     r"|targets/robots/[0-9a-f]{64}\.[A-Za-z0-9_]+\.tar\.gz"
     r"|(?:metadata|targets/robots)/\.[^/]+\.new"

@@ -7,15 +7,15 @@ never rely on it.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import field
+from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT
 from sros_tool.keystore.delivery.release import read_release, release_target
@@ -36,7 +36,7 @@ MOST_NUMBER = 10**12 - 1
 """Highest number of a release, as a seal can state it, and highest version of metadata."""
 BEGIN_AGAIN = "Start again as after a theft of all keys: docs/fetching.md says how."
 """Remedy if somebody has used up the numbers."""
-_DIGEST = regex(r"[0-9a-f]{64}\Z")
+_DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 
 
 class PublishedRelease(NamedTuple):
@@ -98,7 +98,7 @@ class PublishedRobot(NamedTuple):
     evaluated: Evaluated | None = None
 
 
-@dataclass(slots=True)
+@dataclass
 class Published:
     """What was published last: by robot, and the versions of the metadata by name.
 

@@ -15,11 +15,13 @@ give it to another robot, nor bring back an earlier one.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 from cryptography import x509
 
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import DocumentError, SrosError, UnavailableError
 from sros_tool.fleet.robots import name_problem
 from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT, listed_digests, pack, unpack
@@ -38,7 +40,7 @@ from sros_tool.pki import smime
 RELEASE_FILES = frozenset({*REQUIRED_FILES, *OPTIONAL_FILES, *ZENOH_FILES} - {KEY_FILE})
 """The files of an enclave that a release can have: neither the key nor the file that names its
 token."""
-_SEALED = regex(rb"sros release 1\nrobot ([^\n]{1,255})\nnumber ([1-9][0-9]{0,11})\n")
+_SEALED = re.compile(rb"sros release 1\nrobot ([^\n]{1,255})\nnumber ([1-9][0-9]{0,11})\n")
 
 
 @dataclass(frozen=True, slots=True)

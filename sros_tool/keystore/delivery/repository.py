@@ -9,11 +9,11 @@ find the earlier metadata.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from datetime import datetime
 from math import ceil, log2
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import serialization
@@ -33,7 +33,6 @@ from tuf.api.metadata import (
 )
 from tuf.api.serialization.json import JSONSerializer
 
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import DocumentError, KeystoreError, PkiError, SrosError
 from sros_tool.folders import Folder
 from sros_tool.keystore.delivery.published import (
@@ -205,7 +204,7 @@ def _is_signed(
 # ── what is there ──────────────────────────────────────────────────────────────────────────
 
 
-@dataclass(slots=True)
+@dataclass
 class Present:
     """The metadata in a publishing folder, as its timestamp names it; empty without a timestamp."""
 

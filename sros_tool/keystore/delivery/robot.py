@@ -5,16 +5,15 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from cryptography import x509
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.deferred import NamedTuple, dataclass, regex
 from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError, UsageError
 from sros_tool.files import write_new_file
 from sros_tool.keystore.confirmation import OF_ANOTHER_KEY
@@ -264,7 +263,7 @@ def _certificates(path: Path) -> tuple[x509.Certificate, ...]:
 _OPTIONAL = (*OPTIONAL_FILES, *ZENOH_FILES)
 _REQUIRED = tuple(file for file in REQUIRED_FILES if file != KEY_FILE)
 _AGAIN = "Have the request signed again, and import the new answer."
-_SEALED = regex(rb"sros answer (?:1|2\nnumber ([1-9][0-9]{0,12}))\n")
+_SEALED = re.compile(rb"sros answer (?:1|2\nnumber ([1-9][0-9]{0,12}))\n")
 """First lines of a seal; earlier versions of sros wrote no number."""
 
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from cryptography import x509
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.permissions import name_notes
-from sros_tool.deferred import NamedTuple, dataclass
 from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError
 from sros_tool.files import staged_file
 from sros_tool.fleet.expansion import FleetPolicy

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +24,6 @@ from sros_tool.dds.decision.access import Decision
 from sros_tool.dds.decision.vendors import TESTED, Vendor, joined_titles, words_of
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import render_permissions
-from sros_tool.deferred import dataclass
 from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.faults import Fault
 from sros_tool.files import write_new_file

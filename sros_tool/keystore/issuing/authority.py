@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 
 from cryptography import x509
@@ -16,7 +17,6 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
 from sros_tool.dds.decision.vendors import TESTED, Vendor
-from sros_tool.deferred import dataclass
 from sros_tool.errors import KeystoreError, Note, PkiError, UsageError, check_meaning
 from sros_tool.keystore.issuing.ca_service import CaService
 from sros_tool.keystore.issuing.keyring import Keyring, check_imported_keys, check_places

@@ -20,13 +20,13 @@ import signal
 import subprocess
 import tempfile
 import time
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 
 from cryptography import x509
 from cryptography.x509.oid import NameOID
 
-from sros_tool.deferred import dataclass, regex
 from sros_tool.errors import KeystoreError, PkiError, UsageError
 from sros_tool.keystore.template import CA_SERVICE_SCHEME, is_ca_service
 from sros_tool.pki import tolerant
@@ -43,7 +43,7 @@ from sros_tool.pki.chains import denies_issuing
 from sros_tool.pki.keys import PublicKey, algorithm
 from sros_tool.validity import Window, iso
 
-_NAME = regex(r"[a-z0-9][a-z0-9_-]{0,39}", re.ASCII)
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,39}", re.ASCII)
 _MOST_BYTES = 64 * 1024
 _MOST_SAID = 500
 _SECONDS = 60

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from functools import cache
 from pathlib import Path
@@ -26,7 +26,6 @@ from sros_tool.dds.permissions import (
     parse_permissions,
     render_permissions,
 )
-from sros_tool.deferred import dataclass
 from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError, check_meaning
 from sros_tool.files import policies_dir
 from sros_tool.keystore.issuing.authority import Authority

@@ -9,11 +9,10 @@ import logging
 import os
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
 
-from sros_tool.deferred import dataclass
 from sros_tool.errors import DocumentError, KeystoreError, PkiError, SrosError, UsageError
 from sros_tool.files import remove_file, write_new_file
 from sros_tool.keystore.issuing.ca_service import CaService, check_ca_service

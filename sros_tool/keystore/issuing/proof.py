@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 
@@ -32,7 +33,6 @@ from sros_tool.dds.decision.vendors import Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule, settings
 from sros_tool.dds.permissions import Permissions
-from sros_tool.deferred import dataclass, regex
 from sros_tool.errors import KeystoreError
 from sros_tool.names import ROS_DISCOVERY_TOPIC, expand, is_expression
 from sros_tool.policy.model import ALLOW, Enclave
@@ -46,7 +46,7 @@ denied in one direction is denied in both there.  No document can avoid that; a 
 (``portable.deny-blocks-topic``).
 """
 
-_SET = regex(r"\[!?[^\]]+\]")
+_SET = re.compile(r"\[!?[^\]]+\]")
 _CHARACTERS = "nabcdefghijklmopqrstuvwxyz_/0123456789" + "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 _OUT, _IN = "publish", "subscribe"
 _ACTION_SERVICES = ("send_goal", "cancel_goal", "get_result")

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES, render_permissions
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import Note
 from sros_tool.fleet.expansion import (
     FleetPolicy,

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
 
-from sros_tool.deferred import dataclass
 from sros_tool.errors import KeystoreError, Note, PkiError, UsageError
 from sros_tool.keystore.issuing.authority import Authorities
 from sros_tool.keystore.known_keys import KnownKeys

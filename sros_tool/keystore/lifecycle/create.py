@@ -11,7 +11,7 @@ import os
 from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +24,6 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance, render_governance
 from sros_tool.dds.permissions import name_notes, parse_permissions
-from sros_tool.deferred import dataclass
 from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError, UsageError, check_meaning
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
@@ -17,7 +17,6 @@ from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
-from sros_tool.deferred import dataclass
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import Fleet, folded
 from sros_tool.keystore.delivery.published import may_have_later_releases

@@ -12,14 +12,13 @@ import hashlib
 import os
 from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from shlex import quote
 
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 
-from sros_tool.deferred import dataclass
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.keystore.fleet import publish_command
 from sros_tool.keystore.issuing.authority import Authority, write_bundle

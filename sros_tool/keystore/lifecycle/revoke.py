@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import count
 from pathlib import Path
 from shlex import quote
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.deferred import dataclass
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.known_keys import revoked_serials

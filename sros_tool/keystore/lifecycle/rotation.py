@@ -9,6 +9,7 @@ import json
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
@@ -17,7 +18,6 @@ from typing import Annotated
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from sros_tool.deferred import dataclass
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.fleet import deliver_first
 from sros_tool.keystore.layout import (

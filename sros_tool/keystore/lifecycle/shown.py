@@ -8,9 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Generic, NamedTuple, TypeVar
 
-from sros_tool.deferred import NamedTuple
 from sros_tool.errors import Note
 from sros_tool.keystore.describe import RouterFacts, router_facts
 from sros_tool.keystore.layout import ROLES
