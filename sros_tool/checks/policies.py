@@ -43,6 +43,7 @@ from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet, Robot, group_of
 from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
 from sros_tool.keystore.protection import contradictions
+from sros_tool.keystore.template import Template
 from sros_tool.names import (
     ACTION_SEPARATOR,
     ACTION_SERVICES,
@@ -1200,6 +1201,11 @@ def _enclaves_of_two_policies(enclaves: Iterable[Enclave]) -> Iterator[Finding]:
         if earlier.source != enclave.source:
             text = f"{enclave.path} is defined here and at {earlier.source}"
             yield IN_TWO_FILES.found(enclave.path, text, enclave.source.file, enclave.source.line)
+
+
+def is_mended_by(template: Template | None, finding: Finding) -> bool:
+    """Return whether a keystore made from ``template`` would not have the reported weakness."""
+    return template is not None and finding.kind is ENCLAVE_NAMES and template.unique_subject
 
 
 def policy_file_findings(

@@ -348,6 +348,10 @@ def check(
     if namespaces and not requirements:
         raise UsageError("--namespace is for --requirements", "", "Leave it out.")
     decide = _requirements(family, paths, requirements, earlier, namespaces)
+    from sros_tool.checks.policies import is_mended_by
+    from sros_tool.keystore.template import load_template
+
+    assumed = load_template(template) if template else None
     with progress("checking"):
         findings_of_paths = [*_findings(family, paths, at), *_stated_differences(paths, at)]
         if decide:
@@ -355,7 +359,7 @@ def check(
         findings = [
             _with_relative_paths(finding)
             for finding in findings_of_paths
-            if not _is_mended_by(template, finding)
+            if not is_mended_by(assumed, finding)
         ]
     chosen = selection.choose(findings)
     if form == "text":
@@ -365,16 +369,6 @@ def check(
     else:
         _SHOW[form](chosen, selection)
     return _status(chosen, fail_on)
-
-
-def _is_mended_by(template: str | None, finding: Finding) -> bool:
-    """Return whether a keystore made from ``template`` would not have the reported weakness."""
-    if template is None:
-        return False
-    from sros_tool.checks.policies import ENCLAVE_NAMES
-    from sros_tool.keystore.template import load_template
-
-    return finding.kind is ENCLAVE_NAMES and load_template(template).unique_subject
 
 
 def _requirements(

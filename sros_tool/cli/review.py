@@ -108,6 +108,13 @@ def _paths_option(name: str, help_text: str) -> Callable[[Decorated], Decorated]
     metavar="PATH",
     help="Fleet file whose robots replace the placeholders of the policies.",
 )
+@click.option(
+    "--template",
+    default="",
+    metavar="TEMPLATE",
+    help="Keystore template whose protection the policies get: the name of one that ships with "
+    "sros, or a PATH.",
+)
 @_paths_option("keystore", "A keystore, or its public part.")
 @_paths_option(
     "leave-out",
@@ -168,6 +175,7 @@ def review(
     policy: tuple[tuple[str, ...], ...],
     requirements: tuple[tuple[str, ...], ...],
     fleet: str,
+    template: str,
     keystore: tuple[tuple[str, ...], ...],
     leave_out: tuple[tuple[str, ...], ...],
     new_access: str,
@@ -239,6 +247,7 @@ def review(
             dropped_requirements == "allow",
             threshold,
             left_out,
+            checked_path(template) if template else "",
             now(),
             local_zone(os.environ),
         )

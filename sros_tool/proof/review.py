@@ -28,6 +28,7 @@ from sros_tool.checks.keystores.issued import (
     STALE,
 )
 from sros_tool.checks.kind import WARNING, ChosenFindings, Finding, FindingFilter
+from sros_tool.checks.policies import is_mended_by
 from sros_tool.checks.requirements import VACUOUS
 from sros_tool.checks.targets import Circumstances, path_findings, policy_findings
 from sros_tool.errors import DocumentError, SrosError
@@ -42,6 +43,7 @@ from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.layout import FLEET, GOVERNANCE_P7S, KEY_FILE, SETTINGS, is_keystore
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import RightsSource, SourcesDifference, compare_sources
+from sros_tool.keystore.template import Template, load_template, read_template, template_names
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Policy, Profile
 from sros_tool.policy.rights import (
@@ -123,7 +125,8 @@ class ReviewRequest:
     ``allow_new_access``, new access and unreviewed policies are shown but do not make the review
     fail; with ``allow_dropped_requirements``, neither do requirements that HEAD drops or weakens.
     The review fails if an enclave expires within ``renew_within``.  ``left_out`` are files and
-    folders of policies that are not reviewed.
+    folders of policies that are not reviewed.  ``template`` is the keystore template, a path or the
+    name of one that ships with sros, whose protection the policies get ("": none is named).
     """
 
     repository: Repository
@@ -137,6 +140,7 @@ class ReviewRequest:
     allow_dropped_requirements: bool
     renew_within: Threshold
     left_out: tuple[str, ...]
+    template: str
     at: datetime
     zone: tzinfo = UTC
 
@@ -792,6 +796,8 @@ class _Review:
             yield "private keys of keystores are not reviewed"
         for path in self._unnamed_keystores():
             yield f"'{path}' is a keystore and is not reviewed"
+        if self._template_changes():
+            yield f"new access by the changes of '{asked.template}'"
         for path in self._changed_settings():
             yield f"'{path}' changes and is not reviewed"
         for side in (self.head, self.base):
@@ -848,7 +854,9 @@ class _Review:
         return Circumstances(self.request.at, self.request.zone, fleet=fleet)
 
     def _findings(self, policies: Sequence[Path], fleet: Fleet | None) -> tuple[int, Content]:
-        chosen = FindingFilter().choose(policy_findings(policies, self._circumstances(fleet)))
+        found = policy_findings(policies, self._circumstances(fleet))
+        template = self._template()
+        chosen = FindingFilter().choose(e for e in found if not is_mended_by(template, e))
         return _status(chosen), chosen
 
     def _access(
@@ -935,7 +943,9 @@ class _Review:
         }
         if self.request.policies:
             named = " ".join(self.request.policies)
-            systems[named] = lambda: load_system(policies, moment=at, fleet=fleet)
+            systems[named] = lambda: load_system(
+                policies, moment=at, fleet=fleet, template=self._template()
+            )
         if not systems:
             yield from _read(files, lambda: fleet)
         for subject, load in systems.items():
@@ -959,6 +969,27 @@ class _Review:
             if dropped_requirements(earlier, wanted):
                 decide = partial(self._dropped_step, earlier, wanted, system)
                 yield from self._step_result("requirements-before", subject, decide)
+
+    def _template(self) -> Template | None:
+        """Return the named keystore template, as HEAD has it; None without one.
+
+        Raises:
+            DocumentError: HEAD does not have it, or it is malformed.
+        """
+        choice = self.request.template
+        if not choice or choice in template_names():
+            return load_template(choice) if choice else None
+        if file := self.head.file(choice):
+            return read_template(file)
+        raise self._missing_file_error(choice)
+
+    def _template_changes(self) -> bool:
+        choice = self.request.template
+        if not (choice and self.base) or choice in template_names():
+            return False
+        with suppress(SrosError):  # said where the template is read
+            return self.base.entry(choice) != self.head.entry(choice)
+        return False
 
     def _keystore_fleet(self, path: str) -> Fleet | None:
         """Return the fleet of a keystore in BASE; None if it has none."""

@@ -14,6 +14,7 @@ import pytest
 
 from sros_tool.cli.review import review as review_verb
 from sros_tool.errors import DocumentError, SrosError, UsageError
+from sros_tool.files import templates_dir
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, renamed_enclaves
 from sros_tool.proof.commit_files import CommitFiles
@@ -781,6 +782,26 @@ def test_a_keystore_fails_for_a_finding_an_expiry_and_a_link_out_of_it(
     change.commit({})
     linked = change.review(*words, "1d")
     assert (linked.status, "cert.pem' is a link out of 'ks'" in linked.out) == (2, True), linked
+
+
+def test_requirements_get_the_protection_of_a_template(change: Change) -> None:
+    protected = '[[protected]]\ntopics = ["/x"]\nlevel = "encrypt"\n'
+    template = (templates_dir() / "production.toml").read_text()
+    change.base = change.commit({"robot.toml": protected, "t.toml": template})
+    words = ("--policy", "robot.xml", "--requirements", "robot.toml", "--template")
+    change.commit({"README": "x"})
+    for choice in ("production", "t.toml"):
+        ended = change.review(*words, choice).ok()
+        assert "requirements robot.xml: nothing found\n" in ended.out, ended  # nothing is assumed
+        assert "by the changes" not in ended.out
+    weaker = template.replace('"ENCRYPT"', '"SIGN"')
+    assert weaker != template
+    change.commit({"t.toml": weaker})
+    ended = change.review(*words, "t.toml")
+    assert ended.status == 1
+    assert "/x: its messages are not, but topic /x has to be encrypted" in ended.out
+    assert "but new access by the changes of 't.toml'" in " ".join(ended.out.split())
+    assert change.review(*words, "none.toml").status == 2
 
 
 def test_whether_a_keystore_is_signed_for_the_policies(
