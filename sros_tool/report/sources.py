@@ -216,8 +216,8 @@ def _compared_picture(
 def _read(path: Path, fleet: Fleet | None, drawing: Drawing, title: str) -> PictureSource:
     """Read a source; if ``drawing`` asks for it, with findings of ``sros check``.
 
-    A source that ``sros check`` cannot read has no findings.  Findings name files with the folders
-    that ``title`` has.
+    A source that ``sros check`` does not read has the finding ``view.not-checked`` instead.
+    Findings name files with the folders that ``title`` has.
     """
     folders = title.removesuffix(_base_name(path))
 
@@ -228,6 +228,9 @@ def _read(path: Path, fleet: Fleet | None, drawing: Drawing, title: str) -> Pict
     source = read_source(path, now=drawing.now, fleet=fleet, sample=sample)
     if not drawing.checked:
         return source
+    if source.origin.kind == "observation":
+        text = "`sros check` does not check what was observed."
+        return replace(source, findings=(*source.findings, _not_checked(text)))
     from sros_tool.checks.policies import policy_file_findings
     from sros_tool.checks.targets import Circumstances, path_findings
 
@@ -242,10 +245,15 @@ def _read(path: Path, fleet: Fleet | None, drawing: Drawing, title: str) -> Pict
             if source.policy
             else path_findings([path], at)
         )
-    except SrosError:
-        findings = []
+    except SrosError as error:
+        text = f"`sros check` cannot read {title}, so nothing in it was checked: {error.what}."
+        return _with_findings(source, path, [_not_checked(text)])
     pictured = [_pictured_finding(finding, {finding.subject}, shown) for finding in findings]
     return _with_findings(source, path, pictured)
+
+
+def _not_checked(text: str) -> PicturedFinding:
+    return PicturedFinding("view.not-checked", "note", text)
 
 
 def _sample(path: Path, drawing: Drawing) -> SampledKeystore | None:

@@ -402,7 +402,7 @@ def test_tab_leads_through_every_control_and_out_of_the_map(
 ) -> None:
     with opened(browser, robot_page) as page:
         seen = []
-        for _ in range(20):
+        for _ in range(22):
             page.keyboard.press("Tab")
             seen.append(
                 page.evaluate("document.activeElement.id || document.activeElement.tagName")
@@ -600,6 +600,20 @@ def test_a_focus_says_its_answer_and_shows_what_leads_to_it(
         assert texts(page, "#map .card.chosen") == {"/cmd_vel"}
         assert "/scan" not in " ".join(texts(page, "#map .card"))
         assert {"2 HOPS BEFORE", "MAY PUBLISH", "MAY SUBSCRIBE"} == texts(page, "#map text.head")
+    with opened(browser, path, "phone") as page:
+        # The flow goes from top to bottom, all of it in sight, and the keyboard leads along it.
+        assert page.evaluate(
+            "(it => it.scrollWidth <= it.clientWidth)(document.querySelector('#canvas'))"
+        )
+        places: dict[str, Any] = {
+            (card.text_content() or "").split()[0]: card.bounding_box() or {}
+            for card in page.locator("#map .card").all()
+        }
+        tops = [places[name]["y"] for name in ("controller", "velocity_mux", "/cmd_vel", "base")]
+        assert tops == sorted(set(tops))
+        page.focus("#map .card.chosen")
+        page.keyboard.press("ArrowUp")
+        assert "velocity_mux" in page.evaluate("document.activeElement.textContent")
 
 
 def test_the_table_has_every_name_and_those_that_only_one_side_may_use(
@@ -634,7 +648,18 @@ def test_a_phone_shows_first_who_may_drive_and_what_everybody_may_do(
         "| topic `/cmd_vel` | everybody with an identity, `/mobile_robot/velocity_mux` |" in shown
     )
     with opened(browser, path, "phone") as page:
-        first, *others = page.locator("#names tbody tr").all_inner_texts()
+        # What needs a look is unfolded; a search unfolds all, and paper has all.
+        rows = page.locator("#names tbody tr:visible")
+        assert 0 < rows.count() < 9
+        page.evaluate("dispatchEvent(new Event('beforeprint'))")
+        printed = rows.count()
+        page.evaluate("dispatchEvent(new Event('afterprint'))")
+        assert printed > 50 and rows.count() < 9
+        page.fill("#search-names", "/mobile_robot/monitor")
+        assert rows.count() > 20
+        page.fill("#search-names", "")
+        page.evaluate("document.querySelectorAll('.group').forEach(it => { it.open = true; })")
+        first, *others = rows.all_inner_texts()
         assert first.split()[1:9] == [
             *("/cmd_vel", "everybody", "with", "an", "identity"),
             *("/mobile_robot/velocity_mux", "/mobile_robot/base", "/mobile_robot/monitor"),
@@ -677,7 +702,9 @@ def test_a_robot_of_unknown_names_says_who_may_do_most_and_equal_findings_are_on
     with opened(browser, tmp_path / "p.html") as page:
         said = page.inner_text("#headlines").split("\n")
         unknown = "What strangers may do is not stated here: a keystore's governance says it."
-        assert [line for line in said if line] == [*most, unknown]
+        node = "/a: p.xml:1: node /n may not reply /n/get_type_description"
+        wrong = f"Looks wrong: 20 errors ({node})"
+        assert [line for line in said if line] == [*most, wrong, unknown]
     with opened(browser, tmp_path / "ks.html") as page:
         said = page.inner_text("#headlines").split("\n")
         closed = "On DDS, strangers, who have no identity, may use none of these names"

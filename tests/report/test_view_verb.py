@@ -75,6 +75,8 @@ def test_an_observation_is_a_source(tmp_path: Path) -> None:
     alone = value(tmp_path / "seen.json")
     assert [(e["enclave"], e["name"]) for e in alone["edges"]] == [("/a", "/x")]
     assert alone["enclaves"][0]["nodes"] == ["/talker"]
+    assert [finding["id"] for finding in alone["findings"]] == ["view.not-checked"]
+    assert str(tmp_path) not in alone["findings"][0]["text"]
     policy = write(tmp_path, "robot.xml", "/x", "/y")
     over = value(policy, tmp_path / "seen.json")
     assert over["overlay"]["kind"] == "use"

@@ -2,7 +2,7 @@
 // are wider than the window into it.
 
 import dagre from "@dagrejs/dagre";
-import { curveBumpX, line } from "d3-shape";
+import { curveBumpX, line, linkVertical } from "d3-shape";
 import { KINDS, counted, sends } from "./words.js";
 
 const SIZES = { letter: 7.4, smallLetter: 6.2, line: 16, small: 14, pad: 7 };
@@ -215,6 +215,7 @@ export function fitted(scene, room) {
   if (scene.width <= room || !scene.cards.length) return scene;
   const columnsOf = byColumn(scene.cards);
   const widths = fittingWidths(columnsOf, room);
+  if (columnsOf.length > 3 && sumOf(widths) + NARROW_GAP * (widths.length - 1) + 16 > room) return stacked(scene, columnsOf, room);
   const gap = Math.max(NARROW_GAP, Math.floor((room - 16) * 0.07));
   const slim = widths.some((width, at) => columnsOf[at][0].role === "names" && width < SLIM);
   const frameOf = (card) => scene.frames.find((frame) => contains(frame, card));
@@ -239,6 +240,45 @@ export function fitted(scene, room) {
   return { ...scene, width, height, slim, cards, links, frames, heads: fittedHeads(scene, before, box) };
 }
 
+// A flow of more columns than the window has room for goes from top to bottom: each column is a band
+// with two cards next to each other, below what the column is.
+function stacked(scene, columnsOf, room) {
+  const cards = [];
+  const bandHeads = [];
+  let y = 0;
+  for (const column of columnsOf) {
+    const head = (scene.heads ?? []).find(({ x }) => column[0].x <= x && x <= column[0].x + column[0].width);
+    if (head) bandHeads.push({ text: head.text, x: 8, y: y + 16, anchor: "start" });
+    y += head ? 24 : 8;
+    const width = Math.floor((room - 32) / 2);
+    let row = [];
+    for (const old of column) {
+      const frame = scene.frames.find((each) => contains(each, old));
+      const isNew = frame !== row[0]?.frame;
+      if (row.length && (isNew || row.length === 2)) {
+        y = below(row);
+        row = [];
+      }
+      if (isNew && frame) y += LEAD;
+      const x = column.length === 1 ? Math.round((room - width) / 2) : 8 + row.length * (width + 16);
+      row.push({ ...rewrapped(old, width, true), frame, x, y });
+      cards.push(row.at(-1));
+    }
+    y = below(row) + NARROW_GAP;
+  }
+  const frames = scene.frames.map((frame) => ({ ...around(frame, cards.filter((card) => card.frame === frame)), x: 2, width: room - 4 }));
+  const box = new Map(cards.map((card) => [card.id, card]));
+  const down = linkVertical();
+  const links = scene.links.map((link) => {
+    const [from, to] = [box.get(link.source), box.get(link.target)];
+    const path = down({ source: [from.x + from.width / 2, from.y + from.height], target: [to.x + to.width / 2, to.y - 1] });
+    return { ...link, path };
+  });
+  return { ...scene, width: room, height: y, slim: true, stacked: true, cards, links, frames, heads: bandHeads };
+}
+
+const below = (row) => Math.max(...row.map((card) => card.y + card.height)) + 9;
+
 // Cards from left to right in columns, and in each column from the top.
 function byColumn(cards) {
   const columnList = [];
@@ -256,9 +296,8 @@ function fittingWidths(columnsOf, room) {
   const gap = Math.max(NARROW_GAP, Math.floor((room - 16) * 0.07));
   const natural = columnsOf.map((cards) => Math.max(...cards.map((card) => card.width)));
   const least = columnsOf.map((cards, at) => Math.min(natural[at], cards[0].role === "names" ? LEAST.names : LEAST.enclave));
-  const sum = (numbers) => numbers.reduce((total, number) => total + number, 0);
-  const spare = room - 16 - gap * (columnsOf.length - 1) - sum(least);
-  const share = Math.min(1, Math.max(0, spare / Math.max(1, sum(natural) - sum(least))));
+  const spare = room - 16 - gap * (columnsOf.length - 1) - sumOf(least);
+  const share = Math.min(1, Math.max(0, spare / Math.max(1, sumOf(natural) - sumOf(least))));
   return least.map((width, at) => Math.floor(width + (natural[at] - width) * share));
 }
 
@@ -277,6 +316,8 @@ function rewrapped(card, width, slim) {
   const fit = { ...card, width, slim, lines, notes };
   return { ...fit, height: Math.max(height(fit), names && slim && card.level !== "unknown" ? 46 : 0) };
 }
+
+const sumOf = (numbers) => numbers.reduce((total, number) => total + number, 0);
 
 function inWords(text, letters) {
   const lines = [""];

@@ -21,4 +21,7 @@ export const svg = (tag, properties = {}, ...children) =>
 
 export const byId = (id) => document.getElementById(id);
 
+// A screen without room for columns side by side.
+export const isSmall = () => window.innerWidth <= 720;
+
 export const counted = (number, thing) => `${number} ${thing}${number === 1 ? "" : "s"}`;

@@ -98,7 +98,7 @@ export function drawScene(node, scene, { overlay, problems, choose }) {
     .join("text")
     .attr("class", "head")
     .attr("x", (head) => head.x)
-    .attr("y", 16)
+    .attr("y", (head) => head.y ?? 16)
     .attr("text-anchor", (head) => head.anchor)
     .selectAll("tspan")
     .data((head) => (head.lines ?? [head.text]).map((text, at, all) => ({ text: at < all.length - 1 ? `${text} ` : text, x: head.x })))
@@ -131,7 +131,7 @@ export function drawScene(node, scene, { overlay, problems, choose }) {
     .attr("tabindex", (_, number) => (number ? -1 : 0))
     .attr("aria-label", (card) => cardText(card, problems(card)))
     .on("click", (_, card) => choose(card))
-    .on("keydown", (event, card) => moved(event, card, drawn, scene.links, choose))
+    .on("keydown", (event, card) => moved(event, card, drawn, scene, choose))
     .each(function draw(card) {
       drawCard(select(this), card, problems(card));
     });
@@ -217,7 +217,7 @@ function drawCard(group, card, problems) {
 
 // The arrow keys lead to the next card in their direction, sideways to one that is linked if there
 // is one; only one card is in the tab order.
-function moved(event, card, drawn, links, choose) {
+function moved(event, card, drawn, { links, stacked }, choose) {
   if (event.key === "Enter" || event.key === " ") {
     event.preventDefault();
     choose(card);
@@ -235,7 +235,7 @@ function moved(event, card, drawn, links, choose) {
     const ahead = (toX - x) * way[0] + (toY - y) * way[1];
     const aside = Math.abs((toX - x) * way[1]) + Math.abs((toY - y) * way[0]);
     // Sideways a column is far; upwards and downwards one stays in it.
-    if (ahead <= 20 || (way[1] && aside > 60)) return;
+    if (ahead <= 20 || (way[1] && aside > 60 && !stacked)) return;
     const distance = way[0] ? ahead * 0.2 + aside + (linked.has(other.id) ? 0 : 1e6) : ahead + aside;
     if (!best || distance < best.distance) best = { distance, node: this };
   });

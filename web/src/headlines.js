@@ -3,6 +3,7 @@
 
 import { counted, el } from "./dom.js";
 import { SHOWN, moves, nameButton, rank } from "./table.js";
+import { daysLeft } from "./timeline.js";
 import { SENDS, noneText, sends } from "./words.js";
 
 const DRIVERS = 3;
@@ -21,7 +22,7 @@ export function headlines(model, opens, act, showTab) {
   else if (model.scenes[0].id !== "focus") {
     const said = drivers(model.rows, opens, showTable);
     const widest = said.length ? [] : [widestLine(model, act)];
-    parts.push(el("div", { class: "drivers" }, said, widest.filter(Boolean), openLine(model, showTable)));
+    parts.push(el("div", { class: "drivers" }, said, widest.filter(Boolean), wrongLine(model, showTab), openLine(model, showTable)));
   }
   const [first, ...rest] = model.notes;
   if (rest.length) {
@@ -78,6 +79,23 @@ function widestLine(model, act) {
     return el("p", {}, `May ${verbs} most names (${top} of ${names.size}): `, button(first, () => act.enclave(first)), also);
   };
   return [most(true, "publish or call"), most(false, "subscribe to or serve")].filter(Boolean);
+}
+
+// What looks wrong: the worst finding, how many others there are, and what expired since the page was made.
+function wrongLine({ findings, validities }, showTab) {
+  const of = (severity) => findings.filter((finding) => finding.severity === severity);
+  const [errors, warnings, notes] = ["error", "warning", "note"].map(of);
+  const expired = validities.filter((validity) => daysLeft(validity) < 0);
+  const [worst] = [...errors, ...warnings];
+  const number = [errors.length && counted(errors.length, "error"), warnings.length && counted(warnings.length, "warning")];
+  const parts = [
+    worst && [button(number.filter(Boolean).join(", "), () => showTab("findings")), ` (${[worst.enclave, worst.text].filter(Boolean).join(": ")})`],
+    expired.length && [button(`${expired.length} expired`, () => showTab("timeline"))],
+  ].filter(Boolean);
+  if (parts.length) return el("p", { class: "lack" }, "Looks wrong: ", parts.flatMap((part, at) => (at ? [", ", ...part] : part)));
+  const unchecked = findings.find(({ id }) => id === "view.not-checked");
+  if (unchecked) return el("p", { class: "lack" }, "Not all was checked: ", button(counted(notes.length, "note"), () => showTab("findings")));
+  return el("p", {}, "No error or warning was found", notes.length ? [", but ", button(counted(notes.length, "note"), () => showTab("findings"))] : "", ".");
 }
 
 // What may be used without a right.  Only a keystore's governance says it, and only of DDS.

@@ -2,7 +2,7 @@
 
 import { MOST_BUNDLES, columns, fitted, flowScene } from "./arrange.js";
 import { cardDetails, enclaveDetails, equalDetails, findingItem, nameDetails } from "./details.js";
-import { byId, counted, el, svg } from "./dom.js";
+import { byId, counted, el, isSmall, svg } from "./dom.js";
 import { drawScene, legend } from "./draw.js";
 import { headlines } from "./headlines.js";
 import { Model } from "./model.js";
@@ -21,7 +21,6 @@ const problemsOf = new Map(
     enclave.problems.length + model.findingsOf(enclave.path).filter((f) => f.severity === "error").length,
   ]),
 );
-const isSmall = () => window.innerWidth <= 720;
 const problems = (card) =>
   card.role === "names" ? 0 : card.members.reduce((sum, path) => sum + (problemsOf.get(path) ?? 0), 0);
 
@@ -396,6 +395,8 @@ function start() {
     }
   });
   window.addEventListener("resize", resized);
+  window.addEventListener("beforeprint", unfoldAll);
+  window.addEventListener("afterprint", foldAgain);
   // A small screen has no room for the columns of the whole map, and the table fits.
   if (isSmall()) for (const fold of document.querySelectorAll(".fold")) fold.open = false;
   fillLists();
@@ -403,6 +404,16 @@ function start() {
   showMap();
   if (startsWithoutEnclaves()) showTab("names");
   document.body.dataset.ready = "true";
+}
+
+// On paper nothing can be unfolded.
+function unfoldAll() {
+  state.folded = [...document.querySelectorAll("details:not([open])")];
+  for (const each of state.folded) each.open = true;
+}
+
+function foldAgain() {
+  for (const each of state.folded) each.open = false;
 }
 
 // The top of a long map may have names only; then the table says more.

@@ -1,10 +1,12 @@
 // All names in a table: who may send, who may receive, and what nobody may do.
 
-import { counted, el } from "./dom.js";
+import { counted, el, isSmall } from "./dom.js";
 import { KINDS, LEVELS, RECEIVES, SENDS, noneText } from "./words.js";
 
 export const SHOWN = 4;
 const MOST = 400;
+// Up to so many rows are looked through without groups, and a group of them needs no folding.
+const FEW = 12;
 // What usually moves a robot stands first, then what is open to everybody; what only one side may
 // use is last.  Each part is in the order of names.
 const MOVES = /(^|\/)(cmd_vel|[^/]*commands?$|joint_trajectory|follow_joint_trajectory)/;
@@ -14,6 +16,8 @@ export const moves = (name) => MOVES.test(name);
 export function rank(row) {
   return row.names.some(moves) ? (row.lacks ? 1 : 0) : row.all_send || row.all_receive ? 2 : row.lacks ? 4 : 3;
 }
+
+const GROUPS = ["Moves the robot, by name", "Moves the robot, by name", "Open to everybody"];
 
 function mentions(row, text) {
   return [row.names, row.senders, row.receivers, row.denied].some((all) =>
@@ -41,8 +45,11 @@ export function nameButton(kind, name, opens) {
 // `lacking` is the number of names that only one side may use;
 // `opens(kind, name)` returns what shows a name, or nothing for one that stands for several.
 export function namesTable(rows, lacking, opens) {
-  const ordered = rows.map((row) => [rank(row), row]).sort((a, b) => a[0] - b[0]).map(([, row]) => row);
-  const body = el("tbody");
+  const ordered = rows
+    .map((row) => [rank(row), -reach(row), row])
+    .sort((a, b) => a[0] - b[0] || a[1] - b[1])
+    .map(([, , row]) => row);
+  const groups = el("div");
   // A protection that all names have is said once.
   const levels = [...new Set(rows.map((row) => row.level))];
   const same = levels.length === 1 ? ` Protection of all: ${levelText(levels[0])}.` : "";
@@ -55,7 +62,12 @@ export function namesTable(rows, lacking, opens) {
     const fit = ordered.filter(
       (row) => (basics.checked || !row.common) && (row.lacks || !only.checked) && (!text || mentions(row, text)),
     );
-    body.replaceChildren(...fit.slice(0, MOST).map((row) => line(row, opens, !same)));
+    const shown = fit.slice(0, MOST);
+    const table = (some) => el("table", { class: "names" }, el("thead", {}, el("tr", {}, heads())), el("tbody", {}, some.map((row) => line(row, opens, !same))));
+    const parts = shown.length > FEW ? grouped(shown) : [];
+    groups.replaceChildren(
+      ...(parts.length > 1 ? parts.map(([title, some]) => group(title, some, table(some), Boolean(text))) : [table(shown)]),
+    );
     const names = fit.reduce((sum, row) => sum + row.names.length, 0);
     const shared = names > fit.length ? " (names with the same rights share a row)" : "";
     const first = fit.length > MOST ? `; shown are the first ${MOST}` : "";
@@ -64,14 +76,45 @@ export function namesTable(rows, lacking, opens) {
   search.addEventListener("input", show);
   only.addEventListener("change", show);
   basics.addEventListener("change", show);
+  const heads = () => ["Name", "May publish or call", "May subscribe or serve", ...(same ? [] : ["Protection"])].map((text) => el("th", { scope: "col", text }));
   show();
-  const head = ["Name", "May publish or call", "May subscribe or serve", ...(same ? [] : ["Protection"])].map((text) => el("th", { scope: "col", text }));
   return [
     el("label", { class: "search" }, "Name or enclave ", search),
     el("p", { class: "choices" }, lacking ? el("label", {}, only, ` only names that one side may use (${lacking})`) : null, el("label", {}, basics, " also names that every node needs")),
     status,
-    el("table", { class: "names" }, el("thead", {}, el("tr", {}, head)), body),
+    groups,
   ];
+}
+
+// How many enclaves may send, and before all of them who may in any namespace.
+function reach(row) {
+  return row.names.some((name) => /^\/?[^/]*[*?[]/.test(name)) && row.senders.length ? Infinity : row.senders.length;
+}
+
+// Rows that are looked at together: what needs a look, and then each namespace, the one in which
+// most enclaves may send to a name first.
+function grouped(rows) {
+  const groups = new Map();
+  for (const row of rows) {
+    const title = GROUPS[rank(row)] ?? namespaceOf(row);
+    if (!groups.has(title)) groups.set(title, []);
+    groups.get(title).push(row);
+  }
+  const most = ([title, some]) => (GROUPS.includes(title) ? Infinity : Math.max(...some.map(reach)));
+  return [...groups].sort((a, b) => most(b) - most(a));
+}
+
+function namespaceOf({ names }) {
+  const [first, ...others] = new Set(names.map((name) => name.split("/").slice(0, -1)[1]));
+  return others.length ? "several namespaces" : first ? `/${first}` : "no namespace";
+}
+
+function group(title, rows, table, searched) {
+  const names = rows.reduce((sum, row) => sum + row.names.length, 0);
+  const most = Math.max(...rows.map((row) => row.senders.length));
+  const said = `${counted(names, "name")}${most > 1 ? `, up to ${most} may send` : ""}`;
+  const open = searched || !isSmall() || (GROUPS.includes(title) && rows.length <= FEW);
+  return el("details", { class: "group", open }, el("summary", {}, el("b", { text: title }), " ", el("span", { class: "soft", text: said })), table);
 }
 
 const levelText = (level) => LEVELS[level].replace("protection ", "");
