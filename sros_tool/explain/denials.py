@@ -64,16 +64,17 @@ _NEAR_LINES = 3
 class Denial:
     """A denied DDS topic, and ``direction``: "publish", "subscribe", or "" if unknown.
 
-    With ``by_rule`` a deny rule denies it, so that an allow rule would not help; with ``remote``
-    the permissions of a peer deny it.  ``enclave`` is "" if the log does not name it. ``process``
-    is the label of the process that printed the denial, or "", and ``lines`` the numbers of its
-    lines, from 1.  ``folder`` is the folder from which the process loaded its enclave, or "".
+    With ``by_rule`` a deny rule denies it, so that an allow rule would not help (None: unknown);
+    with ``remote`` the permissions of a peer deny it.  ``enclave`` is "" if the log does not name
+    it.  ``process`` is the label of the process that printed the denial, or "", and ``lines`` the
+    numbers of its lines, from 1.  ``folder`` is the folder from which the process loaded its
+    enclave, or "".
     """
 
     topic: str
     direction: str
     enclave: str = ""
-    by_rule: bool = False
+    by_rule: bool | None = False
     remote: bool = False
     vendor: Vendor = field(default=Vendor.FAST, compare=False)
     process: str = ""
@@ -112,8 +113,14 @@ def read_denials(text: str) -> tuple[Denial, ...]:
         for denial in _denials_of(*item):
             lines.setdefault(denial, []).extend(denial.lines)
     denials = [replace(denial, lines=tuple(numbers)) for denial, numbers in lines.items()]
-    known = {replace(denial, direction="") for denial in denials if denial.direction}
-    return tuple(denial for denial in denials if denial.direction or denial not in known)
+    known = {
+        replace(denial, direction=direction, by_rule=by_rule)
+        for denial in denials
+        for direction in {denial.direction, ""}
+        for by_rule in {denial.by_rule, None}
+        if (direction, by_rule) != (denial.direction, denial.by_rule)
+    }
+    return tuple(denial for denial in denials if denial not in known)
 
 
 def _denials_of(process: str, numbered: list[tuple[int, str]]) -> Iterator[Denial]:
@@ -127,7 +134,8 @@ def _denials_of(process: str, numbered: list[tuple[int, str]]) -> Iterator[Denia
             vendor, match = denied
             topic = match["topic"]
             remote, direction = _direction(lines[index : index + 1 + _NEAR_LINES], topic)
-            by_rule = "deny" in match["rule"].lower()
+            rule = match.groupdict().get("rule")
+            by_rule = "deny" in rule.lower() if rule else None
             yield Denial(
                 topic, direction, enclave, by_rule, remote, vendor, process, (number,), folder
             )

@@ -60,6 +60,7 @@ from sros_tool.runtime.zenoh_log import (
 from sros_tool.translate import grant_rights
 from sros_tool.translate_zenoh.rights import name_of_key
 from sros_tool.values import shows
+from sros_tool.wording import first_few
 
 _WORDS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))
 """Patterns that split a log line into words: without punctuation, or with the punctuation of
@@ -256,6 +257,8 @@ def explain_log(
 ) -> tuple[LogFinding, ...]:
     """Return the security messages of a log, each once, in the order of the log.
 
+    The lines that are not understood follow at the end, those of a process as one finding.
+
     ``find`` loads an enclave; ``context`` returns domain and time for it.  ``root`` is the path of
     the keystore as suggested commands name it.  The enclaves of peers and nodes in the log are
     looked up in ``keystore``.
@@ -281,7 +284,7 @@ def explain_log(
     findings += _dropped_message_findings(
         lines, root, own_enclave.name if own_enclave else "", keystore
     )
-    return tuple(sorted(findings, key=lambda finding: finding.line))
+    return tuple(sorted(findings, key=lambda finding: (finding.id == UNKNOWN.id, finding.line)))
 
 
 # ── reading ────────────────────────────────────────────────────────────────────────────────
@@ -310,9 +313,7 @@ class _Hit:
     @property
     def kind(self) -> str:
         """A key that is equal for lines that are reported as one finding."""
-        if self.meaning is not UNKNOWN:
-            return f"{self.meaning.id} {self.cause}"
-        return _NUMBERS.sub("", plain_refusal(self.text))
+        return f"{self.meaning.id} {self.cause}"
 
 
 def _joined_lines(lines: list[str]) -> Iterator[tuple[int, str]]:
@@ -567,7 +568,7 @@ class _Examiner:
             first.text,
             first.process,
             first.enclave,
-            first.cause,
+            _unknown_cause(hits) if meaning is UNKNOWN else first.cause,
             remedy_of,
             zenoh=meaning.id.startswith(ZENOH_IDS),
         )
@@ -716,7 +717,11 @@ class _Examiner:
         line, text = named[0][0], " ".join(named[0][1].split())
         right, name = _in_ros_terms(denial)
         who = "a peer" if denial.remote else denial.enclave or "the process"
-        by = "a rule of the policy denies it" if denial.by_rule else "no rule allows it"
+        by = {
+            True: "a rule of the policy denies it",
+            False: "no rule allows it",
+            None: "its permissions do not allow it",
+        }[denial.by_rule]
         if node := serving_node(denial):
             by += f"; every node has this service, and here it belongs to node {node}"
         finding = LogFinding(
@@ -733,11 +738,13 @@ class _Examiner:
         enclave = None if denial.remote else self._find(denial.enclave)
         if enclave is None:
             return finding
-        if not denial.direction:
-            named_remedy = finding.remedy.replace("ENCLAVE", quote(enclave.name))
-            return replace(finding, remedy=named_remedy)
-        answer = self._answer(enclave, denial.vendor, _question(denial))
-        if answer.allowed:
+        directions = (denial.direction,) if denial.direction else (PUBLISH, SUBSCRIBE)
+        answers = [
+            self._answer(enclave, denial.vendor, _question(replace(denial, direction=direction)))
+            for direction in directions
+        ]
+        answer = answers[0]
+        if all(answer.allowed for answer in answers):
             facts = ["the current permissions allow it"]
             elsewhere, remedy = self._other_folder_cause(denial, enclave)
             facts += elsewhere
@@ -745,6 +752,9 @@ class _Examiner:
                 "Restart the process: it loaded earlier permissions. If it runs from an export, "
                 "export the enclave again first."
             )
+        elif not denial.direction:
+            facts = [answer.decision.text for answer in answers]
+            remedy = finding.remedy
         elif ns:
             facts = [answer.decision.text, f"the enclave may {right} {ns}{name}"]
             remedy = (
@@ -825,6 +835,7 @@ class _Examiner:
     def _how_to_ask(self, denial: Denial, name: str) -> str:
         """Return the commands that show which rights a policy lacks for the topic of a denial."""
         root, enclave = self._root or "KEYSTORE", denial.enclave or "ENCLAVE"
+        enclave = "PEER" if denial.remote else enclave
         commands = [
             f"`sros explain {root} {quote(enclave)} {word} {quote(name)}`"
             for word in _words_to_ask(denial, name)
@@ -881,6 +892,17 @@ class _Examiner:
         )
 
 
+def _unknown_cause(hits: Iterable[_Hit]) -> str:
+    """Return the cause of lines that are not understood: which they are, each text once."""
+    lines: dict[str, int] = {}
+    for hit in hits:
+        lines.setdefault(_NUMBERS.sub("", plain_refusal(hit.text)), hit.line)
+    if len(lines) == 1:
+        return UNKNOWN.cause
+    shown = first_few([str(line) for line in lines.values()], _MOST_LINES)
+    return f"{len(lines)} different lines of DDS Security that sros does not know: lines {shown}"
+
+
 def _with_name(text: str, word: str, name: str) -> str:
     """Return a remedy with the quoted ``name`` in place of ``word``; unchanged for "".
 
@@ -894,6 +916,7 @@ def _with_name(text: str, word: str, name: str) -> str:
 
 
 _COMMAND = re.compile(r"(`sros\b[^`]*`)")
+_MOST_LINES = 20
 _MOST_PEERS = 5
 """Highest number of peers that are examined for one message."""
 _OF_ROTATION = ("peer-signature", "peer-permissions-ca")

@@ -257,7 +257,7 @@ _CYCLONE_PARTICIPANT_TEXTS = (
         "peer-unsecured", _CYCLONE, r"Non secure remote (?:reader|writer) \S+ is not allowed"
         r"|from unauthenticated participant|downgrade participant \S+ to non-secure",
         "a PEER was refused: it runs without DDS Security, or is not authenticated yet",
-        "Start the peer in its enclave: `sros run KEYSTORE ENCLAVE -- COMMAND`.",
+        "Start the peer in its enclave: `sros run KEYSTORE PEER -- COMMAND`.",
     ),
     _log_text(
         "peer-permissions", _CYCLONE, rf"{_CYCLONE_PARTICIPANT} permissions from plugin: "
@@ -438,7 +438,7 @@ _FAST_PARTICIPANT_TEXTS = (
         "peer-malformed", _FAST,
         r"Error validating remote permissions for \S+ \(Malformed permissions file",
         "a PEER was refused: Fast DDS does not accept its permissions, although signed correctly",
-        "Generate them again with sros: `sros create_permission KEYSTORE ENCLAVE POLICY`.",
+        "Generate them again with sros: `sros create_permission KEYSTORE PEER POLICY`.",
     ),
     _log_text(
         "peer-domain", _FAST, r"Error checking remote participant"
@@ -446,7 +446,7 @@ _FAST_PARTICIPANT_TEXTS = (
         r"|check_remote_participant.*Not found a rule allowing to use the domain_id",
         "a PEER was refused: its permissions are not for this domain",
         "Sign the peer's permissions again, with this domain: `sros create_permission KEYSTORE "
-        "ENCLAVE POLICY` takes the domains of the keystore.",
+        "PEER POLICY` takes the domains of the keystore.",
     ),
     _log_text(
         "peer-refused", _FAST, r"Error validating remote permissions for"
@@ -649,13 +649,13 @@ _DENIED_TOPIC_TEXTS = (
     ),
     _log_text(  # rmw_cyclonedds, which names other reasons than a refusal
         "topic-denied", _CYCLONE,
-        r"failed to create topic \[(?P<topic>[^\]\s]+)\] for (?P<rule>unknown reasons)",
+        r"failed to create topic \[(?P<topic>[^\]\s]+)\] for unknown reasons",
         refuses=RefusedObject.TOPIC,
     ),
     _log_text(  # the nodes of `sros demo`
         "topic-denied", _CYCLONE,
         r"cannot create (?:topic|a (?:writer|reader) on) (?P<topic>\S+)\. "
-        r"(?P<rule>Not Allowed By Security)",
+        r"Not Allowed By Security",
         refuses=RefusedObject.TOPIC,
     ),
 )  # fmt: skip
@@ -716,11 +716,11 @@ UNKNOWN = LogText(
         # Any line of the file of ROS_SECURITY_LOG_FILE: without trouble, it stays empty.
         r"|\[[A-Z]{4,13}\] [^\s|]+\|[^\s|]+ \d+ \w+::\w+ :"
         # Cyclone DDS; what it traces of success is no trouble.
-        r"|\A\d+\.\d+ \[\d*\]\s+\S+: (?!.*(?:DDS Security plugins have been loaded"
+        r"|\A\d+\.\d+ \[\d*\]\s+\S+: (?!send \w+ tokens|.*(?:DDS Security plugins have been loaded"
         r"|using security settings from|allow non-secure remote|FSM: |handshake (?:delete|resend)"
         r"|config: |(?:PARTICIPANT|WRITER|READER) \S+ QOS=|write_sample |data\(builtin"
         r"|validate_local_identity: candidate_guid|cleanup participant|SPDP ST"
-        r"|\) (?:processed|send tokens|succeeded)))"
+        r"|crypto=\d|waiting for approval|\) (?:processed|send tokens|succeeded)))"
         rf".*(?:{_AMBIGUOUS_WORDS}|plugin|not allowed|token|encoded|authenticat"
         r"|Could not (?:load|find))"
         r"|SECURITY ERROR"

@@ -36,9 +36,9 @@ def vendor_of_line(line: str) -> Vendor | None:
 
 
 SECURITY_DIRECTORY = re.compile(
-    r"Found security directory: (?P<folder>\S*?/enclaves(?P<enclave>/\S*)?)(?:\s|\Z)"
+    r"\b(?:Found )?security directory: (?P<folder>\S*?/enclaves(?P<enclave>/\S*)?)(?:\s|\Z)"
 )
-"""The line in which rcl names the enclave of a process, and its folder (groups)."""
+"""The line in which rcl, or a node of `sros demo`, names its enclave and its folder (groups)."""
 
 _PROCESS_LABEL = re.compile(
     r"\[(?P<launch>[\w.-]+-\d+)\] "  # ros2 launch: [talker-1]
@@ -115,7 +115,10 @@ def _first_refusal(refused: RefusedObject, text: str) -> str:
 
 
 def denied_topic(line: str) -> tuple[Vendor, re.Match[str]] | None:
-    """Return the vendor that denies a topic, and the match with groups ``topic`` and ``rule``."""
+    """Return the vendor that denies a topic, and the match with group ``topic``.
+
+    Group ``rule`` says which rule denies it, if the line does.
+    """
     for vendor, pattern in _TOPIC_DENIED:
         if match := pattern.search(line):
             return vendor, match

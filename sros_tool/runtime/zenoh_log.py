@@ -15,7 +15,7 @@ from typing import NamedTuple
 from sros_tool.runtime.log_texts import LogText
 
 _RUN_IN_ENCLAVE = "Start it in its enclave: `sros run KEYSTORE ENCLAVE -- COMMAND`."
-_RUN_PARTICIPANT = "Start that process in its enclave: `sros run KEYSTORE ENCLAVE -- COMMAND`."
+_RUN_PEER = "Start that process in its enclave: `sros run KEYSTORE PEER -- COMMAND`."
 _SAME_KEYSTORE = (
     "Give both sides enclaves of the same keystore, and restart both after each stage of `sros "
     "rotate_ca KEYSTORE`; `sros inspect` shows the CA of each."
@@ -37,7 +37,7 @@ def _zenoh_text(name: str, pattern: str, cause: str, remedy: str, vagueness: int
 _LISTENING_TEXTS = (
     _zenoh_text(
         "peer-no-certificate", r"zenoh_link\S*: .*peer sent no certificates",
-        "a PEER was refused: it showed no certificate", _RUN_PARTICIPANT,
+        "a PEER was refused: it showed no certificate", _RUN_PEER,
     ),
     _zenoh_text(
         "foreign-ca", r"zenoh_link\S*: received fatal alert: UnknownCA"
@@ -49,14 +49,14 @@ _LISTENING_TEXTS = (
         "not-tls", r"zenoh_link\S*: received corrupt message of type InvalidContentType",
         "something without TLS connected to an endpoint with TLS: a process with an endpoint "
         "tcp/..., or another program",
-        f"{_RUN_PARTICIPANT} Many such lines a second keep everybody out: use a firewall, or "
+        f"{_RUN_PEER} Many such lines a second keep everybody out: use a firewall, or "
         "listen on localhost.",
     ),
     _zenoh_text(
         "peer-expired", r"invalid peer certificate: certificate expired",
         "a PEER was refused: its certificate has expired, by the clock of this host",
         "Renew it, and restart the peer: `sros inspect KEYSTORE` shows which one, `sros renew "
-        "KEYSTORE ENCLAVE` renews it.",
+        "KEYSTORE PEER` renews it.",
     ),
     _zenoh_text(
         "peer-not-yet-valid", r"invalid peer certificate: certificate not valid yet",
@@ -66,7 +66,7 @@ _LISTENING_TEXTS = (
     _zenoh_text(
         "closed-expired", r"Closing \S+ link .{1,200}remote certificate chain expired",
         "a connection was closed, because the certificate of the other side has expired",
-        "Renew it, and restart that process: `sros renew KEYSTORE ENCLAVE`.",
+        "Renew it, and restart that process: `sros renew KEYSTORE PEER`.",
     ),
     _zenoh_text(
         "alert", r"zenoh_link\S*: received fatal alert: (?P<alert>\w{1,40})",
@@ -188,7 +188,7 @@ _REASONLESS_TEXTS = (
     ),
 )  # fmt: skip
 
-_ZENOH_TEXTS: tuple[LogText, ...] = (
+ZENOH_TEXTS: tuple[LogText, ...] = (
     *_LISTENING_TEXTS,
     *_CONNECTING_TEXTS,
     *_CONFIGURATION_TEXTS,
@@ -198,7 +198,7 @@ _ZENOH_TEXTS: tuple[LogText, ...] = (
 
 def matching_zenoh_text(line: str) -> tuple[LogText, re.Match[str]] | None:
     """Return the text that explains a line of Zenoh, with its match, or None."""
-    for text in _ZENOH_TEXTS:
+    for text in ZENOH_TEXTS:
         if match := text.pattern.search(line):
             return text, match
     return None

@@ -82,15 +82,15 @@ def test_rcl_tells_what_cyclone_does_not(topic: str, said: str, direction: str) 
     ("line", "denial"),
     [
         ("RCLError: Failed to create publisher: failed to create topic [rt/x] for unknown reasons",
-         Denial("rt/x", "publish")),
+         Denial("rt/x", "publish", by_rule=None)),
         ("  'failed to create topic [rt/x] for unknown reasons, at src/rmw_node.cpp:1941, at "
-         "/project/src/rcl/subscription.c:112'", Denial("rt/x", "subscribe")),
+         "/project/src/rcl/subscription.c:112'", Denial("rt/x", "subscribe", by_rule=None)),
         ("Failed to create action client: failed to create topic [rq/x/_action/send_goalRequest] "
          "for unknown reasons, at src/rmw_node.cpp:1941, at /project/src/rcl/client.c:146",
-         Denial("rq/x/_action/send_goalRequest", "publish")),
+         Denial("rq/x/_action/send_goalRequest", "publish", by_rule=None)),
         ("failed to create service: failed to create topic [rr/xReply] for unknown reasons",
-         Denial("rr/xReply", "publish")),
-        ("failed to create topic [rt/x] for unknown reasons", Denial("rt/x", "")),
+         Denial("rr/xReply", "publish", by_rule=None)),
+        ("failed to create topic [rt/x] for unknown reasons", Denial("rt/x", "", by_rule=None)),
     ],
 )  # fmt: skip
 def test_rmw_cyclonedds_names_the_topic_and_rcl_the_kind(line: str, denial: Denial) -> None:
@@ -100,6 +100,14 @@ def test_rmw_cyclonedds_names_the_topic_and_rcl_the_kind(line: str, denial: Deni
         "for unknown reasons", "because it's already in use in this context with another type"
     )
     assert not read_denials(other_reason)
+
+
+def test_a_line_that_names_the_rule_is_of_the_same_denial_as_one_that_does_not() -> None:
+    text = (
+        "1.2 [0] python: Local topic permission denied: rt/x found in deny_rule\n"
+        "cannot create topic rt/x. Not Allowed By Security\n"
+    )
+    assert read_denials(text) == (Denial("rt/x", "", by_rule=True),)
 
 
 def test_a_denial_of_a_peer_is_no_reason_to_widen_ones_own() -> None:

@@ -21,6 +21,8 @@ from sros_tool.keystore.participant import LoadedEnclave, load_enclave_of
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.names import PARAMETER_SERVICES
 from sros_tool.pki.certificates import identity_of, load_certificate
+from sros_tool.runtime.log_texts import LOG_TEXTS, UNKNOWN, LogText
+from sros_tool.runtime.zenoh_log import ZENOH_TEXTS
 from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
 from tests.support.children import python, run
 from tests.support.harness import copy_of, policy_text, publish, sros
@@ -332,10 +334,37 @@ def test_without_a_keystore(file: str, ids: list[str]) -> None:
         'PARTICIPANT 8:9:d:1c1 QOS={user_data=10<"enclave=/;">,property_list={0:"dds.sec.auth"}}',
         "SPDP ST3 8:9:d:1c1 unknown not allowed",
         "cleanup participant 8:9:d:1c1 security attributes",
+        "send crypto tokens(8:9:d:ff0202c3 --> f:1:4:ff0202c4)",
+        "match_remote_reader: proxypp_crypto=14 wr_crypto=94 prd_crypto=14",
+        "connect_proxy_writer_with_reader (pwr f:1:4:c2) with (rd 8:9:d:c7) waiting for approval "
+        "by security",
     ],
 )
 def test_a_trace_of_success_is_no_trouble(line: str) -> None:
     assert not explained(f"1795877133.730803 [43] python: {line}")
+
+
+def test_lines_that_are_not_understood_are_one_finding_after_the_known_ones() -> None:
+    unknown = [f"{CYCLONE_LINE}token {word} 1:2" for word in ("lost", "late", "lost")]
+    known = f"{CYCLONE_LINE}Non secure remote writer 1:2:3:403 is not allowed."
+    first, last = explained("\n".join((*unknown, known)))
+    assert (first.id, last.id, last.line, last.count) == ("peer-unsecured", UNKNOWN.id, 1, 3)
+    assert last.cause == "2 different lines of DDS Security that sros does not know: lines 1, 2"
+
+
+@pytest.mark.parametrize("text", [*LOG_TEXTS, *ZENOH_TEXTS], ids=lambda text: text.id)
+def test_what_a_peer_needs_is_not_advised_for_the_enclave_that_logged_it(text: LogText) -> None:
+    of_peer = text.id.startswith("peer-") or "PEER was" in text.cause
+    assert not (of_peer and re.search(r"\bENCLAVE\b", text.remedy))
+
+
+def test_a_peer_without_security_is_to_be_started_in_an_enclave_of_its_own(
+    keystore: Path, tmp_path: Path
+) -> None:
+    line = f"{CYCLONE_LINE}Non secure remote writer 1:2:3:4 is not allowed"
+    (tmp_path / "robot.log").write_text(line)
+    said = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "robot.log").out
+    assert f"Start the peer in its enclave: `sros run {keystore} PEER -- COMMAND`." in said
 
 
 @pytest.mark.parametrize(
@@ -394,7 +423,7 @@ def test_what_is_not_understood_is_shown(line: str, tmp_path: Path) -> None:
     (found,) = explained(f"before\n{line}\n{line}\nafter")
     assert (found.id, found.line, found.count) == ("not-understood", 2, 2)
     both = f"{line}\n[SECURITY Error] PKCS7 data verification failed -> Function init\n"
-    assert [each.id for each in explained(both)] == ["not-understood", "signature"]
+    assert [each.id for each in explained(both)] == ["signature", "not-understood"]
     (tmp_path / "robot.log").write_text(line)
     said = sros("explain", "--log", tmp_path / "robot.log")
     assert said.status == 1 and " ".join(line.split())[-20:] in said.out
@@ -570,7 +599,7 @@ def test_tests_of_declared_keys_are_not_called_nothing(tmp_path: Path) -> None:
 def test_a_line_that_follows_an_unknown_one_is_not_swallowed() -> None:
     unknown, known = f"{FAST_LINE}Something new", f"{FAST_LINE}PKCS7 data verification failed"
     assert [each.id for each in explained(f"{unknown}\n{known}\n{unknown}")] == [
-        "not-understood", "signature",
+        "signature", "not-understood",
     ]  # fmt: skip
     other = f"a-1 | {FAST_LINE}PKCS7 data verifi\nb-1 | cation failed"
     assert [each.id for each in explained(other)] == ["not-understood"]
@@ -589,10 +618,11 @@ def test_nothing_found_is_said_of_what_was_read(tmp_path: Path) -> None:
         ended = sros("explain", "--log", tmp_path / "robot.log").ok()
         assert ended.err.strip().partition(": ")[0] == said
     assert "no line says 'Found security directory': on DDS, its nodes ran open" in ended.err
-    line = "[INFO] [1.0] [rcl]: Found security directory: /k/enclaves/talker\n"
-    (tmp_path / "robot.log").write_text(line)
-    ended = sros("explain", "--log", tmp_path / "robot.log").ok()
-    assert "a node ran in '/k/enclaves/talker'" in ended.err
+    for found in ("[INFO] [1.0] [rcl]: Found", "[talker]"):  # rcl, and a node of `sros demo`
+        line = f"{found} security directory: /k/enclaves/talker\n"
+        (tmp_path / "robot.log").write_text(line)
+        ended = sros("explain", "--log", tmp_path / "robot.log").ok()
+        assert "a node ran in '/k/enclaves/talker'" in ended.err
     for cause in ("CAs", "revocation list", "governance", "domains", "clock"):
         assert cause in ended.err
     assert "`sros check FOLDER OTHER`" in ended.err
@@ -846,6 +876,17 @@ def test_a_process_that_was_not_restarted_in_a_rotation_is_named(
 
 
 # ── denials ────────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_topic_that_is_denied_in_either_direction_is_looked_up_in_both(
+    keystore: Path, tmp_path: Path
+) -> None:
+    line = "cannot create topic rt/x. Not Allowed By Security"
+    (tmp_path / "robot.log").write_text(line)
+    said = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "robot.log").out
+    assert "no rule allows it" not in said.partition("found")[0]
+    for direction in ("publish", "subscribe"):
+        assert f"  found     Cyclone DDS 0.10: no rule names {direction} rt/x" in said
 
 
 def test_a_denied_topic_is_compared_with_what_is_signed(keystore: Path, tmp_path: Path) -> None:
