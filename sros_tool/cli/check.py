@@ -47,6 +47,7 @@ from sros_tool.cli.common import (
     output_option,
     policy_for,
     print_json,
+    print_notes,
     progress,
     save,
     taken_secrets,
@@ -676,6 +677,7 @@ def _relative(file: str) -> str:
 
 def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
     from sros_tool.keystore.expiry import (
+        clock_notes,
         describe_lifetime,
         due_enclaves,
         expiring_enclaves,
@@ -706,7 +708,10 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
                 echo(line)
             for remark in filter(None, ("" if lines else none_due, left_out)):
                 echo(remark, err=True)
-    return NOT_DONE if expiring.unreadable else 1 if expiring.due else 0
+    notes = tuple(clock_notes(keystore, moment))
+    print_notes(notes)
+    is_unknown = expiring.unreadable or (notes and not expiring.due)
+    return NOT_DONE if is_unknown else 1 if expiring.due else 0
 
 
 def renewal_markdown(lines: Sequence[str], text_if_none: str, text: str) -> str:

@@ -16,6 +16,7 @@ from sros_tool.cli.common import (
     json_option,
     now,
     print_json,
+    print_notes,
     verb,
 )
 from sros_tool.terminal import echo
@@ -106,16 +107,18 @@ def inspect(
     """
     from sros_tool.errors import DocumentError, UsageError
     from sros_tool.keystore.describe import describe, problems_of
+    from sros_tool.keystore.expiry import clock_notes
     from sros_tool.keystore.reader import OpenedKeystore
 
     if not path.exists():
         raise DocumentError(f"'{path}' does not exist")
+    keystore = OpenedKeystore(path)
     if enclave is not None:
         if history:
             raise UsageError("--history is for a whole keystore", "", f"Leave {enclave} out.")
-        path = _enclave_of(OpenedKeystore(path), enclave)
+        path = _enclave_of(keystore, enclave)
     if history:
-        return _show_history(OpenedKeystore(path), policy, as_json)
+        return _show_history(keystore, policy, as_json)
     if policy:
         raise UsageError("--policy is for --history", "", "Add --history.")
     described = describe(path, now=now(), authority=authority)
@@ -131,6 +134,7 @@ def inspect(
     else:
         for line in _TEXT[described.kind](described):
             echo(line)
+    print_notes([*clock_notes(keystore, now())] if keystore.root.is_dir() else [])
     if problems_of(described):
         return 1
     if signature and not signature.signed:  # documents in clear, such as governance.xml, exist

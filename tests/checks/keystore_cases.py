@@ -171,6 +171,7 @@ CASES |= {
     "portable.signature-hash": lambda b: b.trust(
         "identity", b.new_authority(IS_CA, digest=hashes.SHA384())[0]
     ),
+    "keystore.clock-behind": lambda b: at(b, -1),
     "keystore.revocation-list-ends": lambda b: b.revoke(end=b.now + 29 * DAY),
     "keystore.revocation-list-issuer": lambda b: b.revoke(by=b.foreign()),
 }

@@ -21,6 +21,8 @@ from sros_tool import __version__
 from sros_tool.cli.program import FAMILIES
 from sros_tool.files import policies_dir
 from sros_tool.keystore.layout import PRIVATE, REQUIRED_FILES
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
+from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name, issue_ca, pem
 from sros_tool.pki.keys import generate_key
@@ -863,3 +865,26 @@ def test_the_root_of_the_file_system_is_no_keystore() -> None:
         ended = sros(*words)
         assert ended.status == 2, ended
         assert "root of the file system" in ended.err
+
+
+def test_a_clock_behind_the_keystore_is_said_of_what_seems_valid(tmp_path: Path) -> None:
+    root, behind = tmp_path / "ks", "of this machine shows"
+    create_keystore(root, template=load_template("development"), now=datetime.now(UTC))
+    create_enclaves(root, ["/a"], now=datetime.now(UTC))
+    asked = (
+        ("explain", root, "/a", "join"),
+        ("inspect", root),
+        ("renew", root, "--all-expiring", "30d"),
+    )
+    due = ("check", root, "--needs-renewal", "30d")
+    for words in (*asked, due):
+        assert behind not in sros(*words).ok().err
+    assert "keystore.clock-behind" not in sros("check", root).out
+    later = datetime.now(UTC) + timedelta(days=2)
+    create_enclaves(root, ["/b"], now=later)
+    for words in (*asked, due):
+        assert behind in sros(*words).err
+    assert sros(*due).status == 2
+    assert "keystore.clock-behind" in sros("check", root).out
+    (root / "ledger.jsonl").unlink()
+    assert behind not in sros(*asked[0]).ok().err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
 from shlex import quote
@@ -321,6 +322,15 @@ LEDGER_UNPROVEN = FindingKind(
     "--trust-records`. Otherwise state the rights again, with `sros generate_artifacts -k KEYSTORE "
     "-p POLICY_FILE` or `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`.",
 )
+CLOCK_BEHIND = FindingKind(
+    "keystore.clock-behind",
+    WARNING,
+    "a check for a moment before the last change of the keystore",
+    "If the clock of this machine is behind, what has expired counts as valid.",
+    "sros: ledger.jsonl has the time of each change.",
+    "Set the clock. If it is right, and was ahead at the last change, run `sros crl KEYSTORE "
+    "--refresh`, so that the last entry of the ledger is of today.",
+)
 CRL_EXPIRES_SOON = FindingKind(
     "keystore.revocation-list-ends",
     ERROR,
@@ -417,6 +427,9 @@ def _record_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
     for clause in edits.unsigned:
         yield NOT_AS_SETTINGS.found("settings", clause, file)
     file = keystore.shown(LEDGER)
+    with suppress(SrosError):  # a ledger that cannot be read is unread
+        if behind := keystore.opened.ledger_file.clock_behind(keystore.now):
+            yield CLOCK_BEHIND.found("clock", behind, file)
     for gap in keystore.ledger.gaps:
         yield LEDGER_DAMAGED.found("ledger", gap, file)
     if count := keystore.ledger.unchained:

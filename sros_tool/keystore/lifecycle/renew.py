@@ -14,6 +14,7 @@ from sros_tool.keystore.expiry import (
     Credentials,
     Threshold,
     UnreadableEnclave,
+    clock_notes,
     read_credentials,
     refuse_unreadable,
     survey,
@@ -98,6 +99,7 @@ def renew(
                 text = f"short-lived, and renewed only if named: {first_few(short_lived, 3)}"
                 change.notes.append(Note("renew.short-lived", text))
         if not wanted:  # no CA key is asked for
+            change.notes += clock_notes(change.keystore, now)
             with suppress(SrosError):
                 change.notes += change.edit_notes()
             return change.result(Changed)
