@@ -7,11 +7,8 @@ They also share its lock on the keystore: the lock is held until the last worker
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import gc
-import mmap
 import os
-import pickle
 import signal
 import threading
 import time
@@ -37,6 +34,8 @@ class Tally:
     """
 
     def __init__(self) -> None:
+        import mmap  # most lists are short, and need no tally and no worker
+
         self.total = 0
         self._memory = mmap.mmap(-1, 8 * _MOST_PROCESSES)
         self._counts = memoryview(self._memory).cast("Q")  # of each process
@@ -163,6 +162,8 @@ def _fork(
     Signals are blocked meanwhile: a signal between the two steps would leave a worker running that
     ``workers`` does not list.
     """
+    import pickle
+
     parent = os.getpid()
     reader, writer = os.pipe()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOP_SIGNALS)
@@ -195,6 +196,8 @@ def _result_or_error(
 
 def _die_with(parent: int) -> None:
     """Have the kernel kill this process when its parent dies, so that it stops writing."""
+    import ctypes
+
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
@@ -220,6 +223,8 @@ def _collect(worker: int, pipe: int) -> Result:  # type: ignore[type-var]
             _end_text(os.waitstatus_to_exitcode(status)),
             "Try again.",
         )
+    import pickle
+
     result = pickle.loads(message)  # noqa: S301 - from our own child, through a pipe
     if isinstance(result, BaseException):
         raise result

@@ -79,10 +79,11 @@ def domains_decided_alike(
 
 def fleet_of(file: Path | None, keystore: OpenedKeystore | None) -> Fleet | None:
     """Return the fleet in a file, or else the fleet of the keystore."""
-    from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.keystore.fleet import load_fleet
 
     if file:
+        from sros_tool.fleet.fleet_file import read_fleet
+
         return read_fleet(file)
     return load_fleet(keystore) if keystore else None
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
 from functools import lru_cache
 from ipaddress import ip_address
 from itertools import permutations
@@ -154,6 +153,8 @@ class Fleet:
 
 def _similar_names_remedy(name: str, known: Iterable[str]) -> str:
     """Return the remedy for an unknown name: similar known names, or else the first ones."""
+    from difflib import get_close_matches
+
     names = list(known)
     similar = get_close_matches(name[:_MAX_NAME], names, n=3, cutoff=0.5) or names[:3]
     return (

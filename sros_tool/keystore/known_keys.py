@@ -19,11 +19,6 @@ from shlex import quote
 from cryptography import x509
 
 from sros_tool.errors import KeystoreError, Note, PkiError, SrosError
-from sros_tool.keystore.delivery.published import (
-    later_revoked_serials,
-    may_have_later_releases,
-    read_published,
-)
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     KEY_FILE,
@@ -220,6 +215,8 @@ class KnownKeys:
     @cached_property
     def _unrecorded(self) -> frozenset[int]:
         """The serial numbers that only lists have, as after a restore: copied, or published."""
+        from sros_tool.keystore.delivery.published import later_revoked_serials
+
         recorded = {int(entry.serial, 16) for entry in self._revocations}
         listed = {entry.serial for crl in self._keystore.revocation_lists for entry in crl.revoked}
         return (later_revoked_serials(self._keystore) | listed) - recorded
@@ -304,6 +301,11 @@ class KnownKeys:
                 f"the key of {holder} was revoked", f"It is the key of {revoked}.", remedy
             )
         if certificate and certificate.serial_number in self._unrecorded:
+            from sros_tool.keystore.delivery.published import (
+                may_have_later_releases,
+                read_published,
+            )
+
             if may_have_later_releases(self._keystore):
                 folder = quote(read_published(self._keystore).folder)
                 publish = f"sros fleet publish {quote(str(self._keystore.root))} {folder}"

@@ -18,14 +18,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from cryptography import x509
 
 from sros_tool.errors import DocumentError, SrosError, UnavailableError
 from sros_tool.fleet.robots import name_problem
 from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT, listed_digests, pack, unpack
-from sros_tool.keystore.issuing.authority import Authority
 from sros_tool.keystore.layout import (
     ENCLAVES,
     KEY_FILE,
@@ -36,6 +35,9 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime
+
+if TYPE_CHECKING:
+    from sros_tool.keystore.issuing.authority import Authority
 
 RELEASE_FILES = frozenset({*REQUIRED_FILES, *OPTIONAL_FILES, *ZENOH_FILES} - {KEY_FILE})
 """The files of an enclave that a release can have: neither the key nor the file that names its
