@@ -391,8 +391,9 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     processes.rename(robot.folder / "processes.json")  # as if it was broken, and removed
     assert "the robot runs closed" in robot.close("--for", "1s", status=2).err
     assert still in robot.close("--undo", status=1).out
-    (robot.folder / "processes.json").rename(processes)
     robot.by_hand = set()
+    assert "\nthe robot is open: " in f"\n{robot.close('--undo').err}", "who knows what it had?"
+    (robot.folder / "processes.json").rename(processes)
     robot.close("--proof", status=1)
     assert made(robot.folder) == MADE
     opens = "protection.default.write_access_control=false"
@@ -1075,6 +1076,19 @@ def test_processes_of_another_user_need_the_files(
     assert robot.restarts == []
 
 
+def test_root_reads_any_export(tmp_path: Path) -> None:
+    export = tmp_path / "export"
+    export.mkdir()
+    if os.geteuid() == 0:
+        os.chown(export, 1234, -1)
+    shell = Shell(close._run, print, {}, lambda: datetime.now(UTC), UTC)
+    robot = LocalRobot(tmp_path, 0, shell)
+    for user in (0, 4321):
+        process = ClosedProcess("/a", 7, ("a",), "/", user, "", "program")
+        problems = preparation._user_problems(robot, ObservedProcesses(0, [process]))
+        assert any("chown -R " in problem for problem in problems) == bool(user)
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -1193,11 +1207,23 @@ def test_a_dry_run_changes_nothing(robot: Robot) -> None:
     assert snapshot(robot.folder) == before
 
 
-def test_what_is_printed_as_json(robot: Robot) -> None:
+def test_what_is_printed_as_json(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also the process ids that the processes have after their restart."""
+    of_root = robot.process
+
+    def process_of(enclave: str, *, is_secured: bool) -> Process:
+        made = of_root(enclave, is_secured=is_secured)
+        return replace(made, pid=made.pid + 1000 * is_secured)
+
+    monkeypatch.setattr(robot, "process", process_of)
     seen = Seen()
     robot.units = UNITS
     for words in ("--dry-run", "", "--apply", "--proof", "--undo"):
-        seen.check("close", robot.close(*words.split(), "--json"))
+        ended = robot.close(*words.split(), "--json")
+        seen.check("close", ended)
+        if words == "--apply":
+            pids = {process["pid"] for process in json.loads(ended.out)["processes"]}
+            assert pids == {pid + 1000 for pid in PID.values()}
     assert seen.unseen("close") == []
 
 
