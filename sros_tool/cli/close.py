@@ -224,15 +224,15 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
 
 def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) -> str:
     """Return the enclave of a process, how sros knows the process, and how it is restarted."""
-    how = "by its launch, by hand" if process.launch else "by hand"
-    how = "by Docker Compose, by hand" if process.container else how
-    restarts = "restarts" if process.pid else "adds a drop-in to"
-    how = f"--apply {restarts} {process.unit}" if process.unit else how
+    restart = "by its launch, by hand" if process.launch else "by hand"
+    restart = "by Docker Compose, by hand" if process.container else restart
+    does = "restarts" if process.pid else "adds a drop-in to"
+    restart = f"--apply {does} {process.unit}" if process.unit else restart
     runs = process.enclave in closed.secured
     if closed.secured.get(process.enclave):
-        how = "closed"
+        restart = "closed"
     elif runs:
-        how = f"closed {_EARLIER}: {how}"
+        restart = f"closed {_EARLIER}: {restart}"
     if process.alike:
         state = f"{process.pids_text}, which sros cannot tell"
     elif process.enclave in closed.absent:
@@ -244,7 +244,7 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
     else:
         ended = process.enclave in closed.observed.ended
         state = "has ended" if ended else "not running as observed"
-    return f"{process.enclave}: {state}{_nodes(policy, process.enclave)}: {how}"
+    return f"{process.enclave}: {state}{_nodes(policy, process.enclave)}: {restart}"
 
 
 def _nodes(policy: Policy, enclave: str) -> str:
@@ -272,13 +272,13 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
             echo(f"  {problem}")
         echo(f"next: sros close {folder}{' --apply' if apply else ''}", err=True)
     elif holds:
-        asked = all(proof.holds for proof in closed.proofs)
-        but = "" if asked else ", except for what was not checked"
+        is_asked = all(proof.holds for proof in closed.proofs)
+        exceptions = "" if is_asked else ", except for what was not checked"
         if missing := [name for name in closed.without if name not in closed.secured]:
-            but += f", without a process of {', '.join(missing)}"
+            exceptions += f", without a process of {', '.join(missing)}"
         following = f"; next: bring {folder}/keystore to another machine: it has the CA keys"
         following = following if robot.keystore.exists() else ""
-        echo(f"the robot is closed{but}{_until(closed)}{following}", err=True)
+        echo(f"the robot is closed{exceptions}{_until(closed)}{following}", err=True)
     elif closed.proofs:
         accept = _ACCEPT if closed.is_proved(partial=True) else ""
         next_command = f"ask again with sros close {folder} --proof, or go back with --undo"
@@ -323,10 +323,10 @@ def _show_undone(robot: LocalRobot, closed: CloseState) -> None:
         # Without the list of processes, nobody knows whether they run.
         stopped = robot.observed is not None and not (pids or closed.observed.unknown)
         state = "no process of the robot runs" if stopped else "the robot is open"
-        but = ""
+        more = ""
         if other_machines := closed.observed.not_here:
-            but = f"; start {enumerated(other_machines)}, on other machines, without sros run, too"
-        echo(f"{state}: sros sees no process in an enclave of this folder{but}", err=True)
+            more = f"; start {enumerated(other_machines)}, on other machines, without sros run, too"
+        echo(f"{state}: sros sees no process in an enclave of this folder{more}", err=True)
 
 
 def _state(closed: CloseState, *, apply: bool) -> str:
@@ -342,8 +342,8 @@ def _state(closed: CloseState, *, apply: bool) -> str:
         else "open"
         for name in closed.pending
     }
-    but = ", ".join(f"{name} ({word})" for name, word in words.items())
-    return f"the processes run in their enclaves{', except for ' if but else ''}{but}"
+    exceptions = ", ".join(f"{name} ({word})" for name, word in words.items())
+    return f"the processes run in their enclaves{', except for ' * bool(words)}{exceptions}"
 
 
 def _until(closed: CloseState) -> str:

@@ -14,6 +14,7 @@ from sros_tool.cli.changed import print_changed, print_closed, print_follow_up, 
 from sros_tool.cli.common import (
     PATH,
     allow_refusal_option,
+    chosen_enclaves,
     complete_file,
     domain_of,
     dry_run_option,
@@ -91,7 +92,7 @@ def distribute_key(
       left out enclave /arm/camera: its key was made on its robot
     """
     from sros_tool.keystore.delivery.archive import SUFFIXES
-    from sros_tool.keystore.delivery.export import distribute, pack_enclaves, select
+    from sros_tool.keystore.delivery.export import distribute, pack_enclaves, with_keys_here
     from sros_tool.keystore.outcomes import changes_below
     from sros_tool.keystore.reader import OpenedKeystore
 
@@ -102,9 +103,8 @@ def distribute_key(
     target = PATH.convert(rest[-1], None, None)
     keystore = OpenedKeystore(root)
     _check_target(keystore, rest[-1])
-    selection = select(
-        keystore, names, patterns, robots=robots, all_enclaves=all_enclaves, keyless=keyless
-    )
+    chosen = chosen_enclaves(keystore, names, patterns, robots, all_enclaves=all_enclaves)
+    selection = with_keys_here(keystore, chosen, names, keyless=keyless)
     notes: tuple[Note, ...] = ()
     if target == _STREAM:
         if not dry_run:

@@ -9,8 +9,9 @@ from functools import cached_property
 from itertools import chain
 from typing import NamedTuple
 
+from sros_tool.close.processes import read_document
 from sros_tool.close.robot import OBSERVER, LocalRobot
-from sros_tool.errors import DocumentError, SrosError
+from sros_tool.errors import SrosError
 from sros_tool.explain.audit import DeniedRight, audit, audited_enclaves
 from sros_tool.graph.learn import stable_name
 from sros_tool.graph.observation import (
@@ -27,8 +28,6 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
 from sros_tool.policy.patterns import overlap
 from sros_tool.runtime.rmw import chosen_vendor
-from sros_tool.values import parse_json
-from sros_tool.xml import read_bytes
 
 
 class MovedEndpoint(NamedTuple):
@@ -52,19 +51,11 @@ class ObservedNodes:
 
         Nodes whose enclave the graph did not show are left out.
         """
-        nodes = self._written_nodes() if self._nodes is None else self._nodes
+        nodes, again = self._nodes, "Watch the robot again: --for 1m."
+        if nodes is None:
+            file = self.robot.observation_file
+            nodes = read_document(file, observation_from_json, "an observation", again).nodes
         return [node for node in nodes if node.enclaves]
-
-    def _written_nodes(self) -> Sequence[ObservedNode]:
-        path = self.robot.observation_file
-        try:
-            return observation_from_json(parse_json(read_bytes(path, "observation"))).nodes
-        except (ValueError, TypeError, KeyError) as error:
-            raise DocumentError(
-                f"'{path}' is not an observation",
-                f"{error}",
-                "Watch the robot again: --for 1m.",
-            ) from error
 
     @cached_property
     def policy(self) -> Policy:

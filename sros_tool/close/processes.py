@@ -7,9 +7,9 @@ import re
 import shlex
 import shutil
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 from sros_tool.enclave_environment import RMWS
 from sros_tool.errors import DocumentError
@@ -350,25 +350,43 @@ def read_processes(path: Path) -> ObservedProcesses:
     Raises:
         DocumentError: The file cannot be read.
     """
+    return read_document(
+        path, _observed_from, "a list of processes", "Remove it, to watch the robot again."
+    )
+
+
+_Value = TypeVar("_Value")
+
+
+def read_document(path: Path, parse: Callable[[Any], _Value], kind: str, remedy: str) -> _Value:
+    """Return what ``parse`` makes of the JSON value in a file of a robot's folder.
+
+    Raises:
+        DocumentError: The file cannot be read, or is not ``kind``, such as "an observation".
+    """
     try:
-        value = parse_json(read_bytes(path, "list of processes"))
-        processes = [ClosedProcess(**process) for process in value["processes"]]
-        observed = ObservedProcesses(**value)._replace(processes=processes)
-        names = (*observed.unknown, *observed.elsewhere, *observed.ended, *observed.not_here)
-        _check_types(names, (observed.domain,))
-        for process in processes:
-            words = (process.enclave, process.folder, process.container, process.rmw)
-            texts = (*words, *process.command, *process.launch, *process.shares)
-            _check_types((*texts, process.known_by), (process.pid, process.user, *process.alike))
-            if process.unit and not re.fullmatch(SERVICE_NAME, process.unit, re.A):
-                raise ValueError(f"{process.unit!r} is not a service")
-        return observed
+        return parse(parse_json(read_bytes(path, kind.partition(" ")[2])))
     except (ValueError, TypeError, KeyError) as error:
-        raise DocumentError(
-            f"'{path}' is not a list of processes",
-            f"{error}",
-            "Remove it, to watch the robot again.",
-        ) from error
+        raise DocumentError(f"'{path}' is not {kind}", f"{error}", remedy) from error
+
+
+def _observed_from(value: Any) -> ObservedProcesses:
+    """Return the processes in a JSON value.
+
+    Raises:
+        ValueError, TypeError, KeyError: the value has another form.
+    """
+    processes = [ClosedProcess(**process) for process in value["processes"]]
+    observed = ObservedProcesses(**value)._replace(processes=processes)
+    names = (*observed.unknown, *observed.elsewhere, *observed.ended, *observed.not_here)
+    _check_types(names, (observed.domain,))
+    for process in processes:
+        words = (process.enclave, process.folder, process.container, process.rmw)
+        texts = (*words, *process.command, *process.launch, *process.shares)
+        _check_types((*texts, process.known_by), (process.pid, process.user, *process.alike))
+        if process.unit and not re.fullmatch(SERVICE_NAME, process.unit, re.A):
+            raise ValueError(f"{process.unit!r} is not a service")
+    return observed
 
 
 def _check_types(texts: Sequence[object], numbers: Sequence[object]) -> None:

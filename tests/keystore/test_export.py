@@ -15,10 +15,16 @@ import pytest
 
 from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.cli.common import chosen_enclaves
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.keystore.delivery.archive import unpack
-from sros_tool.keystore.delivery.export import ExportSelection, distribute, pack_enclaves, select
+from sros_tool.keystore.delivery.export import (
+    ExportSelection,
+    distribute,
+    pack_enclaves,
+    with_keys_here,
+)
 from sros_tool.keystore.delivery.robot import create_request
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
@@ -75,6 +81,12 @@ def test_an_older_list_does_not_replace_a_newer_one(fleet: Path, tmp_path: Path)
 # ── selection ──────────────────────────────────────────────────────────────────────────────
 
 
+def select(root: Path, names: list[str], patterns: list[str], every: bool) -> ExportSelection:
+    keystore = OpenedKeystore(root)
+    chosen = chosen_enclaves(keystore, names, patterns, [], all_enclaves=every)
+    return with_keys_here(keystore, chosen, names, keyless=False)
+
+
 @pytest.mark.parametrize(
     ("names", "patterns", "every", "chosen", "left_out"),
     [
@@ -96,7 +108,7 @@ def test_selection(
     left_out: list[str],
     made_fleet: Path,
 ) -> None:
-    found = select(OpenedKeystore(made_fleet), names, patterns, all_enclaves=every)
+    found = select(made_fleet, names, patterns, every)
     assert found == ExportSelection(tuple(chosen), tuple(left_out))
 
 
@@ -106,7 +118,7 @@ def test_selection(
 )
 def test_an_empty_selection_is_refused(patterns: list[str], why: str, made_fleet: Path) -> None:
     with pytest.raises(KeystoreError) as caught:
-        select(OpenedKeystore(made_fleet), [], patterns)
+        select(made_fleet, [], patterns, every=False)
     assert why in str(caught.value)
 
 

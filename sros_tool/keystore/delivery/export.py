@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -47,7 +47,7 @@ from sros_tool.keystore.outcomes import (
 )
 from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
 from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore
-from sros_tool.keystore.selection import missing_enclave_error, select_enclaves
+from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.keystore.transaction import Change, Transaction
 from sros_tool.keystore.zenoh_files import open_zenoh
 from sros_tool.names import check_enclave_name
@@ -86,35 +86,22 @@ class ExportSelection:
     left_out: tuple[str, ...]
 
 
-def select(
-    keystore: OpenedKeystore,
-    names: Sequence[str],
-    patterns: Sequence[str] = (),
-    *,
-    robots: Sequence[str] = (),
-    all_enclaves: bool = False,
-    keyless: bool = False,
+def with_keys_here(
+    keystore: OpenedKeystore, names: Iterable[str], given: Collection[str], *, keyless: bool
 ) -> ExportSelection:
-    """Return the enclaves to export, selected as by `select_enclaves`.
+    """Return the enclaves to export.
 
-    Unless ``keyless`` is set, an enclave whose key is on its robot is left out if only a pattern,
-    ``robots`` or ``all_enclaves`` selects it; `distribute` refuses such an enclave in ``names``.
+    Unless ``keyless`` is set, enclaves whose keys are on their robots are left out, but for those
+    that are ``given`` by their names, which `distribute` refuses.
 
     Raises:
-        KeystoreError: a pattern matches no enclave, or all selected enclaves have their keys on
-            robots.
+        KeystoreError: this is no keystore, or all enclaves have their keys on robots.
     """
+    keystore.check()
     chosen: list[str] = []
     left_out: list[str] = []
-    for name in select_enclaves(
-        keystore,
-        names,
-        patterns,
-        robots=robots,
-        all_enclaves=all_enclaves,
-        checked=True,
-    ):
-        only_matches = name not in names and not keyless
+    for name in dict.fromkeys(names):
+        only_matches = name not in given and not keyless
         at_robot = only_matches and key_on_robot(keystore.folder(name))
         (left_out if at_robot else chosen).append(name)
     if not chosen:
