@@ -23,6 +23,7 @@ from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     KEY_FILE,
     REQUEST,
+    REVOKED,
     revoked_certificates,
 )
 from sros_tool.keystore.ledger import RESTORED, SAME_KEY, Entry
@@ -32,6 +33,7 @@ from sros_tool.pki.certificates import (
     common_name_of,
     digest,
     identity_of,
+    issued_by,
     key_digest,
     load_request,
     subject_text,
@@ -89,8 +91,22 @@ def revoked_issues(keystore: OpenedKeystore) -> Iterator[Entry]:
             yield entry
         elif entry.enclave in names and entry.serial in serials:
             serials.remove(entry.serial)
-            if entry.what == "revocation" or entry.time >= since:
+            if _is_of_trusted(keystore, entry, since):
                 yield entry
+
+
+def _is_of_trusted(keystore: OpenedKeystore, entry: Entry, since: str) -> bool:
+    """Return whether a CA that is trusted ``since`` a moment issued a revoked certificate.
+
+    Where the ledger does not tell, the certificate in the folder ``revoked`` does, if it is there.
+    """
+    if entry.what == "certificate" and entry.time != since:
+        return entry.time > since
+    file = keystore.identity_file
+    with suppress(SrosError):
+        certificate = keystore.certificate(f"{REVOKED}/{entry.serial}/{CERTIFICATE_FILE}")
+        return not file or any(issued_by(certificate, ca) for ca in keystore.certificates_of(file))
+    return True
 
 
 class IssuedEarlier:

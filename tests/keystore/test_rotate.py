@@ -21,6 +21,7 @@ from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.issuing import keyring
 from sros_tool.keystore.issuing.keyring import Keyring
+from sros_tool.keystore.known_keys import revoked_issues
 from sros_tool.keystore.layout import ROTATION, enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
@@ -450,6 +451,20 @@ def test_revocation_lists_go_along(separate: Path) -> None:
         openssl("verify", "-crl_check", "-CAfile", ca, "-CRLfile", own, folder / "cert.pem")
     assert numbers == sorted(numbers)
     assert numbers[0] < numbers[1]
+
+
+def test_a_revoked_certificate_of_a_ca_that_is_gone_is_not_of_a_trusted_one(
+    separate: Path,
+) -> None:
+    """Also if all happens in one second, so that the times in the ledger do not tell."""
+    revoke(separate, ["/b"], now=NOW)
+    (certificate,) = (e for e in revoked_issues(OpenedKeystore(separate)) if e.serial)
+    assert (certificate.what, certificate.enclave) == ("certificate", "/b")
+    rotate_ca(separate, finish=True, now=NOW)
+    assert not [e for e in revoked_issues(OpenedKeystore(separate)) if e.serial]
+    revoke(separate, ["/a"], now=NOW)
+    (certificate,) = (e for e in revoked_issues(OpenedKeystore(separate)) if e.serial)
+    assert certificate.enclave == "/a"
 
 
 def lists_of(root: Path) -> list[tuple[str, set[int]]]:
