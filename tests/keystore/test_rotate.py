@@ -463,8 +463,7 @@ def test_a_revoked_certificate_of_a_ca_that_is_gone_is_not_of_a_trusted_one(
     rotate_ca(separate, finish=True, now=NOW)
     assert not [e for e in revoked_issues(OpenedKeystore(separate)) if e.serial]
     revoke(separate, ["/a"], now=NOW)
-    (certificate,) = (e for e in revoked_issues(OpenedKeystore(separate)) if e.serial)
-    assert certificate.enclave == "/a"
+    assert {e.enclave for e in revoked_issues(OpenedKeystore(separate)) if e.serial} == {"/a"}
 
 
 def lists_of(root: Path) -> list[tuple[str, set[int]]]:
