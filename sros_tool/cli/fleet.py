@@ -773,7 +773,8 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         if waiting := sum(
             robot.has_list and robot.crl_in_force is False for robot in status.robots
         ):
-            text += f"; {waiting} more have it, but may run processes that started before it"
+            have = "have" if waiting > 1 else "has"
+            text += f"; {waiting} more {have} it, but may run processes that started before it"
         if (until := status.revoked_until) and until > compared_fleet.at:
             text += f"; robots need it until {until:%Y-%m-%d}, when "
             text += "the revoked certificates have expired"
@@ -1151,7 +1152,10 @@ def _details(robot: RobotStatus) -> Iterator[str]:
     for file in pending[:_MOST_LINES]:
         issued = f" of {file.since}" if file.since else ""
         owner_clause = f" of {file.robot or file.enclave}" if file.enclave else ""
-        yield f"  {file.action} {file.path}: {file.state}{issued}{owner_clause}"
+        # Of a keystore from a backup, the robots may have the list that it lost.
+        is_lost = file.surplus and file.kind == "crl" and file.state == "unknown"
+        action = "find out who signed" if is_lost else file.action
+        yield f"  {action} {file.path}: {file.state}{issued}{owner_clause}"
     if (more := len(pending) - _MOST_LINES) > 0:
         yield f"  and {more} more, see --json"
 

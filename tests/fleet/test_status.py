@@ -318,6 +318,11 @@ def test_files_that_the_keystore_never_issued(field: Field) -> None:
     assert field.pending("r1") == {"permissions": ("unknown", "deliver")}
     (field.root / ENCLAVES / "r2/base/permissions.p7s").unlink()
     assert field.pending("r2") == {"permissions": ("broken", "deliver")}
+    crl = f"{ENCLAVES}/r1/base/crl.pem"
+    (field.folder / "r1" / crl).write_text("of a keystore that was lost")
+    field.confirm("r1")
+    shown = field.run("fleet", "status", "ks", "--robot", "r1", status=1).out
+    assert f"  find out who signed {crl}: unknown\n" in shown, "nobody is told to remove it"
 
 
 def test_a_robot_that_was_revoked(field: Field) -> None:
