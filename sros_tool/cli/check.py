@@ -349,20 +349,17 @@ def check(
     if namespaces and not requirements:
         raise UsageError("--namespace is for --requirements", "", "Leave it out.")
     decide = _requirements(family, paths, requirements, earlier, namespaces)
-    from sros_tool.checks.policies import is_mended_by
-    from sros_tool.keystore.template import load_template
-
-    assumed = load_template(template) if template else None
     with progress("checking"):
-        findings_of_paths = [*_findings(family, paths, at), *_stated_differences(paths, at)]
+        findings = [*_findings(family, paths, at), *_stated_differences(paths, at)]
         if decide:
-            findings_of_paths += decide(lambda paths: _system(paths, at, template))
-        findings = [
-            _with_relative_paths(finding)
-            for finding in findings_of_paths
-            if not is_mended_by(assumed, finding)
-        ]
-    chosen = selection.choose(findings)
+            findings += decide(lambda paths: _system(paths, at, template))
+    if template:
+        from sros_tool.checks.policies import is_mended_by  # most checks read no policy
+        from sros_tool.keystore.template import load_template
+
+        assumed = load_template(template)
+        findings = [finding for finding in findings if not is_mended_by(assumed, finding)]
+    chosen = selection.choose(map(_with_relative_paths, findings))
     if form == "text":
         _print_text(chosen, _fleet_of(at, paths))
     elif form == "markdown":

@@ -662,6 +662,8 @@ def local_zone(environment: Mapping[str, str]) -> tzinfo:
     if not name and _LOCALTIME.exists():
         _, marker, name = str(_LOCALTIME.resolve()).partition("zoneinfo/")
         name = name if marker else ""
+    if name in ("UTC", "Etc/UTC"):  # most robots, which need no time zones
+        return UTC
     if name:
         from zoneinfo import ZoneInfo
 
