@@ -193,7 +193,7 @@ class _Round:
         self._state = replace(before, boot=boot)
         if self._machine.restarted or has_started:
             # After a start of the machine no process has files of before; what is seen counts.
-            self._state = replace(self._state, due=(), list_due=())
+            self._state = replace(self._state, due=(), list_due=(), restarted=())
         # Before files are replaced: processes may have started with those that are here now.
         self._note_due((), self._enclaves())
         if self._machine.restarted:
@@ -228,7 +228,10 @@ class _Round:
         list_due = enclaves_to_restart(
             self._state.list_due, processes.list_states, complete=processes.complete
         )
-        self._state = replace(self._state, due=due, unseen=unseen, list_due=list_due)
+        again = tuple(name for name in self._state.restarted if name in due)
+        self._state = replace(
+            self._state, due=due, unseen=unseen, list_due=list_due, restarted=again
+        )
         asked = self._renewals(names)
         arrived = self._confirm(names, opened, processes, clock, asked)
         problems = tuple(dict.fromkeys(self._problems))
@@ -478,6 +481,7 @@ class _Round:
     def _note_due(self, changed: Iterable[str], names: Iterable[str]) -> None:
         """Note the restarts that are due: also for files that somebody else changed."""
         before, files = self._state.files, self._digests(names)
+        new_files = {*changed}
         due = {*self._state.due, *changed} & files.keys()
         list_due = {*self._state.list_due} & files.keys()
         list_since = dict(self._state.list_since)
@@ -487,12 +491,14 @@ class _Round:
             if before_trust != trust:
                 list_since[name] = self._time()
             if before_all != all_files:
+                new_files.add(name)
                 due.add(name)
                 if before_trust != trust:
                     list_due.add(name)
         self._state = replace(
             self._state,
             due=tuple(sorted(due)),
+            restarted=tuple(name for name in self._state.restarted if name not in new_files),
             list_due=tuple(sorted(list_due)),
             list_since={name: list_since[name] for name in files if name in list_since},
             files=files,
@@ -532,7 +538,7 @@ class _Round:
     def _restart(
         self, names: Iterable[str], opened_enclaves: Mapping[str, InstalledEnclave]
     ) -> Sequence[str]:
-        """Restart the units of enclaves whose restart is due.
+        """Restart the units of enclaves whose restart is due, once after each change of files.
 
         Return the enclaves whose units restarted and whose processes can be seen: other units run
         no nodes, or run as users whose processes this user cannot look at.
@@ -545,9 +551,14 @@ class _Round:
         routers = [
             name for name in names if (enclave_path(self._folder, name) / ROUTER_FILE).exists()
         ]
+        states, due = processes.restartable, self._state.due
         done = restart_units(
             settings,
-            enclaves_to_restart(self._state.due, processes.states, complete=processes.complete),
+            [
+                name
+                for name in enclaves_to_restart(due, states, complete=processes.complete)
+                if name not in self._state.restarted
+            ],
             routers=routers,
             unusable={
                 name: enclave.problem
@@ -557,9 +568,9 @@ class _Round:
             systemd=machine.systemd or Systemd(settings.systemctl),
         )
         self._problems += done.problems
-        return [
-            name for name in done.enclaves if processes.states[name] is not RunningFiles.NOT_SEEN
-        ]
+        restarted = tuple(sorted({*self._state.restarted, *done.enclaves}))
+        self._state = replace(self._state, restarted=restarted)
+        return [name for name in done.enclaves if states[name] is not RunningFiles.NOT_SEEN]
 
     def _look_after(self, restarted: Sequence[str], names: Iterable[str]) -> EnclaveProcesses:
         """Examine the processes until the processes of restarted units have loaded new files."""

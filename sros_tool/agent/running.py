@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import subprocess
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, tzinfo
 from pathlib import Path
@@ -28,6 +28,7 @@ from sros_tool.keystore.confirmation import (
     RunningFiles,
     Seen,
 )
+from sros_tool.keystore.layout import KEY_FILE
 from sros_tool.runtime.processes import (
     Process,
     ProcessEnclave,
@@ -51,7 +52,13 @@ class EnclaveProcesses(NamedTuple):
     """The processes in the enclaves of a security folder."""
 
     states: Mapping[str, RunningFiles]
-    """By enclave, whether its processes that run from the folder have loaded the current files."""
+    """By enclave, whether its processes that run from the folder have loaded the current files.
+
+    A process of a user who cannot read the key may only claim to run in the enclave: it is never
+    ``current``.
+    """
+    restartable: Mapping[str, RunningFiles]
+    """Like `states`, without such processes: nobody who can only claim it restarts a unit."""
     list_states: Mapping[str, RunningFiles]
     """Like `states`, but only for the revocation list and the CAs: ``current`` also if only the
     enclave's own certificate, permissions or governance are newer than a process."""
@@ -83,16 +90,18 @@ def look_at_processes(
     """Return what runs in the enclaves ``names`` of ``folder``; ``look`` reads the processes."""
     running = (look or ProcessTable().look)(now)
     own_processes = [process for process in running.processes if _is_of(process, folder)]
-    by_enclave: dict[str, list[Process]] = {}
+    readers, owner = list[Process](), folder.stat().st_uid
     for process in own_processes:
-        by_enclave.setdefault(_enclave_of(process), []).append(process)
-    states = {name: _state(by_enclave.get(name, ()), _is_outdated) for name in names}
+        if process.user in (0, owner) or (process.enclave and _is_key_readable(process.enclave)):
+            readers.append(process)
 
     def lacks_list(process: Process, enclave: ProcessEnclave) -> bool:
         since = list_since.get(_enclave_of(process))
         return may_lack_list(process, enclave, has_list=bool(since and since < process.started))
 
-    list_states = {name: _state(by_enclave.get(name, ()), lacks_list) for name in states}
+    names = [*names]
+    states = _states(names, own_processes, _is_outdated, readers)
+    list_states = _states(names, own_processes, lacks_list, readers)
     other_processes = [
         process
         for process in running.processes
@@ -121,6 +130,7 @@ def look_at_processes(
     )
     return EnclaveProcesses(
         states,
+        _states(names, readers, _is_outdated, readers),
         list_states,
         tuple(sorted({*map(_enclave_of, elsewhere)})),
         complete,
@@ -153,17 +163,27 @@ def _is_outdated(process: Process, enclave: ProcessEnclave) -> bool:
     return any(newer_files(process, enclave))
 
 
-def _state(
-    processes: Iterable[Process], is_outdated: Callable[[Process, ProcessEnclave], bool]
-) -> RunningFiles:
-    is_any_current = False
+def _is_key_readable(enclave: ProcessEnclave) -> bool:
+    return bool(enclave.file(KEY_FILE).mode & 0o077)
+
+
+def _states(
+    names: Iterable[str],
+    processes: Iterable[Process],
+    is_outdated: Callable[[Process, ProcessEnclave], bool],
+    readers: Collection[Process],
+) -> dict[str, RunningFiles]:
+    """Map enclaves to what their processes have loaded; only ``readers`` of the key are current."""
+    states = dict.fromkeys(names, RunningFiles.NOT_SEEN)
     for process in processes:
-        if process.enclave is None or process.enclave.problem:
+        name, enclave = _enclave_of(process), process.enclave
+        if name not in states or enclave is None or enclave.problem:
             continue
-        if is_outdated(process, process.enclave):
-            return RunningFiles.EARLIER
-        is_any_current = True
-    return RunningFiles.CURRENT if is_any_current else RunningFiles.NOT_SEEN
+        if is_outdated(process, enclave):
+            states[name] = RunningFiles.EARLIER
+        elif process in readers and states[name] is RunningFiles.NOT_SEEN:
+            states[name] = RunningFiles.CURRENT
+    return states
 
 
 def enclaves_to_restart(

@@ -43,15 +43,15 @@ class AgentState:
     the number of the last message.  ``latest`` is the latest moment that has certainly passed:
     verified documents begin to be valid then.  ``due`` are the enclaves whose processes were not
     yet seen with the installed files, since the start ``boot`` of the machine (see `boot_id`); of
-    those in ``unseen``, no process was seen.  ``list_due`` are the enclaves whose processes may
-    lack the revocation list.  ``files`` maps enclaves to two digests at the end of the last
-    round, as text: of all files, and of the files that decide whom the enclave trusts.  A change of
-    a digest, whoever wrote the files, makes a restart due; ``list_since`` maps enclaves to the time
-    since when the second digest is the same.  ``fetched`` and
-    ``sent`` are when the source and the inbox were last reached.  ``repaired`` is a sentence on
-    files that were not those of the release and were replaced, at ``repaired_at``.  ``exposed``
-    maps paths of private keys that others could read, until the agent closed them, to the time of
-    that round.
+    those in ``unseen``, no process was seen.  ``restarted`` are those whose units were restarted
+    since.  ``list_due`` are the enclaves whose processes may lack the revocation list.  ``files``
+    maps enclaves to two digests at the end of the last round, as text: of all files, and of the
+    files that decide whom the enclave trusts.  A change of a digest, whoever wrote the files, makes
+    a restart due; ``list_since`` maps enclaves to the time since when the second digest is the
+    same.  ``fetched`` and ``sent`` are when the source and the inbox were last reached.
+    ``repaired`` is a sentence on files that were not those of the release and were replaced, at
+    ``repaired_at``.  ``exposed`` maps paths of private keys that others could read, until the agent
+    closed them, to the time of that round.
     """
 
     release: int = 0
@@ -60,6 +60,7 @@ class AgentState:
     latest: datetime | None = None
     due: tuple[str, ...] = ()
     unseen: tuple[str, ...] = ()
+    restarted: tuple[str, ...] = ()
     list_due: tuple[str, ...] = ()
     boot: str = ""
     fetched: datetime | None = None
@@ -110,8 +111,8 @@ def _state_from(value: Any) -> AgentState:
             value[moment] = parse_iso(_text(value[moment]))
     value["boot"] = _text(value["boot"])
     value["repaired"] = _text(value.get("repaired", ""))
-    value.setdefault("list_due", value["due"])
-    for names in ("due", "unseen", "list_due"):
+    value = {"list_due": value["due"], "restarted": [], **value}
+    for names in ("due", "unseen", "restarted", "list_due"):
         value[names] = tuple(check_enclave_name(_text(name)) for name in value[names])
     value["files"] = {
         check_enclave_name(_text(name)): _text(text)

@@ -68,6 +68,8 @@ class Robot:
     unseen: bool = False
     clock: RobotClock = RobotClock.SYNCHRONIZED
     boot: str = "first"
+    user: int = 0
+    """The user of the processes."""
     restarted: bool = False
     settings: AgentSettings = field(init=False)
     patience: float = 0.0
@@ -142,7 +144,8 @@ class Robot:
             "ROS_SECURITY_STRATEGY": "Enforce",
         }
         enclave = ProcessEnclave(str(self.folder), name, files, is_there=True, here=self.folder)
-        return Process(1, ("node",), environment, self.started[name], enclave=enclave)
+        started, user = self.started[name], self.user
+        return Process(1, ("node",), environment, started, user=user, enclave=enclave)
 
     def message(self) -> Confirmation:
         """Return the last message, whose signature is verified."""
@@ -674,6 +677,42 @@ def test_units_restart_in_their_order(home: Home, r1: Robot) -> None:
     assert any("bad.service" in problem for problem in done.problems)
     r1.round()
     assert r1.systemctl == ["a.service", "sros@r1-b.service"], "what is done is not done again"
+
+
+def test_a_unit_restarts_once_for_each_change_of_its_files(home: Home, r1: Robot) -> None:
+    """Also if its processes cannot be seen, or another one in the enclave goes on to run."""
+    r1.settings = replace(r1.settings, restart=True, units=(Unit("c.service", ("/r1/c",)),))
+    r1.unseen = r1.restarted = True
+    r1.started = {"/r1/a": moment() - timedelta(hours=1)}
+    r1.round()
+    r1.restarted, r1.systemctl = False, []
+    r1.release = home.revoked
+    for _ in range(2):
+        assert r1.round().restart == ("/r1/a", "/r1/c")
+        assert r1.systemctl == ["c.service", "sros@r1-b.service"]
+    r1.started["/r1/c"] = moment() - timedelta(hours=1)
+    r1.round()
+    assert r1.systemctl == ["c.service", "sros@r1-b.service"]
+    (r1.folder / "enclaves/r1/c/permissions.p7s").write_text("x")
+    r1.round()
+    assert r1.systemctl[2:] == ["c.service"]
+
+
+def test_a_process_that_cannot_read_the_key_restarts_nothing_and_ends_no_restart(
+    home: Home, r1: Robot
+) -> None:
+    """Any user can start a program that names the folder and an enclave."""
+    r1.settings = replace(r1.settings, restart=True, units=(Unit("a.service", ("/r1/a",)),))
+    r1.round()
+    r1.systemctl, r1.user = [], r1.folder.stat().st_uid + 1
+    r1.started = {"/r1/a": moment() - timedelta(hours=1)}
+    assert r1.round().restart == ("/r1/a",) and not r1.systemctl
+    r1.unseen, r1.release = True, home.revoked
+    r1.started = {"/r1/a": moment() + timedelta(hours=1)}
+    r1.settings = replace(r1.settings, restart=False)
+    assert "/r1/a" in r1.round().restart
+    r1.user = 0
+    assert "/r1/a" not in r1.round().restart
 
 
 @pytest.mark.parametrize("patience", [0.0, 60.0])
