@@ -10,10 +10,9 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import quote
 
 from sros_tool.checks.kind import ChosenFindings, Finding, FindingKind, Severity, group_by_cause
@@ -287,8 +286,7 @@ def _relative(file: str, base: Path) -> str:
 _KINDS = "certificate, permissions, governance, crl, identity_ca or permissions_ca"
 
 
-@dataclass(frozen=True, slots=True)
-class Expiry:
+class Expiry(NamedTuple):
     """The moment when a file expires; ``enclave`` is "" for a file that all enclaves share."""
 
     kind: str

@@ -287,32 +287,12 @@ def _lines(fleet: Fleet) -> Iterator[str]:
         yield f"[groups.{group}]"
     yield "[robots]"
     for robot in fleet.robots.values():
-        values: dict[str, object] = {
-            "groups": list(robot.groups),
-            "namespace": robot.namespace,
-            "domain": robot.domain,
-            "address": robot.address,
-            "user": robot.user,
-            "router": robot.router,
-            "crossing": list(robot.crossing),
-            "distribution": robot.distribution,
-            "renewal": robot.renewal,
-            "renewal_grace": robot.renewal_grace,
-        }
-        usual: dict[str, object] = {
-            "groups": [],
-            "namespace": f"/{robot.name}",
-            "domain": None,
-            "address": robot.name,
-            "user": "",
-            "router": "",
-            "crossing": [],
-            "distribution": "",
-            "renewal": "",
-            "renewal_grace": "",
-        }
+        settings = robot._asdict()
+        usual = Robot(robot.name, f"/{robot.name}", address=robot.name)._asdict()
         shown = [
-            f"{key} = {json.dumps(value)}" for key, value in values.items() if value != usual[key]
+            f"{key} = {json.dumps(settings[key])}"
+            for key in ("groups", *_VARIABLES)
+            if settings[key] != usual[key]
         ]
         yield f"{robot.name} = {{ {', '.join(shown)} }}" if shown else f"{robot.name} = {{}}"
 
@@ -615,18 +595,12 @@ def script_inventory(fleet: Fleet) -> dict[str, Any]:
 
 
 def _variables(robot: Robot) -> dict[str, Any]:
-    values = {
-        "namespace": robot.namespace,
-        "domain": robot.domain,
-        "address": robot.address,
-        "user": robot.user,
-        "router": robot.router,
-        "crossing": list(robot.crossing),
-        "distribution": robot.distribution,
-        "renewal": robot.renewal,
-        "renewal_grace": robot.renewal_grace,
+    settings = {**robot._asdict(), "crossing": list(robot.crossing)}
+    shown = {
+        variable: settings[key]
+        for key, variable in _VARIABLES.items()
+        if settings[key] not in (None, "", [])
     }
-    shown = {_VARIABLES[key]: value for key, value in values.items() if value not in (None, "", [])}
     return {_ROBOT: robot.name, **shown}
 
 

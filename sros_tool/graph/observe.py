@@ -28,7 +28,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import TracebackType
 from typing import Any, NamedTuple, Protocol, Self
 
 from sros_tool.errors import UnavailableError
@@ -117,12 +116,7 @@ class RosGraph:
         self.rmw = answer["ready"]
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self.close()
 
     def next(self, seconds: float) -> Observation | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 from shlex import quote
@@ -25,8 +24,7 @@ from sros_tool.validity import SOON, Window, duration_text, iso, parse_duration,
 from sros_tool.wording import counted, first_few
 
 
-@dataclass(frozen=True, slots=True)
-class Threshold:
+class Threshold(NamedTuple):
     """The limit from which an enclave is due for renewal.
 
     Exactly one field is set: ``remaining``, the time until expiry, or ``elapsed``, the fraction of
@@ -57,8 +55,7 @@ def clock_notes(keystore: OpenedKeystore, now: datetime) -> Iterator[Note]:
             yield Note("keystore.clock", text)
 
 
-@dataclass(frozen=True, slots=True)
-class Lifetime:
+class Lifetime(NamedTuple):
     """The validity of an enclave's certificate and of its permissions."""
 
     name: str
@@ -82,8 +79,7 @@ class Lifetime:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Credentials:
+class Credentials(NamedTuple):
     """The certificate of an enclave and the grant that DDS reads, both not verified yet.
 
     ``signed`` is the permissions document with the grant, ``digest`` the SHA-256 of
@@ -102,8 +98,7 @@ class Credentials:
         return Lifetime(self.name, validity_of(self.certificate), self.grant.validity, self.came)
 
 
-@dataclass(frozen=True, slots=True)
-class UnreadableEnclave:
+class UnreadableEnclave(NamedTuple):
     """An enclave whose certificate or permissions cannot be read, and why."""
 
     name: str

@@ -124,7 +124,7 @@ class _Raising:
         numbers = set(deciding.values())
         number = numbers.pop()
         if number is not None and not numbers and self._is_for_topics(number, topics):
-            self._named[number] = replace(self._named[number], protection=needed)
+            self._named[number] = self._named[number]._replace(protection=needed)
         else:
             self._added.append(NamedProtection(protection.kind, protection.name, needed))
 
@@ -148,7 +148,7 @@ class _Raising:
                 wide.append(name)
             elif covers(topic, name):
                 value = self._raised_protection(self._value(number), protection.level)
-                self._named[number] = replace(self._named[number], protection=value)
+                self._named[number] = self._named[number]._replace(protection=value)
             elif self._raised_protection(self._value(number), protection.level) != self._value(
                 number
             ):

@@ -10,7 +10,7 @@ import hashlib
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
@@ -57,8 +57,7 @@ def _recorded_settings(ledger: Ledger) -> Template | None:
     return None
 
 
-@dataclass(frozen=True, slots=True)
-class HandEdits:
+class HandEdits(NamedTuple):
     """Manual edits of settings and governance files that sros has not applied yet.
 
     ``settings`` are clauses on keys of ``sros.toml``; ``governance`` is a clause on
@@ -158,7 +157,7 @@ def present_settings(keystore: OpenedKeystore) -> PresentSettings:
         settings = replace(settings, protection=protection)
     edits = hand_edits(keystore, ledger, written, governance)
     if unreadable:
-        edits = replace(edits, settings=(unreadable,))
+        edits = edits._replace(settings=(unreadable,))
     return PresentSettings(settings, written, governance, edits, without_settings, recorded)
 
 

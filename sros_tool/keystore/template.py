@@ -44,8 +44,7 @@ _KINDS: dict[str, str] = {"topic": "topics", "service": "services", "action": "a
 _TYPES: dict[type, str] = {str: "a string", bool: "a boolean", list: "a list"}
 
 
-@dataclass(frozen=True, slots=True)
-class ShortLived:
+class ShortLived(NamedTuple):
     """The validity of the enclaves whose names match ``name``, which may have wildcards."""
 
     name: str

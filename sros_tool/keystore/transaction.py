@@ -41,7 +41,6 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple, Self, TypeVar, overload
 
 from sros_tool.errors import KeystoreError, SrosError
@@ -497,12 +496,7 @@ class Transaction:
                 "Choose another folder, or run sros as that user.",
             )
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self._end()
         for undo in self._undo:
             undo()

@@ -276,8 +276,7 @@ class TopicProtection:
     liveliness: bool = True
 
 
-@dataclass(frozen=True, slots=True)
-class NamedProtection:
+class NamedProtection(NamedTuple):
     """The protection of topics, services or actions (``kind``) whose names match an expression."""
 
     kind: str

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 from sros_tool.names import (
@@ -244,8 +243,7 @@ _NO_NAMES = Names(())
 _Place = tuple[str, Qualifier, str]
 
 
-@dataclass(frozen=True, slots=True)
-class RightsDifference:
+class RightsDifference(NamedTuple):
     """The rights that only one side has, in normal form and sorted.
 
     ``covered`` maps some of these rights to the wildcards of the other side that cover them, unless

@@ -229,17 +229,17 @@ def test_the_life_of_a_certificate_of_another_ca_begins_when_it_came(tmp_path: P
     root = made(tmp_path / "ks", "/a")
     file, hour = root / "enclaves/a/cert.pem", timedelta(hours=1)
     (life,), _ = survey(OpenedKeystore(root))
-    short = replace(life, certificate=Window(NOW, NOW + 30 * hour))
+    short = life._replace(certificate=Window(NOW, NOW + 30 * hour))
     assert not short.due(parse_threshold("66%"), NOW + 20 * hour)
     os.utime(file, (NOW.timestamp(), NOW.timestamp()))
     (life,), _ = survey(OpenedKeystore(root))
-    short = replace(life, certificate=short.certificate)
+    short = life._replace(certificate=short.certificate)
     assert not short.due(parse_threshold("66%"), NOW + 19 * hour)
     assert short.due(parse_threshold("66%"), NOW + 20 * hour)
     for strange in (-1e12, 1e12):
         os.utime(file, (strange, strange))
         (life,), _ = survey(OpenedKeystore(root))
-        assert not replace(life, certificate=short.certificate).due(
+        assert not life._replace(certificate=short.certificate).due(
             parse_threshold("66%"), NOW + 20 * hour
         )
 

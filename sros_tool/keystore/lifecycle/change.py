@@ -17,7 +17,6 @@ from datetime import datetime, timedelta
 from functools import cached_property
 from pathlib import Path
 from shlex import quote
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from cryptography import x509
@@ -188,13 +187,8 @@ class KeystoreChange:
         self.keystore = OpenedKeystore(self.root, locked=not self.dry_run)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.transaction.__exit__(kind, error, trace)
+    def __exit__(self, *error: object) -> None:
+        self.transaction.__exit__(*error)
 
     # ── what is there, and what is to be ───────────────────────────────────────────────────
 
