@@ -118,9 +118,8 @@ def _not_open(running: RunningRobot, started: Sequence[ClosedProcess]) -> Iterat
     """Yield the processes of restarted units that run neither open nor in their enclaves."""
     secured = {enclave.name for _, enclave in running.secured_everywhere}
     since = running.robot.shell.now() - _STEADY
-    steady = [process for process in running.open_processes if process.started <= since]
     for process in started:
-        if process.enclave not in secured and not any(map(process.fits, steady)):
+        if process.enclave not in secured and not running.runs_open(process, since):
             yield (
                 f"{process.enclave} does not run open, though {process.unit} was restarted: "
                 f"systemctl status {process.unit}"

@@ -90,9 +90,17 @@ class RunningRobot:
         """The processes in the robot's domain that run without security."""
         return [process for process in self.in_domain if not process.asks_for_security]
 
-    def runs_open(self, process: ClosedProcess) -> bool:
-        """Return whether a process like an observed one runs without security."""
-        return any(process.fits(other) for other in self.open_processes)
+    def runs_open(self, process: ClosedProcess, since: datetime | None = None) -> bool:
+        """Return whether a process like an observed one runs without security, perhaps ``since``.
+
+        That of a unit has to be of this unit: any user can start one with the same command.
+        """
+        return any(
+            process.fits(other)
+            and not (since and other.started > since)
+            and process.unit in ("", process_origin(other.program[0]).unit)
+            for other in self.open_processes
+        )
 
     def is_open(self, process: ClosedProcess) -> bool:
         """Return whether an observed process runs open, and no process runs in its enclave."""

@@ -378,10 +378,11 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     robot.close("--undo")
     assert len(robot.restarts) == 4, "they run open already"
     robot.absent = {"/talker"}
+    robot.more = (replace(robot.process("/talker", is_secured=False), pid=12, user=12),)
     ended = "/talker does not run open, though talker.service was restarted: systemctl status talk"
     assert ended in robot.close("--undo", status=1).out
     assert robot.restarts[4:] == ["daemon-reload", "restart talker.service"]
-    robot.absent = set()
+    robot.absent, robot.more = set(), ()
     (robot.folder / "systemctl.log").write_text("before\n" * 4)
     robot.by_hand = {"/talker"}
     still = "process 4711 (run) still runs in /talker: stop it if talker.service did not start it"
