@@ -62,9 +62,11 @@ def run_action(
     shutil.rmtree(clone.with_name(f"{clone.name}.temp"), ignore_errors=True)
     job = action_job(origin, clone, event_base=event_base, **inputs)
     ended = job.run()
-    begin, *_, end = ended.stdout.splitlines()
+    begin, *lines = ended.stdout.splitlines()
     mark = begin.removeprefix("::stop-commands::")
-    assert mark == end.strip(":") and len(mark) >= 32
+    annotations = lines[lines.index(f"::{mark}::") + 1 :]
+    assert len(mark) >= 32
+    assert all(re.match(r"::(error|warning|notice) file=[^:]+::", line) for line in annotations)
     assert mark not in MARKS_OF_JOBS, "a pull request could print it"
     MARKS_OF_JOBS.append(mark)
     outputs = dict(
@@ -76,6 +78,8 @@ def run_action(
     written = Path(outputs["summary"])
     assert summary == (written.read_text() if written.exists() else "")
     assert len(summary) < 65_536
+    if ended.returncode and written.exists():
+        assert "::error " in "".join(annotations), annotations
     assert not origin.git("status", "--porcelain", cwd=clone)
     return ended.returncode, summary + ended.stderr, outputs
 
@@ -286,14 +290,15 @@ def test_both_code_hosts_run_the_same_command() -> None:
     """Each option of the verb is an input of both, but those that the runner decides."""
     _, review = action()["runs"]["steps"]
     (script,) = gitlab()[1]["script"]
-    commands = [
+    of_github, of_gitlab = (
         sorted(re.findall(r"--[a-z-]+", text.partition("sros_tool review")[2].partition("||")[0]))
         for text in (review["run"], script)
-    ]
-    assert commands[0] == commands[1]
+    )
+    of_github.remove("--annotations")  # GitLab has none
+    assert of_github == of_gitlab
     own = {"--repository", "--fetch", "--summary", "--sarif"}
     inputs = {f"--{name}" for name in action()["inputs"]} - {"--checkout"}
-    assert set(commands[0]) == inputs | own
+    assert set(of_github) == inputs | own
     assert inputs == {f"--{name}" for name in gitlab()[0]} - {"--source", "--stage"}
 
 

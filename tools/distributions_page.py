@@ -38,7 +38,9 @@ def distributions_page() -> str:
         written[0].rstrip(),
         MADE,
         shipped,
-        "The versions are the latest as of November 2026; sros assumes that patches of a release "
+        "A version of rmw_zenoh between those of two distributions is of Rolling, and counts for "
+        "the next one: Lyrical has 0.10, and 0.7 to 0.9 came before it. The versions of DDS are "
+        "the latest as of November 2026; sros assumes that patches of a release "
         "decide alike. For a release that is *not tested*, sros uses the rules of another "
         "release, and does not see how the two releases differ.",
         "Rules that are not the same in all tested releases:",

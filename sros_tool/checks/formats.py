@@ -1,4 +1,4 @@
-"""Findings for other programs: SARIF 2.1.0 (OASIS), Markdown, and metrics for Prometheus.
+"""Findings for other programs: SARIF 2.1.0 (OASIS), Markdown, annotations, metrics for Prometheus.
 
 The metrics of a keystore also have the expiry of its files.
 """
@@ -250,6 +250,30 @@ def _result(finding: Finding, rule: int, base: Path) -> dict[str, Any]:
             {"kind": "external", "status": "accepted", "justification": finding.accepted}
         ]
     return result
+
+
+_ANNOTATIONS = {"error": "error", "warning": "warning", "note": "notice"}
+
+
+def github_annotations(findings: Iterable[Finding]) -> str:
+    """Return workflow commands of GitHub Actions, which show each finding at its line.
+
+    The worst come first, because GitHub shows ten of each severity.  No text of a finding begins a
+    line or a property (GitHub, actions/toolkit, command.ts).
+    """
+
+    lines = []
+    for finding in sorted(findings, key=lambda finding: -finding.severity.weight):
+        kind = _ANNOTATIONS[finding.severity.word]
+        place = f"file={_escaped(finding.file, ':,')},line={finding.line or 1}"
+        message = _escaped(f"{finding.subject}: {finding.text}. {finding.remedy}")
+        lines.append(f"::{kind} {place},title={finding.id}::{message}\n")
+    return "".join(lines)
+
+
+def _escaped(text: str, characters: str = "") -> str:
+    """Return the text with line ends, "%" and ``characters`` as a workflow command has them."""
+    return "".join(f"%{ord(one):02X}" if one in f"%\r\n{characters}" else one for one in text)
 
 
 def _location(file: str, line: int | None, base: Path) -> dict[str, Any]:

@@ -163,7 +163,7 @@ class Finding(NamedTuple):
     """Line in the file, from 1, or null."""
     own_remedy: str = ""
     accepted: str = ""
-    """The template or setting that accepts the finding, or null."""
+    """The template, setting or option that accepts the finding, or null."""
     related: tuple[RelatedPlace, ...] = ()
     """Other places that the finding is about, in the order to read them."""
     cause: Cause | None = None
@@ -231,7 +231,7 @@ _MODULES = (
     *("policies", "requirements", "keystores.files", "keystores.authorities"),
     *("keystores.enclaves", "keystores.vendors", "keystores.documents", "keystores.topic_names"),
     *("keystores.issued", "keystores.trust", "keystores.zenoh_files", "zenoh", "upgrade"),
-    *("environment", "runtime", "processes", "vulnerabilities"),
+    *("environment", "runtime", "processes", "vulnerabilities", "review"),
 )
 """The modules of checks, in the order in which their kinds are listed."""
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.issuing.size import MinimizedEnclave
     from sros_tool.keystore.rights import RightsSource, SourcesDifference
     from sros_tool.policy.merge import Merged
-    from sros_tool.policy.model import StatedProtection
+    from sros_tool.policy.model import Source, StatedProtection
     from sros_tool.policy.rights import RightsDifference
     from sros_tool.proof.growth import DroppedDenial, Gain, Growth, NewNode, NewReach
     from sros_tool.proof.sources import AccessSource
@@ -827,6 +827,41 @@ def _show_new_access(
     return int(bool(growth))
 
 
+class PlacedChange(NamedTuple):
+    """A change for which a review fails: its enclave or setting, a clause, its place in HEAD."""
+
+    subject: str
+    text: str
+    place: Source | None
+    is_denial: bool = False
+    """Whether it is a DENY that is gone, and no access."""
+
+
+def placed_changes(
+    base: AccessSource, head: AccessSource, growth: Growth, dropped: Iterable[DroppedDenial]
+) -> Iterator[PlacedChange]:
+    """Yield the added access of a change and its dropped denials, each with its place in HEAD."""
+    from sros_tool.proof.growth import renamed_between
+
+    def place_of(enclave: str) -> Source | None:
+        stated = head.enclaves.get(enclave)
+        return next((profile.source for profile in stated.all_profiles()), None) if stated else None
+
+    renamed = renamed_between(base, head)
+    for old, new in sorted(renamed.items()):
+        yield PlacedChange(new, _renamed_text(old, new), place_of(new))
+    for gain in growth.without_renames(renamed).added:
+        enclave, text = gain.enclaves[0], _gain_text("+", gain, growth)
+        yield PlacedChange(enclave, text.removeprefix(f"{enclave} "), gain.source)
+    for node in growth.new_nodes:
+        yield PlacedChange(node.enclave, _new_node_text(node), node.place)
+    for change in growth.lost:
+        yield PlacedChange(change.key, f"less protection: {change}", None)
+    for denial in dropped:
+        enclave = denial.denial.enclave
+        yield PlacedChange(enclave, _dropped_text(denial), place_of(enclave), is_denial=True)
+
+
 def added_lines(base: AccessSource, head: AccessSource, growth: Growth) -> list[str]:
     """Return the added access as lines that begin with "+", or "~" for a renamed enclave."""
     from sros_tool.proof.growth import renamed_between
@@ -834,7 +869,10 @@ def added_lines(base: AccessSource, head: AccessSource, growth: Growth) -> list[
     renamed = renamed_between(base, head)
     unrenamed = growth.without_renames(renamed)
     return [
-        *_renamed_lines(renamed, head.fleet),
+        *(
+            f"{line}; they count as new, so that a reviewer has to allow them"
+            for line in _renamed_lines(renamed, head.fleet)
+        ),
         *_folded_gains(head, "+", unrenamed.added, growth),
         *_new_node_lines(head, growth.new_nodes),
         *(f"+ less protection: {change}" for change in growth.lost),
@@ -846,24 +884,26 @@ def _new_node_lines(head: AccessSource, nodes: Iterable[NewNode]) -> Iterator[st
     """Yield a line for each node that gets more rights in another enclave; see `folded`."""
     from sros_tool.fleet.robots import folded
 
-    lines = []
-    for node, enclave, moved_from, rights, place in nodes:
-        where = f"moves from enclave {moved_from} to" if moved_from else "is new in enclave"
-        may = first_few([right.describe() for right in rights], _MOST_NEW_RIGHTS)
-        text = f"+ node {node} {where} {enclave}, and may {may} there  ({place})"
-        lines.append((enclave, text))
-    return folded(head.fleet, lines)
+    return folded(head.fleet, ((node.enclave, f"+ {_new_node_text(node)}") for node in nodes))
+
+
+def _new_node_text(new: NewNode) -> str:
+    node, enclave, moved_from, rights, place = new
+    where = f"moves from enclave {moved_from} to" if moved_from else "is new in enclave"
+    may = first_few([right.describe() for right in rights], _MOST_NEW_RIGHTS)
+    return f"node {node} {where} {enclave}, and may {may} there  ({place})"
 
 
 def _renamed_lines(renamed: Mapping[str, str], fleet: Fleet | None) -> Iterator[str]:
     """Yield a line for each enclave that has another name; lines of robots are merged."""
     from sros_tool.fleet.robots import folded
 
-    lines = (
-        (new, f"~ enclave {old} is now {new}, with the same rights")
-        for old, new in sorted(renamed.items())
-    )
+    lines = ((new, f"~ {_renamed_text(old, new)}") for old, new in sorted(renamed.items()))
     return folded(fleet, lines)
+
+
+def _renamed_text(old: str, new: str) -> str:
+    return f"enclave {old} is now {new}, with the same rights"
 
 
 def _removed_lines(base: AccessSource, head: AccessSource, growth: Growth) -> list[str]:
@@ -934,17 +974,21 @@ def dropped_lines(head: AccessSource, dropped: Iterable[DroppedDenial]) -> list[
     """Return a line for each DENY that is dropped or narrowed; lines of robots are merged."""
     from sros_tool.fleet.robots import folded
 
-    lines = []
-    for right, name, moved_from in dropped:
-        if moved_from:
-            text = f"has a node of {moved_from} without its DENY {right.describe()}"
-            text += f" for names such as {name}" if name else ""
-        else:
-            text = f"DENY {right.describe()} is gone"
-            text += f" for names such as {name}" if name else ""
-        text += f": other policies may allow {'them' if name else 'it'} now"
-        lines.append((right.enclave, f"! {right.enclave} {text}"))
+    lines = (
+        (denial.denial.enclave, f"! {denial.denial.enclave} {_dropped_text(denial)}")
+        for denial in dropped
+    )
     return list(folded(head.fleet, lines))
+
+
+def _dropped_text(dropped: DroppedDenial) -> str:
+    right, name, moved_from = dropped
+    if moved_from:
+        text = f"has a node of {moved_from} without its DENY {right.describe()}"
+    else:
+        text = f"DENY {right.describe()} is gone"
+    text += f" for names such as {name}" if name else ""
+    return f"{text}: other policies may allow {'them' if name else 'it'} now"
 
 
 def access_summary(growth: Growth, dropped: Collection[DroppedDenial]) -> str:
@@ -961,10 +1005,13 @@ def access_summary(growth: Growth, dropped: Collection[DroppedDenial]) -> str:
         )
         if clauses
     )
-    gone = f"; {_count(len(growth.removed), 'right')} gone" if growth.removed else ""
-    gone += f"; {counted(len(dropped), 'DENY', 'DENYs')} gone" if dropped else ""
+    rights_gone = f"; {_count(len(growth.removed), 'right')} gone" if growth.removed else ""
+    denials_gone = f"{counted(len(dropped), 'DENY is', 'DENYs are')} gone"
     if not growth:
-        return f"nobody gets more access, and nothing is protected less ({worlds}){gone}{basis}"
+        same = f"nobody gets more access, and nothing is protected less ({worlds})"
+        if dropped:
+            same = f"{denials_gone}, so that other policies may allow the names; by itself, {same}"
+        return f"{same}{rights_gone}{basis}"
     parts = []
     if growth.added:
         parts.append(f"{_count(len(growth.added), 'right')} new")
@@ -978,7 +1025,7 @@ def access_summary(growth: Growth, dropped: Collection[DroppedDenial]) -> str:
         parts.append((text if pairs == 1 else f"{pairs} pairs of enclaves can influence") + " now")
     if growth.added and growth.reach_unknown:
         parts.append(f"it is unknown whom enclaves can influence now: {growth.reach_unknown}")
-    return "; ".join(parts) + gone + basis
+    return "; ".join(parts) + rights_gone + (f"; {denials_gone}" if dropped else "") + basis
 
 
 def _count(number: int, noun: str) -> str:
@@ -993,14 +1040,16 @@ def access_markdown(
 
     shown_by = "which `sros diff_policy --no-new-access` shows"
     summary = access_summary(growth, dropped)
-    parts = [f"### New access: {plain('yes' if growth else 'none')}", plain(summary)]
+    verdict = "yes" if growth else "none, but a DENY is gone" if dropped else "none"
+    parts = [f"### New access: {plain(verdict)}", plain(summary)]
     added, removed = added_lines(base, head, growth), _removed_lines(base, head, growth)
     renamed = [line for line in added if line.startswith("~")]
+    gone = dropped_lines(head, dropped)
     for title, lines in (
         ("renamed", renamed),
         ("added", added[len(renamed) :]),
         ("removed", removed),
-        ("denials gone", dropped_lines(head, dropped)),
+        ("DENY gone" if len(gone) == 1 else "DENYs gone", gone),
     ):
         if lines:
             parts.append(f"**{len(lines)} {title}**")

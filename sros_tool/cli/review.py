@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -30,7 +31,13 @@ from sros_tool.wording import counted
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
     from sros_tool.proof.repository import Repository
-    from sros_tool.proof.review import Review, ReviewRequest, ReviewStep, RightsChange
+    from sros_tool.proof.review import (
+        AccessChange,
+        Review,
+        ReviewRequest,
+        ReviewStep,
+        RightsChange,
+    )
 
     _PathsType = click.ParamType[tuple[str, ...]]
 else:  # generic from click 8.2 on
@@ -42,6 +49,7 @@ _MOST_REASONS = 20
 """Maximum number of lines below a failed step."""
 _SIGNS = {0: "🟢", 1: "🔴", 2: "⚪"}
 _SIGN_ALLOWED = "🟡"
+_MARKS = {0: "ok", 1: "FAILED", 2: "UNDECIDED"}
 _TITLES = {
     "new-access": "New access",
     "requirements": "Requirements",
@@ -168,6 +176,13 @@ def _paths_option(name: str, help_text: str) -> Callable[[Decorated], Decorated]
     metavar="FILE",
     help="Write the findings as SARIF. FILE must be outside of the repository.",
 )
+@click.option(
+    "--annotations",
+    type=PATH,
+    metavar="FILE",
+    help="Write the findings as annotations of GitHub Actions, for `cat FILE` in a workflow. "
+    "FILE must be outside of the repository.",
+)
 @json_option
 def review(
     base: str,
@@ -185,6 +200,7 @@ def review(
     remote: str | None,
     summary: Path | None,
     sarif: Path | None,
+    annotations: Path | None,
     as_json: bool,
 ) -> int:
     r"""Review a change of policies, requirements and keystores, as in a pull request.
@@ -232,7 +248,7 @@ def review(
         raise UsageError("no policy and no keystore is named", "", "Add --policy or --keystore.")
     repository = Repository(folder.resolve())
     threshold = parse_threshold(renew_within)
-    outputs = _Outputs(repository, summary, sarif)
+    outputs = _Outputs(repository, (*policies, *keystores)[0], summary, sarif, annotations)
     outputs.write_unfinished()
     try:
         request = ReviewRequest(
@@ -277,7 +293,7 @@ def review(
                 result.head,
                 result.status,
                 steps,
-                findings=[result.shown_finding(finding) for finding in result.findings],
+                findings=_findings(result, request),
                 left_out=result.left_out,
             )
         )
@@ -293,32 +309,46 @@ def review(
 class _Outputs:
     """The output files of a review, which must be outside of the repository."""
 
-    def __init__(self, repository: Repository, summary: Path | None, sarif: Path | None) -> None:
-        """Check the files.  Raises `UsageError`."""
-        self._summary, self._sarif = summary, sarif
+    def __init__(
+        self,
+        repository: Repository,
+        first: str,
+        summary: Path | None,
+        sarif: Path | None,
+        annotations: Path | None,
+    ) -> None:
+        """Check the files; ``first`` is the first reviewed path.  Raises `UsageError`."""
+        self._first, self._summary, self._sarif = first, summary, sarif
+        self._annotations = annotations
         self._top = repository.top() or repository.folder
-        named = [file for file in (summary, sarif) if file]
+        named = [file for file in (summary, sarif, annotations) if file]
         for file in named:
             _check_outside(file, self._top)
         if len({file.absolute() for file in named}) < len(named):
-            raise UsageError("--summary and --sarif name the same file")
+            raise UsageError("two options name the same file to write")
 
     def write(self, result: Review, request: ReviewRequest) -> None:
         """Write the result."""
-        self._write(_markdown(result, request), [result.shown_finding(e) for e in result.findings])
+        self._write(_markdown(result, request), _findings(result, request))
 
     def write_unfinished(self) -> None:
         """Write "could not be decided" first; it stays if the review is killed (time limit)."""
-        self._write("## Review: could not be decided\n\nIt was ended before its result.\n", [])
+        self._write_undecided("It was ended before its result.")
 
     def write_error(self, error: SrosError) -> None:
         """Write the error that prevented a result."""
         from sros_tool.markdown import code
 
-        self._write(f"## Review: could not be decided\n\n{code(str(error))}\n", [])
+        self._write_undecided(code(str(error)), str(error))
+
+    def _write_undecided(self, markdown: str, reason: str = "") -> None:
+        from sros_tool.checks.review import UNDECIDED
+
+        undecided = UNDECIDED.found("the review", reason or markdown, self._first)
+        self._write(f"## Review: could not be decided\n\n{markdown}\n", [undecided])
 
     def _write(self, markdown: str, findings: Sequence[Finding]) -> None:
-        from sros_tool.checks.formats import sarif
+        from sros_tool.checks.formats import github_annotations, sarif
         from sros_tool.checks.kind import FindingFilter, select_kinds
 
         if self._summary:
@@ -327,6 +357,10 @@ class _Outputs:
             kinds = select_kinds(FindingFilter())
             log = sarif(findings, kinds, version=__version__, base=self._top)
             _save(self._sarif, f"{json_text(log)}\n".encode("utf-8", "backslashreplace"))
+        if self._annotations:
+            _save(
+                self._annotations, github_annotations(findings).encode("utf-8", "backslashreplace")
+            )
 
 
 def _check_outside(file: Path, top: Path) -> None:
@@ -395,7 +429,8 @@ def _sentence(result: Review, step: ReviewStep) -> str:
             left_out = expiry.short_lived_text()
             left_out = f"; not counted: {left_out}" if left_out else ""
             return f"{len(due)} of {count} enclaves need to be renewed{unread}{left_out}"
-        case Facts(lines=lines):
+        case Facts() as facts:
+            lines = facts.lines
             further = f", and {len(lines) - 1} more" if len(lines) > 1 else ""
             return f"'{lines[0][1]}' {lines[0][0]}{further}"
         case error:
@@ -413,12 +448,87 @@ def _sentences(result: Review, steps: Sequence[ReviewStep]) -> Iterator[tuple[Re
         yield step, sentence
 
 
+def _findings(result: Review, request: ReviewRequest) -> list[Finding]:
+    """Return the findings of all steps; a step that fails has at least one that says why.
+
+    Paths are relative to the top of the repository.  What the options allow is accepted.
+    """
+    findings: dict[Finding, None] = {}
+    for step in result.steps:
+        option = "dropped-requirements" if step.kind == "requirements-before" else "new-access"
+        allowed = f"option --{option} allow" if step.allowed and step.kind != "signed" else ""
+        for finding in _step_findings(result, step, request):
+            accepted = finding.accepted or allowed
+            findings[result.shown_finding(finding._replace(accepted=accepted))] = None
+    return list(findings)
+
+
+def _step_findings(result: Review, step: ReviewStep, request: ReviewRequest) -> Iterator[Finding]:
+    """Yield what a step found, at a place in HEAD."""
+    from sros_tool.checks.kind import ChosenFindings
+    from sros_tool.checks.review import (
+        EXPIRY,
+        NEW_ACCESS,
+        NOT_REVIEWED,
+        PRIVATE_KEY,
+        UNDECIDED,
+    )
+    from sros_tool.keystore.expiry import ExpiryCheck, describe_lifetime
+    from sros_tool.proof.review import AccessChange, DroppedRequirements, Facts, RightsChange
+
+    named = (request.policies, request.requirements, request.keystores)
+    whole = (paths[0] for paths in named if paths and " ".join(paths) == step.subject)
+    path = next(whole, step.subject) or next(chain(*named))
+    match step.content:
+        case ChosenFindings() as chosen:
+            yield from (*chosen.shown, *chosen.accepted)
+        case DroppedRequirements(chosen=chosen):
+            yield from chosen.shown
+        case AccessChange() as change:
+            yield from _access_findings(change, path)
+        case RightsChange():
+            pass
+        case ExpiryCheck(due=due, unreadable=unreadable):
+            for lifetime in due:
+                yield EXPIRY.found(lifetime.name, describe_lifetime(lifetime, request.at), path)
+            for enclave in unreadable:
+                yield UNDECIDED.found(enclave.name, str(enclave.error), path)
+        case Facts(failing=failing):
+            kinds = {"files": NOT_REVIEWED, "keystore": PRIVATE_KEY}
+            for text, name in failing:
+                is_file = step.kind in kinds
+                yield kinds.get(step.kind, NEW_ACCESS).found(name, text, name if is_file else path)
+        case error:
+            yield UNDECIDED.found(step.subject or path, str(error), path)
+
+
+def _access_findings(change: AccessChange, path: str) -> Iterator[Finding]:
+    """Yield a finding for each line of HEAD with new access, or without a DENY of BASE.
+
+    What has no line is at ``path``.
+    """
+    from sros_tool.checks.review import DROPPED_DENIAL, NEW_ACCESS
+    from sros_tool.cli.policy import placed_changes
+
+    at: dict[tuple[bool, str, int], list[tuple[str, str]]] = {}
+    for subject, text, place, is_denial in placed_changes(
+        change.before, change.after, change.growth, change.dropped
+    ):
+        line = (place.file, place.line) if place and place.file else (path, 0)
+        at.setdefault((is_denial, *line), []).append((subject, text))
+    for (is_denial, file, number), [(subject, text), *more] in at.items():
+        text += f"; and {len(more)} more of this line" if more else ""
+        kind = DROPPED_DENIAL if is_denial else NEW_ACCESS
+        yield kind.found(subject, text, file, number)
+
+
 def _text(result: Review) -> list[str]:
     """Return the review as lines."""
     lines = []
     for step, sentence in _sentences(result, result.steps):
         subject = f" {result.with_shown_paths(step.subject)}" if step.subject else ""
-        lines.append(f"{step.kind}{subject}: {sentence}")
+        mark = "allowed" if step.allowed else _MARKS[step.status]
+        lines.append(f"[{mark}] {step.kind}{subject}: {sentence}")
         lines_to_read = _lines_to_read(step)
         further = [f"and {len(lines_to_read) - _MOST_REASONS} more (--summary FILE has all)"]
         shown = lines_to_read[:_MOST_REASONS] + further * (len(lines_to_read) > _MOST_REASONS)
@@ -442,8 +552,8 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
     from sros_tool.proof.review import AccessChange, DroppedRequirements, Facts, RightsChange
 
     match step.content:
-        case Facts(lines=facts) if len(facts) > 1 and step.status:
-            return [f"'{name}' {text}" for text, name in facts]
+        case Facts() as facts if len(facts.lines) > 1 and step.status:
+            return [f"'{name}' {text}" for text, name in facts.lines]
         case AccessChange(before=before, after=after, growth=growth, dropped=dropped):
             return [*added_lines(before, after, growth), *dropped_lines(after, dropped)]
         case RightsChange(before=before, after=after, compared=compared):
@@ -584,8 +694,8 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
             lines = [describe_lifetime(lifetime, request.at) for lifetime in due]
             lines += [f"{enclave.name}  unknown: {enclave.error}" for enclave in unreadable]
             return renewal_markdown(lines, "", "as asked") if lines else ""
-        case Facts(lines=facts):
-            facts_with_names = (f"{code(name)} {code(text)}" for text, name in facts)
+        case Facts() as facts:
+            facts_with_names = (f"{code(name)} {code(text)}" for text, name in facts.lines)
             return f"### {_TITLES[step.kind]}\n\n{bounded_list(facts_with_names, 6000, shown_by)}"
     return ""
 

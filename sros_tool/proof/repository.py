@@ -223,7 +223,8 @@ class Repository:
             raise DocumentError(
                 f"the commit of '{name}' is not in the repository",
                 f"It is {digits}.",
-                "In a shallow clone, such as on a server for tests, fetch it first.",
+                "In a shallow clone, such as on a server for tests, fetch it first: `git fetch "
+                "origin`, or `--fetch origin` of sros review.",
             )
         raise DocumentError(f"'{name}' is not a commit", f"It is a {kind}.")
 

@@ -183,9 +183,15 @@ class DroppedRequirements:
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """Facts as lines of text: pairs of a sentence and a name."""
+    """Facts as lines of text: pairs of a sentence and a name; ``named`` are no reason to fail."""
 
-    lines: tuple[tuple[str, str], ...]
+    failing: tuple[tuple[str, str], ...]
+    named: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def lines(self) -> tuple[tuple[str, str], ...]:
+        """All facts."""
+        return self.failing + self.named
 
 
 Content = (
@@ -237,14 +243,6 @@ class Review:
     def status(self) -> int:
         """The worst exit status of all steps."""
         return max((step.status for step in self.steps), default=_OK)
-
-    @property
-    def findings(self) -> list[Finding]:
-        """The findings on HEAD, of all steps."""
-        chosen = [step.content for step in self.steps if isinstance(step.content, ChosenFindings)]
-        return list(
-            dict.fromkeys(f for choice in chosen for f in (*choice.shown, *choice.accepted))
-        )
 
     def with_shown_paths(self, text: str) -> str:
         """Return a text with file paths relative to the top of the repository."""
@@ -605,7 +603,7 @@ class _Review:
         """Return the step on policy files that were changed or renamed, but are not reviewed."""
         assert self.base
         lines: list[tuple[str, str]] = []
-        status = _OK
+        named: list[tuple[str, str]] = []
         changed = list(self._changed_files(self.head, self.base))
         if len(changed) > _MOST_CHANGED:
             raise DocumentError(f"the change has more than {_MOST_CHANGED} files")
@@ -617,20 +615,16 @@ class _Review:
             content = self.request.repository.content(entries[path].id)
             if (Path(path).name, content) not in shipped:
                 lines.append((f"{_NOT_USED} --leave-out {quote(path)}, or delete it", path))
-                status = _FOUND
         for path in self._used_in_part(changed, reviewed, fleet):
             lines.append(("changes and is used only in part: the rest is not reviewed", path))
-            status = _FOUND
         for path in self._not_reviewed_users(changed):
             lines.append(("is not reviewed, and includes a file that changes", path))
-            status = _FOUND
         sizes = self.request.repository.sizes(names)
         for path, entry in changed:
             if sizes.get(entry.id, 0) > _MOST_OUTSIDE and entry.mode in FILES:
-                lines.append(("changes and is too large to be reviewed", path))
+                named.append(("changes and is too large to be reviewed", path))
             if clause := self._hidden_entry_clause(path, entry):
                 lines.append((f"changes and is not reviewed: it is {clause}", path))
-                status = _FOUND
         gone = [
             (path, entry)
             for path, entry in self._changed_files(self.base, self.head)
@@ -638,8 +632,9 @@ class _Review:
         ]
         for path in self._policies_among(gone, self.base, known=False):
             new = names.get(dict(gone)[path].id)
-            lines.append((f"is renamed to '{new}'" if new else "is deleted", path))
-        return (status, Facts(tuple(lines))) if lines else None
+            named.append((f"is renamed to '{new}'" if new else "is deleted", path))
+        facts = Facts(tuple(lines), tuple(named))
+        return (_FOUND if lines else _OK, facts) if facts.lines else None
 
     def _used_in_part(
         self,
@@ -1006,9 +1001,14 @@ class _Review:
             requirement.requirement
             for requirement in dropped_requirements(earlier, wanted_requirements)
         ]
-        findings = dropped_findings(
-            earlier, wanted_requirements, " ".join(self.request.requirements)
-        )
+        assert self.base
+        findings = [
+            finding._replace(
+                file=str(self.head.folder / Path(place.file).relative_to(self.base.folder))
+            )
+            for finding in dropped_findings(earlier, wanted_requirements, "")
+            for place in finding.related
+        ]
         broken = requirement_findings(dropped, system)
         chosen = FindingFilter(exclude=(VACUOUS.id,)).choose([*findings, *broken])
         return _FOUND, DroppedRequirements(len(dropped), chosen)

@@ -25,7 +25,7 @@ from tests.checks import (
 from tests.checks.bench import Bench
 from tests.cli import test_requirements
 from tests.fleet import test_status
-from tests.proof import test_crossing, test_upgrade
+from tests.proof import test_crossing, test_review, test_upgrade
 from tests.support.harness import sros
 from tests.support.tables import for_every
 
@@ -44,6 +44,7 @@ def test_every_finding_has_a_test_that_brings_it_about() -> None:
         *test_requirements.CASES,
         *test_crossing.FOUND,
         *test_upgrade.FOUND,
+        *test_review.FOUND,
         *test_status.FOUND,
     }
     assert tested == set(all_kinds())
@@ -54,7 +55,7 @@ def test_every_finding_has_a_test_that_brings_it_about() -> None:
 def test_kinds_are_complete(kind: Any) -> None:
     assert re.fullmatch(
         r"(policy|requirement|keystore|enclave|permissions|governance|portable|zenoh|runtime"
-        r"|upgrade|distribution)\."
+        r"|upgrade|distribution|review)\."
         r"[a-z0-9]+(-[a-z0-9]+)*",
         kind.id,
     )

@@ -12,6 +12,8 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
+from sros_tool.checks.formats import github_annotations
+from sros_tool.checks.kind import all_kinds
 from sros_tool.cli.review import review as review_verb
 from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.files import templates_dir
@@ -87,6 +89,79 @@ def change(first_commit: Change, tmp_path: Path) -> Change:
     return Change(tmp_path, first_commit.base)
 
 
+FOUND = {
+    *("review.new-access", "review.dropped-denial", "review.file", "review.private-key"),
+    *("review.expiry", "review.undecided"),
+}
+"""The kinds of findings that the tests below see."""
+DENIES = '<topics publish="DENY"><topic>/q</topic></topics>'
+
+
+@pytest.mark.parametrize(
+    ("files", "found", "place"),
+    [
+        ({"robot.xml": policy_text(WIDER)}, "review.new-access", ("robot.xml", 6)),
+        (
+            {"robot.xml": policy_text({"/c": publish("/x")})},
+            "review.new-access",
+            ("robot.xml", 3),
+        ),
+        ({"second.xml": policy_text(WIDER)}, "review.file", ("second.xml", 1)),
+        ({"robot.toml": ONLY.replace("only", "nobody")}, "requirement.dropped", ("robot.toml", 1)),
+        ({"robot.toml": None}, "review.undecided", ("robot.toml", 1)),
+        (
+            {"old.key": "-----BEGIN EC PRIVATE KEY-----\nMHcCAQEE\n"},
+            "review.private-key",
+            ("old.key", 1),
+        ),
+        ({"robot.xml": "<policy"}, "review.undecided", ("robot.xml", 1)),
+    ],
+)
+def test_what_fails_a_review_is_in_its_sarif(
+    files: dict[str, str | bytes | None], found: str, place: tuple[str, int], change: Change
+) -> None:
+    change.commit(files)
+    words = ("--policy", "robot.xml", "--requirements", "robot.toml")
+    with TemporaryDirectory() as folder:
+        sarif, commands = Path(folder, "sarif"), Path(folder, "annotations")
+        ended = change.review(*words, "--sarif", str(sarif), "--annotations", str(commands))
+        assert ended.status
+        results = json.loads(sarif.read_text())["runs"][0]["results"]
+        lines = commands.read_text().splitlines()
+    result = next(each for each in results if each["ruleId"] == found)
+    assert result["level"] in ("error", "warning")
+    (at,) = result["locations"]
+    where = at["physicalLocation"]
+    assert (where["artifactLocation"]["uri"], where["region"]["startLine"]) == place
+    begin = f"::{result['level']} file={place[0]},line={place[1]},title={found}::"
+    assert any(line.startswith(begin) for line in lines)
+
+
+def test_a_denial_that_is_gone_is_named_as_what_failed(change: Change) -> None:
+    change.base = change.commit({"robot.xml": policy_text({"/a": publish("/x") + DENIES})})
+    change.commit({"robot.xml": policy_text({"/a": publish("/x")})})
+    with TemporaryDirectory() as folder:
+        summary = Path(folder, "review.md")
+        ended = change.review("--policy", "robot.xml", "--summary", str(summary), "--json")
+        said = summary.read_text()
+    (step,) = (step for step in json.loads(ended.out)["steps"] if step["status"])
+    assert step["result"].startswith("1 DENY is gone, so that other policies may allow the names")
+    (finding,) = json.loads(ended.out)["findings"]
+    assert (finding["id"], finding["file"]) == ("review.dropped-denial", "robot.xml")
+    assert "### New access: none, but a DENY is gone" in said and "**1 DENY gone**" in said
+    allowed = change.review("--policy", "robot.xml", "--new-access", "allow", "--json").ok()
+    (finding,) = json.loads(allowed.out)["findings"]
+    assert (finding["severity"], finding["accepted"]) == ("note", "option --new-access allow")
+
+
+def test_no_name_becomes_a_command_of_the_runner() -> None:
+    kind = next(iter(all_kinds().values()))
+    line = github_annotations([kind.found("a\n::error::b", "c%0A", "x,line=1:\r\ny")])
+    assert line.count("\n") == 1 and "\r" not in line
+    assert line.startswith(f"::{kind.severity.word} file=x%2Cline=1%3A%0D%0Ay,line=1,title=")
+    assert "::a%0A::error::b: c%250A." in line
+
+
 # ── what is compared ───────────────────────────────────────────────────────────────────────
 
 
@@ -148,7 +223,7 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
         }
     )
     ended = change.review("--policy", "robot.xml\nsecond.xml")
-    said = ended.out.partition("\nrights ")[2].splitlines()
+    said = ended.out.partition("\n[ok] rights ")[2].splitlines()
     assert "written rights gone, 1 name made absolute" in said[0], ended
     assert "  ! /c may subscribe /x, but no enclave may publish it any more" in said
     assert "  - /a ALLOW publish topic /x" in said
@@ -181,7 +256,7 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
     change.base = change.commit({"second.xml": denied("/stop", "/*/erase", "/cmd*", "/lidar/x")})
     change.commit({"second.xml": denied("/lidar*/erase", "/cmd", "/cmd?*")})
     ended = change.review("--policy", "robot.xml\nsecond.xml")
-    assert ended.status == 1 and "; 2 DENYs gone" in ended.out, ended
+    assert ended.status == 1 and "; 2 DENYs are gone" in ended.out, ended
     assert (
         "  ! /c DENY publish topic /*/erase is gone for names such as /a/erase: other policies may "
         "allow them now\n  ! /c DENY publish topic /stop is gone: other policies may allow it now"
@@ -190,7 +265,7 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
     compared = sros("diff_policy", "--no-new-access", *sides, cwd=change.folder)
     denials = [line.strip() for line in ended.out.splitlines() if line.startswith("  ! ")]
     assert [line for line in compared.out.splitlines() if line.startswith("! ")] == denials
-    assert "; 2 DENYs gone" in compared.err
+    assert "; 2 DENYs are gone" in compared.err
 
 
 def test_a_denial_that_a_node_leaves_behind_is_gone(change: Change) -> None:
@@ -249,7 +324,8 @@ def test_a_renamed_enclave_is_one_line_and_still_new_access(change: Change) -> N
         # Whom the enclave is influenced by is only new if other access is.
         reach = ["  + /a can influence /c: /a -publish /x-> /c"] * len(also)
         assert lines == [
-            *(renamed, *(f"  + {right}" for right in also), *reach),
+            f"{renamed}; they count as new, so that a reviewer has to allow them",
+            *(*(f"  + {right}" for right in also), *reach),
             *(renamed, *(f"  + {right}".replace(" publish", " ALLOW publish") for right in also)),
         ]
 
@@ -751,7 +827,7 @@ def test_the_access_of_a_keystore_is_compared(
     change.commit({})
     ended = change.review(*words)
     assert ended.status > 0
-    (line,) = (each for each in ended.out.splitlines() if each.startswith("new-access ks"))
+    (line,) = (each for each in ended.out.splitlines() if "] new-access ks" in each)
     assert "nobody gets more" not in line
     assert ("requirements ks: 1 error" in ended.out) == (case == "rights")
     assert ("error: " in ended.out and "  + /" in ended.out) or case != "rights", ended
@@ -766,8 +842,9 @@ def test_a_keystore_fails_for_a_finding_an_expiry_and_a_link_out_of_it(
     words = ("--keystore", "ks", "--renew-within")
     sound = change.review(*words, "1d").ok()
     assert "expiry ks: 0 of 2 enclaves need to be renewed" in sound.out
-    late = change.review(*words, "3000d")
-    assert (late.status, "expiry ks: 2 of 2 enclaves" in late.out) == (1, True), late
+    late = change.review(*words, "3000d", "--json")
+    assert (late.status, "2 of 2 enclaves need to be" in late.out) == (1, True), late
+    assert [each["id"] for each in json.loads(late.out)["findings"]] == ["review.expiry"] * 2
     certificate = change.folder / "ks/enclaves/a/cert.pem"
     settings = (change.folder / "ks/sros.toml").read_text()
     elsewhere = settings.replace("[authorities]", '[authorities]\nidentity_key = "file:/dev/null"')
@@ -812,10 +889,10 @@ def test_whether_a_keystore_is_signed_for_the_policies(
     change.base = change.commit({})
     change.commit({"README": "x"})
     words = ("--policy", "robot.xml", "--keystore", "ks")
-    assert "\nsigned ks: nothing found" in change.review(*words).ok().out
+    assert "\n[ok] signed ks: nothing found" in change.review(*words).ok().out
     change.commit({"robot.xml": policy_text({"/a": publish("/x"), "/c": publish("/z")})})
     ended = change.review(*words, "--new-access", "allow").ok()
-    assert "\nsigned ks: 1 warning, 1 note" in ended.out, ended
+    assert "\n[allowed] signed ks: 1 warning, 1 note" in ended.out, ended
     assert "/c: the keystore does not have this enclave [keystore.enclave-missing]" in ended.out
     change.commit({"robot.xml": policy_text(ROBOT | {"/a": publish("/x2")})})
     ended = change.review(*words, "--new-access", "allow").ok()
