@@ -13,11 +13,12 @@ This module reads no files.
 
 from __future__ import annotations
 
+import re
 from bisect import bisect_left
 from collections import defaultdict, deque
-from collections.abc import Collection, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import combinations, product
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -254,9 +255,18 @@ class Network:
         """The enclaves that may write or read at least one topic, sorted."""
         return tuple(sorted({name for side in self._sides.values() for name in side.of}))
 
-    def hops(self, enclave: str) -> Iterator[Hop]:
-        """Yield every hop from an enclave to another enclave."""
-        return self._steps(enclave, True, set(), {enclave})
+    def links(self, enclave: str, known: Container[str]) -> Iterator[tuple[str, Callable[[], Hop]]]:
+        """Yield each enclave that another enclave can influence directly, with how to get the hop.
+
+        The search for a name, which a hop has, takes long.  Enclaves that are ``known`` when their
+        turn comes are left out.
+        """
+        for writer, reader in self._meeting(enclave, True, set(), known):
+            if reader.enclave != enclave and self._carries_a_topic(writer, reader):
+                yield reader.enclave, partial(self._hop_between, writer, reader)
+
+    def _hop_between(self, writer: _Access, reader: _Access) -> Hop:
+        return _hop(writer, reader, self._carried_topic(writer, reader))
 
     def users(self, direction: str, topic: str) -> frozenset[str]:
         """Return the enclaves that may publish or subscribe (``direction``) to a DDS topic.
@@ -300,6 +310,14 @@ class Network:
         ``followed`` are the topics whose hops were yielded earlier, and so lead to ``known``
         enclaves only.  The topics of this enclave are added to them.
         """
+        for writer, reader in self._meeting(enclave, forward, followed, known):
+            if name := self._carried_topic(writer, reader):
+                yield _hop(writer, reader, name)
+
+    def _meeting(
+        self, enclave: str, forward: bool, followed: _Followed, known: Container[str]
+    ) -> Iterator[tuple[_Access, _Access]]:
+        """Yield the accesses of writers and readers that `_steps` has to compare."""
         directions = ("publish", "subscribe") if forward else ("subscribe", "publish")
         own_side, other_side = (self._sides[direction] for direction in directions)
         for end in own_side.of.get(enclave, ()):
@@ -310,9 +328,17 @@ class Network:
             for reached in other_side.possibly_overlapping(end.topic):
                 if reached.enclave in known:
                     continue
-                writer, reader = (end, reached) if forward else (reached, end)
-                if name := self._carried_topic(writer, reader):
-                    yield _hop(writer, reader, name)
+                yield (end, reached) if forward else (reached, end)
+
+    def _carries_a_topic(self, writer: _Access, reader: _Access) -> bool:
+        """Return whether `_carried_topic` has a result, if possible without the search for it."""
+        routers = {self._router_of.get(end.enclave, "") for end in (writer, reader)}
+        if len(routers) == 1 and all(
+            _ANY_LETTERS.fullmatch(end.topic) and not end.without for end in (writer, reader)
+        ):
+            common = _common_domain_set(writer.domains, reader.domains)
+            return bool(common) and overlap(writer.topic, reader.topic)
+        return bool(self._carried_topic(writer, reader))
 
     def _carried_topic(self, writer: _Access, reader: _Access) -> str:
         """Return a DDS topic that a writer may write and a reader gets, or ""."""
@@ -326,6 +352,10 @@ class Network:
             _shared_topic(writer, reader, passed) for passed in passing if passed.enclave == sending
         )
         return next(filter(None, names), "")
+
+
+_ANY_LETTERS = re.compile(r"(?!.*/[0-9])[^?\[]*\*[^?\[]*")
+"""DDS expressions that share a valid ROS name if they overlap: a letter fits at each ``*``."""
 
 
 def _domains_by_enclave(rights: DomainRights) -> dict[str, list[DomainSet | None]]:

@@ -145,14 +145,27 @@ def test_a_question_changes_nothing(asked: str, served: str) -> None:
 def test_requests_that_change_something_count() -> None:
     found = rights("/c request /b/set_parameters", "/d request /*", "/b reply /*")
     network = Network(found, questions=QUESTIONS)
-    assert {hop.target for hop in network.hops("/c")} == {"/b"}
-    assert {hop.target for hop in network.hops("/d")} == {"/b"}
+    assert dict(network.links("/c", ())).keys() == {"/b"}
+    assert dict(network.links("/d", ())).keys() == {"/b"}
 
 
 def test_hops_of_one_enclave() -> None:
-    hops = list(Network(CHAIN).hops("/b"))
+    hops = [hop() for _, hop in Network(CHAIN).links("/b", ())]
     assert [str(hop) for hop in hops] == ["/b -publish /y-> /c"]
     assert (hops[0].said, hops[0].heard, hops[0].kind) == ("/y", "/y", "topics")
+
+
+def test_links_are_found_without_the_name_of_each_hop() -> None:
+    """Also for expressions that overlap, but only in names that no node can have."""
+    stars = ("/e{}/*/a*", "/*/c{}/*", "/*x", "/*/1*", "/?{}", "/[0-9]", "/e{}/x", "*")
+    names = [star.format(number) for star in stars for number in (1, 2)]
+    found = [f"/w{n} publish {name}" for n, name in enumerate(names)]
+    found += [f"/r{n} subscribe {name}" for n, name in enumerate(names)]
+    network = Network(rights(*found))
+    for enclave in network.enclaves:
+        linked = {reader for reader, _ in network.links(enclave, ())}
+        reached_directly = {path[0].target for path in network.influenced_by([enclave]).values()}
+        assert linked == reached_directly, enclave
 
 
 ENCLAVES = ["/a", "/b", "/c", "/d"]

@@ -16,6 +16,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from hashlib import sha256
 from itertools import chain, islice, product, takewhile
 from typing import Annotated, NamedTuple
@@ -1023,8 +1024,8 @@ def _example(names: NameSet, expression: str, world: _World, limit: SearchLimit)
 # ── reach ──────────────────────────────────────────────────────────────────────────────────
 
 
-_Edges = Mapping[str, Mapping[str, Hop]]
-"""Maps pairs of enclaves (source, target) to a hop from the first to the second."""
+_Edges = Mapping[str, Mapping[str, Callable[[], Hop]]]
+"""Maps pairs of enclaves (source, target) to what returns a hop from the first to the second."""
 _MOST_REACH = 10_000
 _MOST_HOPS = 200_000
 
@@ -1039,20 +1040,20 @@ def _new_reach(before: _Edges | None, after: _Edges | None) -> Iterator[NewReach
     changed = {
         source for source, of in after.items() if not of.keys() <= before.get(source, {}).keys()
     }
-    backwards: dict[str, dict[str, Hop]] = defaultdict(dict)
+    backwards: dict[str, list[str]] = defaultdict(list)
     for source, of in after.items():
-        for target, hop in of.items():
-            backwards[target][source] = hop
-    sources = changed.union(*(_reached_with_hops(backwards, name) for name in sorted(changed)))
+        for target in of:
+            backwards[target].append(source)
+    sources = changed.union(*(_reached(backwards, name) for name in sorted(changed)))
     for source in sorted(sources):
-        known = _reached_with_hops(before, source).keys()
-        reached = _reached_with_hops(after, source)
+        known = _reached(before, source).keys()
+        reached = _reached(after, source)
         for target in sorted(reached.keys() - known - {source}):
             path: list[Hop] = []
             at = target
             while at != source:
-                path.insert(0, reached[at])
-                at = reached[at].source
+                path.insert(0, after[reached[at]][at]())
+                at = reached[at]
             yield NewReach(source, target, tuple(path))
 
 
@@ -1104,28 +1105,35 @@ def _edges(side: AccessSource, fitting_pairs: Iterable[tuple[str, str]]) -> _Edg
         unguarded=unguarded(side.governance) if side.governance else (),
         everybody=sorted(side.permissions),
     )
-    edges: dict[str, dict[str, Hop]] = defaultdict(dict)
+    edges: dict[str, dict[str, Callable[[], Hop]]] = defaultdict(dict)
     left = _MOST_HOPS
     for enclave in network.enclaves:
         source = real.get(enclave, enclave)
-        for hop in network.hops(enclave):
-            target = real.get(hop.target, hop.target)
+        known = {enclave}
+        for reached, hop in network.links(enclave, known):
+            known.add(reached)
+            target = real.get(reached, reached)
             if target != source and target not in edges[source]:
-                edges[source][target] = hop._replace(source=source, target=target)
+                edges[source][target] = partial(_hop_of, hop, source, target)
                 left -= 1
         if left < 0:
             return None
     return edges
 
 
-def _reached_with_hops(edges: _Edges, start: str) -> dict[str, Hop]:
-    """Return the enclaves that can be reached from ``start``, each with the last hop to it."""
-    reached: dict[str, Hop] = {}
+def _hop_of(hop: Callable[[], Hop], source: str, target: str) -> Hop:
+    """Return a hop between real enclaves."""
+    return hop()._replace(source=source, target=target)
+
+
+def _reached(neighbors: Mapping[str, Iterable[str]], start: str) -> dict[str, str]:
+    """Map the enclaves that can be reached from ``start`` to the enclave before each of them."""
+    reached: dict[str, str] = {}
     row = [start]
     for enclave_here in row:
-        for neighbor, hop in edges.get(enclave_here, {}).items():
+        for neighbor in neighbors.get(enclave_here, ()):
             if neighbor not in reached and neighbor != start:
-                reached[neighbor] = hop
+                reached[neighbor] = enclave_here
                 row.append(neighbor)
     return reached
 

@@ -207,7 +207,7 @@ def open_keystores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 def distances(network: Network, name: str, upstream: bool) -> dict[str, int]:
     """The enclaves that a name is reached from (or that it reaches), each with its hops."""
-    hops = [hop for enclave in network.enclaves for hop in network.hops(enclave)]
+    hops = [hop() for enclave in network.enclaves for _, hop in network.links(enclave, ())]
     distance = {(hop.source if upstream else hop.target): 1 for hop in hops if hop.name == name}
     for enclave in list(distance):
         reach = network.reach(enclave)
