@@ -27,16 +27,23 @@ from sros_tool.agent.fetch import OLD_COPY
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import KEY_NOT_HERE, OF_OTHER_CA, OLDER_THAN_INSTALLED
-from sros_tool.keystore.delivery.release import RELEASE_FILES, Release, seal_problem
+from sros_tool.keystore.delivery.release import (
+    RELEASE_FILES,
+    Release,
+    retired_authorities,
+    seal_problem,
+)
 from sros_tool.keystore.delivery.robot import evaluate_delivered
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
+    IDENTITY,
     IDENTITY_CA_FILE,
     KEY_FILE,
     KEY_FILES,
     KEY_URI_FILE,
     OPTIONAL_FILES,
+    PERMISSIONS,
     PERMISSIONS_CA_FILE,
     PRIVATE,
     PUBLIC,
@@ -49,6 +56,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import OpenedEnclave, open_enclave, weaknesses
 from sros_tool.keystore.transaction import Transaction, recover_keystore
 from sros_tool.pki.certificates import (
+    authority_text,
     digest,
     load_certificates,
     load_request,
@@ -348,6 +356,17 @@ def _check_not_older(folder: Folder, place: str, sent: OpenedEnclave, now: datet
     present = open_enclave(folder.path / place, now=now)
     if present.problems or not (present.certificate and sent.certificate):
         return
+    for role, file in ((IDENTITY, IDENTITY_CA_FILE), (PERMISSIONS, PERMISSIONS_CA_FILE)):
+        trusted, brought = (
+            load_certificates(state.files.get(file, b""), file) for state in (present, sent)
+        )
+        if retired := retired_authorities(trusted, brought):
+            raise KeystoreError(
+                f"the release goes back to the {role} CA {authority_text(retired[0])}, which a "
+                "later CA replaced on this robot",
+                "the keystore comes from a backup: replace the CA again where it is, with `sros "
+                f"rotate_ca KEYSTORE --{role} --finish --allow-unconfirmed`, and publish",
+            )
     same_authority = present.files.get(PERMISSIONS_CA_FILE) == sent.files.get(PERMISSIONS_CA_FILE)
     newer = [
         f"its {document} is valid from {iso(here)}, the {document} in the release from {iso(there)}"

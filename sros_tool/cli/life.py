@@ -554,9 +554,10 @@ def rotate_ca(
         f"cut off: {', '.join(step.cut_off)} {cannot} talk to robots with the files of this stage "
         "before getting these files, too"
     )
-    if step.cut_off and publish_command(root):
+    if step.cut_off and publish_command(root) and step.replaces_seals:
         cut_off += (
-            ". A robot that fetches and does not trust the new CA yet refuses all later releases: "
+            ". A robot that fetches and does not trust the new permissions CA yet refuses all "
+            "later releases: "
             f"`sros distribute_key {quote(str(root))} --robot NAME FOLDER --force`, and bring "
             "FOLDER to the robot"
         )

@@ -858,3 +858,8 @@ def key_digest(key: PublicKey) -> str:
         serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo
     )
     return hashlib.sha256(der).hexdigest()
+
+
+def authority_key(authority: x509.Certificate) -> str:
+    """Return the `key_digest` of a CA: a later certificate of the same key is the same CA."""
+    return key_digest(authority.public_key())  # type: ignore[arg-type]

@@ -16,6 +16,8 @@ import pytest
 from sros_tool.agent.install import Installation, install_release
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.delivery.release import Release
+from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import digest, make_request
 from sros_tool.pki.keys import generate_key
@@ -313,6 +315,21 @@ def test_what_a_play_brought_meanwhile_is_not_taken_back(home: Home, robot: Path
     (robot / A / "permissions.p7s").write_text("mine")
     done = install(robot, home.release({**home.revoked.files, **older_a(home)}))
     assert done.changed == ("/r1/a",), "files that no process can load are not newer"
+
+
+def test_an_enclave_does_not_trust_a_replaced_ca_again(
+    home: Home, robot: Path, tmp_path: Path
+) -> None:
+    """A keystore from before the rotation renews its certificates, and publishes."""
+    root, backup = (copy_of(home.root, tmp_path / name) for name in ("home", "backup"))
+    rotate_ca(root, roles=["identity"], now=moment() + timedelta(hours=2), finish=True)
+    late = moment() + timedelta(hours=4)
+    later = release_of(files_of(root), 4, home.authority)
+    assert install_release(robot, later, "r1", now=late).changed == NAMES
+    renew(backup, ["/r1/a"], now=moment() + timedelta(hours=3))
+    done = install_release(robot, home.release(files_of(backup)), "r1", now=late)
+    assert all("goes back to the identity CA" in done.kept[name] for name in NAMES)
+    assert has(robot, later)
 
 
 def older_a(home: Home) -> dict[str, bytes]:

@@ -39,12 +39,14 @@ from sros_tool.keystore.delivery.release import (
 )
 from sros_tool.keystore.delivery.repository import Composer, Roots, load_signer, read_present
 from sros_tool.keystore.fleet_status import fleet_status
+from sros_tool.keystore.layout import ROLES as ROLES_OF_CAS
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
+from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.crl import load_crl
 from sros_tool.validity import iso
-from tests.agent.published import DAY, ROLES, Home, Thief
+from tests.agent.published import DAY, LATER, ROLES, Home, Thief
 from tests.support.harness import copy_of, policy_text, snapshot, sros
 from tests.support.harness import publish as allow_publish
 from tests.support.long_form import few_steps
@@ -883,6 +885,35 @@ def test_restored_is_refused_where_nothing_shows_a_restore(publisher: Home) -> N
     publisher.publish()  # only the timestamp is later
     shutil.rmtree(publisher.root)
     backup.rename(publisher.root)
+    assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
+
+
+@pytest.mark.parametrize("role", ROLES_OF_CAS)
+def test_a_restored_keystore_never_brings_back_a_ca_that_was_replaced(
+    publisher: Home, role: str
+) -> None:
+    """The CA may have been replaced because somebody has its key."""
+
+    def replace_ca() -> None:
+        publisher.now += LATER
+        rotate_ca(
+            publisher.root,
+            roles=[role],
+            now=publisher.now,
+            finish=True,
+            allow_unconfirmed=True,
+        )
+
+    backup = copy_of(publisher.root, publisher.folder / "backup")
+    replace_ca()
+    publisher.publish()
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    before = snapshot(publisher.folder)
+    with pytest.raises(KeystoreError, match=f"the {role} CA was replaced after the backup") as said:
+        publisher.publish(restored=True)
+    assert f"--{role} --finish" in said.value.remedy and snapshot(publisher.folder) == before
+    replace_ca()
     assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
 
 

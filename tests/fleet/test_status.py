@@ -432,6 +432,12 @@ def test_a_rotation_goes_on_without_robots_if_that_is_chosen(field: Field) -> No
     refused = field.run("rotate_ca", "ks", "--finish", status=2).err
     assert "several stages at once would cut off every robot: r1, r2, r3. " in refused
     assert "confirm the files" not in refused and "add --allow-unconfirmed" in refused
+    assert "does not accept a published release" in refused
+    alone = ("rotate_ca", "ks", "--finish", "--identity")
+    refused = field.run(*alone, status=2).err
+    assert "several stages" in refused and "published" not in refused, "releases are sealed as ever"
+    field.run("fleet", "publish", "ks", "pub")
+    assert "refuses" not in field.run(*alone, "--allow-unconfirmed", "--dry-run").err
     field.run("rotate_ca", "ks", "--next", "--identity")
     field.deliver("r1", "r3")
     words = ("rotate_ca", "ks", "--to", "reissue", "--allow-unconfirmed")

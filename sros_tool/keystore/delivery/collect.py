@@ -46,7 +46,7 @@ from sros_tool.keystore.delivery.signing import certify_requests
 from sros_tool.keystore.expiry import read_credentials
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, recorded_fleet
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.known_keys import revoked_serials
+from sros_tool.keystore.known_keys import restored_at, revoked_serials
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     IDENTITY,
@@ -563,7 +563,11 @@ class _Verifier:
         validity = validity_of(signer)
         moment = min(max(self._now, validity.not_before), validity.not_after)
         if fault := chain_fault(signer, self._authorities, moment=moment):
-            raise _RefusedError(f"no identity CA of the keystore issued its certificate: {fault}")
+            why = f"no identity CA of the keystore issued its certificate: {fault}"
+            if restored_at(self._keystore):
+                why += "; perhaps the CA was replaced after the backup of the keystore: see "
+                why += "docs/howto/keystore_is_lost.md"
+            raise _RefusedError(why)
         if signer.serial_number in self._revoked:
             raise _RefusedError(f"its certificate, {signer.serial_number:x}, was revoked")
         issued = self._issued(digest(signer))

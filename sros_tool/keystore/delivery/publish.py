@@ -48,6 +48,7 @@ from sros_tool.keystore.delivery.release import (
     check_tuf,
     pack_release,
     read_release,
+    retired_authorities,
     seal_problem,
     seal_releases,
 )
@@ -57,8 +58,10 @@ from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
     FLEET_ROOT,
+    IDENTITY,
     IDENTITY_CA_FILE,
     PERMISSIONS,
+    PERMISSIONS_CA_FILE,
     PUBLISHED,
     enclave_folder,
     enclave_path,
@@ -76,7 +79,7 @@ from sros_tool.keystore.outcomes import changes_below
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.transaction import KeystoreLock
 from sros_tool.parallel import map_slices, tick
-from sros_tool.pki.certificates import load_certificates
+from sros_tool.pki.certificates import authority_key, authority_text, load_certificates, validity_of
 from sros_tool.pki.crl import lists_as_revoked, read_list
 from sros_tool.validity import iso
 from sros_tool.values import (
@@ -622,7 +625,14 @@ class _Run:
         if restored and not is_later:
             self._check_removed()
         if restored:
-            self._restore(self._forgotten_revocations() if is_later else None, keyring)
+            forgotten = Forgotten(self.keystore, self._now)
+            if is_later:
+                last = self._last_read()
+                self._check_authorities(last)
+                for path, content in last.files.items():
+                    if path.endswith(f"/{CRL_FILE}"):
+                        forgotten.add(content)
+            self._restore(forgotten, keyring)
         if not (is_later and self._dry_run):  # which has not revoked again
             self._check_removed()
         if is_lost or restored:
@@ -729,11 +739,12 @@ class _Run:
         """The highest number of a release in the folder; 0 without one."""
         return max((release.number for release in self._there.values()), default=0)
 
-    def _forgotten_revocations(self) -> Forgotten:
-        """Return what the last releases revoke and the restored keystore does not."""
-        forgotten = Forgotten(self.keystore, self._now)
+    def _last_read(self) -> Release:
+        """Return a last release in the folder: its CAs and its revocation list are the last ones.
+
+        Robots without a last release may have been refused since, and still have earlier files.
+        """
         problem = ""
-        # Only these have the last list: others may have been refused since, and still have earlier.
         last = (robot for robot in self._there.items() if robot[1].number == self._number)
         for robot, present_release in last:
             try:
@@ -746,26 +757,56 @@ class _Run:
                     raise DocumentError(f"the release of {robot} does not have the recorded number")
             except SrosError as error:
                 problem = problem or f"{error.what[:1].upper()}{error.what[1:]}."
-                continue
-            for path, content in release.files.items():
-                if path.endswith(f"/{CRL_FILE}"):
-                    forgotten.add(content)
-            break
-        else:
-            raise KeystoreError(
-                f"no last release in '{self._folder}' can be read",
-                f"{problem} So it is not known which revocations the keystore lacks.",
-                "Copy a release there from a copy of the folder, or from the robot, whose agent "
-                "keeps it as FOLDER/.agent/release.tar.gz.",
-            )
-        return forgotten
+            else:
+                return release
+        raise KeystoreError(
+            f"no last release in '{self._folder}' can be read",
+            f"{problem} So it is not known which revocations the keystore lacks.",
+            "Copy a release there from a copy of the folder, or from the robot, whose agent "
+            "keeps it as FOLDER/.agent/release.tar.gz.",
+        )
 
-    def _restore(self, forgotten_lists: Forgotten | None, keyring: Keyring) -> None:
+    def _check_authorities(self, last: Release) -> None:
+        """Refuse to bring back CAs that were replaced after the backup.
+
+        Raises:
+            KeystoreError: the keystore has a CA that a later one in the release ``last`` replaced,
+                or lacks the newest CA.
+        """
+        where = quote(str(self.keystore.root))
+        for role, file in ((IDENTITY, IDENTITY_CA_FILE), (PERMISSIONS, PERMISSIONS_CA_FILE)):
+            own = self.keystore.authority(role)
+            published = [
+                authority
+                for path, data in last.files.items()
+                if path.endswith(f"/{file}")
+                for authority in load_certificates(data, path)
+            ]
+            newest = max([*own, *published], key=lambda each: validity_of(each).not_before)
+            lost = authority_key(newest) not in map(authority_key, own)
+            if lost or retired_authorities(published, own):
+                flag = f"--{role} " * (len(self.keystore.authority_files) > 1)
+                by_hand = (
+                    f", bring the files of each robot by hand (`sros distribute_key {where} "
+                    "--robot NAME FOLDER --force`), because robots accept releases only of the "
+                    "CA that they trust,"
+                ) * (role == PERMISSIONS or not flag)
+                raise KeystoreError(
+                    f"the {role} CA was replaced after the backup of the keystore "
+                    f"'{self.keystore.root}'",
+                    f"The last release in '{self._folder}' trusts {authority_text(newest)}. "
+                    "Publishing would put robots back on the earlier CA, whose key somebody may "
+                    "have copied.",
+                    "Restore a backup from after the rotation. If there is none, repeat later "
+                    f"revocations, replace the CA again (`sros rotate_ca {where} {flag}--finish "
+                    f"--allow-unconfirmed`){by_hand} and repeat this command.",
+                )
+
+    def _restore(self, forgotten_lists: Forgotten, keyring: Keyring) -> None:
         """Record that the keystore was restored, and revoke again what ``forgotten_lists`` have.
 
         Certificates in releases that the keystore sealed are recorded, so that `revoke` knows them.
         """
-        forgotten_lists = forgotten_lists or Forgotten(self.keystore, self._now)
         for certificate in self._sealed_certificates():
             forgotten_lists.add_certificate(certificate)
         revocation = restore_revocations(

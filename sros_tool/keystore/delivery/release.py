@@ -35,6 +35,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime
+from sros_tool.pki.certificates import authority_key, validity_of
 
 if TYPE_CHECKING:
     from sros_tool.keystore.issuing.authority import Authority
@@ -155,6 +156,21 @@ def seal_problem(release: Release, authorities: Iterable[x509.Certificate]) -> s
     if signed.text != _text(release.robot, release.number, release.files):
         return "robot, number or files differ from the signed list"
     return signed.problem_for(authorities)
+
+
+def retired_authorities(
+    trusted: Sequence[x509.Certificate], sent: Iterable[x509.Certificate]
+) -> list[x509.Certificate]:
+    """Return the CAs in ``sent`` that a later CA in ``trusted`` replaced, told by key and date."""
+    keys = {authority_key(authority) for authority in trusted}
+    newest = max((validity_of(authority).not_before for authority in trusted), default=None)
+    return [
+        authority
+        for authority in sent
+        if newest
+        and validity_of(authority).not_before < newest
+        and authority_key(authority) not in keys
+    ]
 
 
 def _text(robot: str, number: int, files: Mapping[str, bytes]) -> bytes:

@@ -115,6 +115,11 @@ class RotationStep(Changed):
     kept_elsewhere: tuple[str, ...] = ()
     cut_off: tuple[str, ...] = ()
 
+    @property
+    def replaces_seals(self) -> bool:
+        """Whether the CA that seals releases is replaced, the permissions CA."""
+        return any(file != "identity_ca" for file in self.files)
+
 
 def rotate_ca(
     root: Path,
@@ -160,7 +165,7 @@ def rotate_ca(
                 _refuse_edited(change.keystore)
             cut_off = robots_cut_off(change.keystore, rotation, stage, now)
             if cut_off and not allow_unconfirmed:
-                raise _cut_off_error(change.keystore, rotation, stage, cut_off)
+                raise _cut_off_error(change.keystore, rotation, stage, cut_off, roles)
             stage = rotator.go_to(stage, roles, new_keys, validity, progress)
             if stage in (RotationStage.DISTRIBUTE, RotationStage.REISSUE):
                 change.notes += _no_robot_notes(change.keystore, change.names)
@@ -243,19 +248,25 @@ def _refuse_late_deletion(keystore: OpenedKeystore, stage: RotationStage) -> Non
 
 
 def _cut_off_error(
-    keystore: OpenedKeystore, rotation: Rotation, to: RotationStage, robots: Sequence[str]
+    keystore: OpenedKeystore,
+    rotation: Rotation,
+    to: RotationStage,
+    robots: Sequence[str],
+    roles: Sequence[str],
 ) -> KeystoreError:
     where, names = quote(str(keystore.root)), first_few(robots, _SHOWN)
     if _leaves_out_stages(rotation, to):
+        files = {replacement.file for replacement in rotation.replacements}
+        seals = files != {"identity_ca"} if files else [*roles] != [IDENTITY]
+        refuses = ", and it does not accept a published release" * seals
+        by_hand = f" by hand (`sros distribute_key {where} --robot NAME FOLDER --force`)" * seals
         return KeystoreError(
             f"several stages at once would cut off every robot: {names}",
             "No robot can trust the new CA before it has the new files: until then, and until its "
-            "processes were restarted, it cannot communicate with others that have them, and it "
-            "does not accept a published release.",
+            f"processes were restarted, it cannot communicate with others that have them{refuses}.",
             "If the robots may stand still, add --allow-unconfirmed, then bring the files to every "
-            f"robot by hand (`sros distribute_key {where} --robot NAME FOLDER --force`), and "
-            f"restart everything. Otherwise go stage by stage, with `sros rotate_ca {where} "
-            "--next`.",
+            f"robot{by_hand}, and restart everything. Otherwise go stage by stage, with "
+            f"`sros rotate_ca {where} --next`.",
         )
     return KeystoreError(
         f"not every robot has confirmed the stage {rotation.stage}: {names}",
