@@ -18,6 +18,7 @@ from cryptography import x509
 from sros_tool.dds.governance import DomainRule, TopicRule, parse_governance
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import DocumentError, SrosError
+from sros_tool.keystore.known_keys import known_authorities
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL,
@@ -1042,6 +1043,9 @@ def history(keystore: OpenedKeystore, *, now: datetime) -> History:
         return HistoryStatus.CURRENT if entry.sha256 in issued else HistoryStatus.SUPERSEDED
 
     known = {entry.sha256 for entry in entries}
+    for role in ROLES:
+        with suppress(SrosError):  # its file is not known then
+            known |= known_authorities(keystore, role) or set()
     present_files = {**retired, **revoked_files, **issued}
     places = {**present_files, **settings}
     return History(

@@ -40,7 +40,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.pki.keys import PublicKey, load_key
-from sros_tool.validity import parse_iso
+from sros_tool.validity import iso, parse_iso
 
 
 def revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
@@ -93,6 +93,43 @@ def revoked_issues(keystore: OpenedKeystore) -> Iterator[Entry]:
             serials.remove(entry.serial)
             if _is_of_trusted(keystore, entry, since):
                 yield entry
+
+
+def unlisted_revocations(keystore: OpenedKeystore, now: datetime) -> Sequence[str]:
+    """Return the enclaves with revoked certificates, valid and trusted, that no list names."""
+
+    def read() -> Sequence[str]:
+        lists = keystore.revocation_lists
+        listed = {f"{entry.serial:x}" for crl in lists for entry in crl.revoked}
+        revoked = (e for e in revoked_issues(keystore) if e.serial and e.not_after > iso(now))
+        return sorted({entry.enclave for entry in revoked if entry.serial not in listed})
+
+    return keystore.once(("unlisted", now), read)
+
+
+def known_authorities(keystore: OpenedKeystore, role: str) -> frozenset[str] | None:
+    """Return the SHA-256 of the certificates in a CA file that the keystore knows.
+
+    These are the CAs in the ledger, and the CAs that issued their certificates; None if the ledger
+    has no CA.
+    """
+    return keystore.once(("known", role), lambda: _known_authorities(keystore, role))
+
+
+def _known_authorities(keystore: OpenedKeystore, role: str) -> frozenset[str] | None:
+    chain = keystore.authority(role)
+    entries = keystore.ledger_with("what", "ca").entries
+    recorded = {entry.sha256 for entry in entries if entry.what == "ca"}
+    if not recorded:
+        return None
+    known = {digest(ca): ca for ca in chain if digest(ca) in recorded}
+    while issuers := {
+        digest(ca): ca
+        for ca in chain
+        if digest(ca) not in known and any(issued_by(issued, ca) for issued in known.values())
+    }:
+        known |= issuers
+    return frozenset(known)
 
 
 def _is_of_trusted(keystore: OpenedKeystore, entry: Entry, since: str) -> bool:

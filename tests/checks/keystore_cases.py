@@ -38,6 +38,14 @@ def case(*ids: str) -> Callable[[Break], Break]:
     return add
 
 
+def also_trusted(bench: Bench, file: str) -> None:
+    """Add another CA to a file of CAs, as the file of this enclave or keystore alone."""
+    path, (stranger, _) = bench.path(file), bench.new_authority(IS_CA)
+    data = path.read_bytes() + pem(stranger)
+    path.unlink()
+    path.write_bytes(data)
+
+
 def at(bench: Bench, days: float) -> None:
     bench.options["now"] = bench.now + days * DAY
 
@@ -174,6 +182,7 @@ CASES |= {
     "keystore.clock-behind": lambda b: at(b, -1),
     "keystore.revocation-list-ends": lambda b: b.revoke(end=b.now + 29 * DAY),
     "keystore.revocation-list-issuer": lambda b: b.revoke(by=b.foreign()),
+    "keystore.unknown-authority": lambda b: also_trusted(b, "public/permissions_ca.cert.pem"),
 }
 
 # ── what DDS refuses ───────────────────────────────────────────────────────────────────────
@@ -314,6 +323,19 @@ def _(bench: Bench) -> None:
     text = bench.document("enclaves/base/permissions.p7s")
     end = text[text.index("<not_after>") : text.index("</not_after>")]
     bench.permissions((end, f"<not_after>{year + 8}-01-01T00:00:00Z"))
+
+
+@case("keystore.revocation-list-lacks")
+def _(bench: Bench) -> None:
+    """Whoever had a copy puts the files of a revoked enclave back, and the list from before."""
+    words = ("create_enclave", "/gone", "/before"), ("revoke", "/before"), ("revoke", "/gone")
+    for verb, *names in words:
+        if names == ["/gone"]:
+            kept = bench.root.with_name("kept")
+            shutil.copytree(bench.root, kept, symlinks=True)
+        sros(verb, bench.root, *names, env={"SROS_CA_PASSPHRASE": SECRET}).ok()
+    shutil.copytree(kept / "enclaves/gone", bench.path("enclaves/gone"), symlinks=True)
+    shutil.copy(kept / "public/identity_ca.crl.pem", bench.path("public/identity_ca.crl.pem"))
 
 
 @case("enclave.crl-older", "keystore.enclave-revoked")

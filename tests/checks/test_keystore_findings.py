@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,7 +23,7 @@ from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import key_pem, load_key
 from sros_tool.policy.document import read_policy
 from tests.checks.bench import SECRET, Bench, new_key
-from tests.checks.keystore_cases import CASES, STRANGER, give_away
+from tests.checks.keystore_cases import CASES, STRANGER, also_trusted, give_away
 from tests.support.harness import copy_of, sros
 from tests.support.long_form import some
 
@@ -243,6 +244,31 @@ def test_a_ca_key_outside_of_the_keystore_is_checked(bench: Bench, tmp_path: Pat
     assert plain in ids(bench)
     copy.write_bytes(key_pem(new_key()))
     assert not {plain, mismatch} & ids(bench)
+
+
+@pytest.mark.parametrize("role", ["identity", "permissions"])
+@pytest.mark.parametrize("folder", ["public", "enclaves/base"])
+def test_a_ca_that_was_added_is_found_and_not_exported(
+    folder: str, role: str, bench: Bench, tmp_path: Path
+) -> None:
+    also_trusted(bench, f"{folder}/{role}_ca.cert.pem")
+    assert "keystore.unknown-authority" in ids(bench)
+    refused = sros("distribute_key", bench.root, "/base", tmp_path / "robot")
+    assert refused.status == 2 and "has a CA that the keystore does not know" in refused.err
+    assert not (tmp_path / "robot").exists()
+
+
+def test_an_earlier_revocation_list_is_not_exported(bench: Bench, tmp_path: Path) -> None:
+    kind = "keystore.revocation-list-lacks"
+    CASES[kind](bench)
+    words = ("distribute_key", bench.root, "/base", tmp_path / "robot")
+    assert "keystore.enclave-revoked" in ids(bench)
+    assert "lacks revoked certificates of /gone" in sros(*words).err
+    shutil.rmtree(bench.path("enclaves/gone"))
+    secret = {"SROS_CA_PASSPHRASE": SECRET}
+    sros("crl", bench.root, "--refresh", env=secret).ok()
+    assert kind not in ids(bench)
+    sros(*words).ok()
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])

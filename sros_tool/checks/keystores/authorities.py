@@ -21,6 +21,7 @@ from sros_tool.errors import SrosError
 from sros_tool.faults import ORIGINAL_KEYSTORE
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import FLEET_REMEDY
+from sros_tool.keystore.known_keys import unlisted_revocations
 from sros_tool.keystore.layout import (
     CRL,
     FLEET,
@@ -339,6 +340,15 @@ CRL_EXPIRES_SOON = FindingKind(
     "RFC 5280, 5.1.2.5; Fast DDS 2.6 to 3.6; tested.",
     "Run `sros crl KEYSTORE --refresh`.",
 )
+CRL_LACKS = FindingKind(
+    "keystore.revocation-list-lacks",
+    ERROR,
+    "a revocation list that lacks revoked certificates",
+    "An earlier list was put back, or the list was removed: every process that loads it accepts "
+    "these certificates.",
+    "RFC 5280, 5; sros: ledger.jsonl has all revocations.",
+    "Find out who changed it, and run `sros crl KEYSTORE --refresh`, which revokes them again.",
+)
 CRL_ISSUER = FindingKind(
     "keystore.revocation-list-issuer",
     ERROR,
@@ -542,10 +552,14 @@ def _separation(keystore: CheckedKeystore) -> str:
 
 
 def _revocation_list_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
-    crl = keystore.crl
+    crl, file = keystore.crl, keystore.shown(CRL)
+    if keystore.is_original:
+        with suppress(SrosError):  # a ledger or list that cannot be read is unread
+            if names := unlisted_revocations(keystore.opened, keystore.now):
+                text = f"it lacks certificates of {first_few(names, _SHOWN)}"
+                yield CRL_LACKS.found("revocation list", text, file)
     if crl is None:
         return
-    file = keystore.shown(CRL)
     remedy = _NEXT_LIST if _is_served(keystore) else ""
     if crl.next_update - keystore.now < _LIST_SOON:
         text = f"it expires at {iso(crl.next_update)}, and DDS then refuses every participant"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from typing import NamedTuple, TypeVar
 
@@ -19,18 +20,25 @@ from sros_tool.dds.governance import parse_governance
 from sros_tool.dds.permissions import Grant, mistaken_names, pairs_text
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import robot_of
+from sros_tool.keystore.known_keys import known_authorities
 from sros_tool.keystore.layout import (
     CLOSED_OBSERVER,
     CRL_FILE,
     IDENTITY_CA_FILE,
     PERMISSIONS_CA_FILE,
     ROLES,
+    ca_certificate,
     enclave_folder,
     folder_of_closed_robot,
     is_original_keystore,
 )
 from sros_tool.keystore.protection import less_protected
-from sros_tool.pki.certificates import fingerprints, load_certificates
+from sros_tool.pki.certificates import (
+    authority_text,
+    digest,
+    fingerprints,
+    load_certificates,
+)
 from sros_tool.pki.crl import load_crl, signed_by
 from sros_tool.policy.model import stated_protections
 from sros_tool.policy.rights import Right, compare, policy_rights
@@ -134,14 +142,23 @@ AUTHORITIES_DIFFER = FindingKind(
     "Export the enclave again from the keystore of the other enclaves, or create it again there.",
 )
 
+UNKNOWN_AUTHORITY = FindingKind(
+    "keystore.unknown-authority",
+    ERROR,
+    "a file of CAs with a CA that the keystore does not know",
+    "Fast DDS trusts every CA in the file, and Cyclone DDS the first one. Whoever has the key of "
+    "an identity CA can make any enclave, and with the key of a permissions CA give any rights.",
+    "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; sros: ledger.jsonl has the CAs.",
+    "Find out who added it, and restore the file from a backup.",
+)
 REVOKED_BY_NEWER_LIST = FindingKind(
     "keystore.enclave-revoked",
     ERROR,
-    "an enclave that a newer revocation list revokes",
-    "The enclave was revoked after it was exported. It can still start, and communicates with all "
-    "processes that have not loaded the newer list.",
+    "an enclave that a newer revocation list, or the ledger, revokes",
+    "The enclave was revoked after it was exported, or its files were put back. It can still "
+    "start, and communicates with all processes that have not loaded the newer list.",
     "RFC 5280, 5; rmw_dds_common (crl.pem).",
-    "Remove the enclave's folder from the robot.",
+    "Remove the enclave's folder.",
 )
 OLDER_LIST = FindingKind(
     "enclave.crl-older",
@@ -317,6 +334,13 @@ def _trust_findings(
     In an export, the CAs of most enclaves count instead.  During a rotation an enclave trusts the
     old and the new CA, so one common CA is enough.
     """
+    for role, authorities in keystore.authorities.items():
+        known = known_authorities(keystore.opened, role)
+        strangers = () if known is None else [ca for ca in authorities if digest(ca) not in known]
+        for authority in strangers:
+            text = f"{authority_text(authority)} is not in the ledger"
+            path = keystore.shown(ca_certificate(role))
+            yield UNKNOWN_AUTHORITY.found(f"{role} CA", text, path)
     for index, (role, file) in enumerate(zip(ROLES, _AUTHORITY_FILES, strict=True)):
         everyone = [summary for summary in summaries if summary.trusted[index]]
         if not everyone:
@@ -329,10 +353,13 @@ def _trust_findings(
             )
             trusted_elsewhere = "the keystore"
         for summary in everyone:
+            place = f"{keystore.root}/{enclave_folder(summary.name)}/{file}"
             if not summary.trusted[index] & usual:
-                place = f"{keystore.root}/{enclave_folder(summary.name)}/{file}"
                 text = f"{file} contains another CA than {trusted_elsewhere}"
                 yield AUTHORITIES_DIFFER.found(summary.name, text, place)
+            elif chain and (more := sorted(summary.trusted[index] - usual)):
+                text = f"the CAs of the keystore, and another one (SHA-256 {more[0][:8]})"
+                yield UNKNOWN_AUTHORITY.found(summary.name, f"{file} has {text}", place)
 
 
 def _exported_governance_findings(
@@ -380,17 +407,24 @@ def _ledger_findings(
     if not entries:
         return
     known = {entry.sha256 for entry in entries}
+    revoked = {entry.serial for entry in entries if entry.what == "revocation"}
+    with suppress(SrosError):  # a list that cannot be read is unread
+        lists = keystore.opened.revocation_lists
+        revoked -= {f"{entry.serial:x}" for crl in lists for entry in crl.revoked}
     signed: dict[str, list[str]] = defaultdict(list)
     for entry in entries:
         if entry.what == "permissions":
             signed[entry.enclave].append(entry.sha256)
     for summary in summaries:
         place = f"{keystore.root}/{enclave_folder(summary.name)}"
-        for file, digest in (
+        if f"{summary.serial:x}" in revoked:
+            text = "the ledger has its revocation, and the revocation list lacks it"
+            yield REVOKED_BY_NEWER_LIST.found(summary.name, text, place)
+        for file, sha256 in (
             ("cert.pem", summary.certificate),
             ("permissions.p7s", summary.permissions),
         ):
-            if digest and digest not in known:
+            if sha256 and sha256 not in known:
                 text = f"{file} is not in the ledger"
                 yield UNEXPLAINED.found(summary.name, text, f"{place}/{file}")
         if (

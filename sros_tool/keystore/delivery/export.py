@@ -22,15 +22,18 @@ from sros_tool.keystore.confirmation import enclave_of
 from sros_tool.keystore.delivery.archive import SUFFIXES, file_mode, pack
 from sros_tool.keystore.delivery.robot import check_same_authority
 from sros_tool.keystore.fleet import load_fleet
+from sros_tool.keystore.known_keys import known_authorities, unlisted_revocations
 from sros_tool.keystore.layout import (
     AGENT,
     CRL_FILE,
     ENCLAVES,
+    IDENTITY,
     IDENTITY_CA_FILE,
     KEY_FILE,
     KEY_FILES,
     KEY_URI_FILE,
     OPTIONAL_FILES,
+    PERMISSIONS,
     PERMISSIONS_CA_FILE,
     PRIVATE,
     REQUIRED_FILES,
@@ -51,11 +54,12 @@ from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.keystore.transaction import Change, Transaction
 from sros_tool.keystore.zenoh_files import open_zenoh
 from sros_tool.names import check_enclave_name
-from sros_tool.pki.certificates import load_certificates, validity_of
+from sros_tool.pki.certificates import fingerprints, load_certificates, validity_of
 from sros_tool.pki.crl import list_number, newest_list
 from sros_tool.pki.keys import holds_private_key
 from sros_tool.pki.token import read_token_file
 from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes, Words
+from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
 
 _ARCHIVE_SUFFIXES = SUFFIXES
@@ -211,6 +215,7 @@ def exported_files(
         KeystoreError: an enclave does not exist, or cannot run.
     """
     keystore.check()
+    _check_list(keystore, now)
     for name in names:
         if not keystore.has_enclave(check_enclave_name(name)):
             raise missing_enclave_error(keystore, name, keystore.names)
@@ -252,6 +257,7 @@ def released_enclave(keystore: OpenedKeystore, name: str, now: datetime) -> Rele
     Raises:
         KeystoreError: the enclave cannot run for another reason.
     """
+    _check_list(keystore, now)
     evaluation = _evaluate_enclave(keystore, name, now)
     state = evaluation.state
     problems = state.problems_in_keystore
@@ -343,6 +349,7 @@ def _files_of(
     return _read_files(keystore, name, _FILES)
 
 
+_ROLES_OF_FILES = {IDENTITY_CA_FILE: IDENTITY, PERMISSIONS_CA_FILE: PERMISSIONS}
 _FILES = (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES, *ZENOH_FILES)
 
 
@@ -362,7 +369,33 @@ def _read_files(
                 files[path] = opened.read_inside(path)
                 if file != KEY_FILE and holds_private_key(files[path]):
                     raise _ca_key_error(keystore.root / path)
+                if role := _ROLES_OF_FILES.get(file):
+                    _check_authorities(keystore, role, keystore.root / path, files[path])
     return files
+
+
+def _check_list(keystore: OpenedKeystore, now: datetime) -> None:
+    """Raise `KeystoreError` if the revocation list lacks what the ledger records as revoked."""
+    if names := unlisted_revocations(keystore, now):
+        raise KeystoreError(
+            f"the revocation list of keystore '{keystore.root}' lacks revoked certificates of "
+            f"{first_few(names, 3)}",
+            "An earlier list was put back, or the list was removed, and robots would trust them.",
+            f"Find out who changed it, and run `sros crl {quote(str(keystore.root))} --refresh`.",
+        )
+
+
+def _check_authorities(keystore: OpenedKeystore, role: str, path: Path, data: bytes) -> None:
+    """Raise `KeystoreError` if a CA file has a CA that a sound ledger does not know."""
+    known = known_authorities(keystore, role)
+    if known is None or keystore.ledger_with("what", "ca").gaps:
+        return
+    if strangers := sorted(fingerprints(data) - known):
+        raise KeystoreError(
+            f"'{path}' has a CA that the keystore does not know (SHA-256 {strangers[0][:8]})",
+            "Robots would trust everything that is issued with its key.",
+            f"Find out who added it: `sros check {quote(str(keystore.root))}`.",
+        )
 
 
 def _check_not_ca_key(folder: Path, state: OpenedEnclave) -> None:
