@@ -12,7 +12,7 @@ import http.client
 import os
 import ssl
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, tzinfo
@@ -182,7 +182,7 @@ class _Round:
         self._is_in_step = False
         """Whether the installed files, with their revocation list, are those of the last
         release."""
-        self._began = time.clock_gettime(time.CLOCK_BOOTTIME)
+        self._began = _since_boot()
 
     def run(self) -> Round:
         now, before = self._machine.now, self._state
@@ -193,11 +193,11 @@ class _Round:
         self._state = replace(before, boot=boot)
         if self._machine.restarted or has_started:
             # After a start of the machine no process has files of before; what is seen counts.
-            self._state = replace(self._state, due=(), list_due=(), restarted=())
+            self._forget_restarts()
         # Before files are replaced: processes may have started with those that are here now.
         self._note_due((), self._enclaves())
         if self._machine.restarted:
-            self._state = replace(self._state, due=(), list_due=())
+            self._forget_restarts()
         proven = self._proven_moment()
         clock = self._clock(proven)
         # Documents that were verified prove that this moment has passed, whatever the clock shows.
@@ -230,7 +230,13 @@ class _Round:
         )
         again = tuple(name for name in self._state.restarted if name in due)
         self._state = replace(
-            self._state, due=due, unseen=unseen, list_due=list_due, restarted=again
+            self._state,
+            due=due,
+            unseen=unseen,
+            list_due=list_due,
+            restarted=again,
+            replaced=_of(due, self._state.replaced),
+            list_replaced=_of(list_due, self._state.list_replaced),
         )
         asked = self._renewals(names)
         arrived = self._confirm(names, opened, processes, clock, asked)
@@ -473,16 +479,35 @@ class _Round:
                 return not smime.parse(seal).text.endswith(b"\n" + listed_digests(release.files))
         return False
 
+    def _forget_restarts(self) -> None:
+        nothing: dict[str, float] = {}
+        self._state = replace(
+            self._state,
+            due=(),
+            list_due=(),
+            restarted=(),
+            replaced=nothing,
+            list_replaced=nothing,
+        )
+
     def _record_due(self, names: Sequence[str]) -> None:
         """Record restarts before the change, so that the agent knows them if it is killed."""
-        self._state = replace(self._state, due=tuple(sorted({*self._state.due, *names})))
+        state, moments = self._state, dict.fromkeys(names, _since_boot())
+        self._state = replace(
+            state,
+            due=tuple(sorted({*state.due, *names})),
+            replaced={**state.replaced, **moments},
+            list_replaced={**state.list_replaced, **moments},
+        )
         self._save()
 
     def _note_due(self, changed: Iterable[str], names: Iterable[str]) -> None:
         """Note the restarts that are due: also for files that somebody else changed."""
         before, files = self._state.files, self._digests(names)
-        new_files = {*changed}
+        changed = {*changed}
+        new_files, moment = {*changed}, _since_boot()
         due = {*self._state.due, *changed} & files.keys()
+        list_replaced = dict(self._state.list_replaced)
         list_due = {*self._state.list_due} & files.keys()
         list_since = dict(self._state.list_since)
         for name, digests in files.items():
@@ -495,11 +520,14 @@ class _Round:
                 due.add(name)
                 if before_trust != trust:
                     list_due.add(name)
+                    list_replaced |= {name: moment} if name in changed else {}
         self._state = replace(
             self._state,
             due=tuple(sorted(due)),
             restarted=tuple(name for name in self._state.restarted if name not in new_files),
             list_due=tuple(sorted(list_due)),
+            replaced=_of(due, {**self._state.replaced, **dict.fromkeys(changed, moment)}),
+            list_replaced=_of(list_due, list_replaced),
             list_since={name: list_since[name] for name in files if name in list_since},
             files=files,
         )
@@ -584,19 +612,29 @@ class _Round:
 
     def _look(self, names: Iterable[str]) -> EnclaveProcesses:
         """Examine the processes at the current time."""
-        machine = self._machine
+        machine, state, now, since_boot = self._machine, self._state, self._time(), _since_boot()
+
+        def on_the_clock(moments: Mapping[str, float]) -> dict[str, datetime]:
+            return {
+                name: now - timedelta(seconds=since_boot - moment)
+                for name, moment in moments.items()
+                if moment <= since_boot  # otherwise of another start
+            }
+
         return look_at_processes(
             self._folder,
             names,
-            now=self._time(),
+            now=now,
             zone=machine.zone,
             look=machine.look,
-            list_since=self._state.list_since,
+            list_since=state.list_since,
+            replaced=on_the_clock(state.replaced),
+            list_replaced=on_the_clock(state.list_replaced),
         )
 
     def _time(self) -> datetime:
         """Return the current time, which is later than the start of the round."""
-        passed = timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME) - self._began)
+        passed = timedelta(seconds=_since_boot() - self._began)
         return self._machine.now + passed
 
     def _renewals(self, names: Iterable[str]) -> Renewals:
@@ -786,6 +824,15 @@ class _Round:
                     certificates_by_expiry.append((until, files))
         certificates_by_expiry.sort(key=lambda pair: pair[0], reverse=True)
         return [files for _, files in certificates_by_expiry[:_MOST_CERTIFICATES]]
+
+
+def _since_boot() -> float:
+    """Return the seconds since the start of the machine."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+def _of(names: Collection[str], moments: Mapping[str, float]) -> dict[str, float]:
+    return {name: moment for name, moment in moments.items() if name in names}
 
 
 def _boot_digest(robot: str, boot: str) -> str | None:

@@ -86,8 +86,15 @@ def look_at_processes(
     zone: tzinfo,
     look: Callable[[datetime], RunningProcesses] | None = None,
     list_since: Mapping[str, datetime] = MappingProxyType({}),
+    replaced: Mapping[str, datetime] = MappingProxyType({}),
+    list_replaced: Mapping[str, datetime] = MappingProxyType({}),
 ) -> EnclaveProcesses:
-    """Return what runs in the enclaves ``names`` of ``folder``; ``look`` reads the processes."""
+    """Return what runs in the enclaves ``names`` of ``folder``; ``look`` reads the processes.
+
+    ``replaced`` maps enclaves to when their files, and ``list_replaced`` to when the files that
+    decide whom they trust, were replaced, by the clock of ``now``: the times of the files are by
+    the clock of then, which may have been set since.
+    """
     running = (look or ProcessTable().look)(now)
     own_processes = [process for process in running.processes if _is_of(process, folder)]
     readers, owner = list[Process](), folder.stat().st_uid
@@ -95,12 +102,18 @@ def look_at_processes(
         if process.user in (0, owner) or (process.enclave and _is_key_readable(process.enclave)):
             readers.append(process)
 
+    def is_outdated(process: Process, enclave: ProcessEnclave) -> bool:
+        return _is_older(process, replaced) or any(newer_files(process, enclave))
+
     def lacks_list(process: Process, enclave: ProcessEnclave) -> bool:
         since = list_since.get(_enclave_of(process))
-        return may_lack_list(process, enclave, has_list=bool(since and since < process.started))
+        has_list = bool(since and since < process.started)
+        return _is_older(process, list_replaced) or may_lack_list(
+            process, enclave, has_list=has_list
+        )
 
     names = [*names]
-    states = _states(names, own_processes, _is_outdated, readers)
+    states = _states(names, own_processes, is_outdated, readers)
     list_states = _states(names, own_processes, lacks_list, readers)
     other_processes = [
         process
@@ -130,7 +143,7 @@ def look_at_processes(
     )
     return EnclaveProcesses(
         states,
-        _states(names, readers, _is_outdated, readers),
+        _states(names, readers, is_outdated, readers),
         list_states,
         tuple(sorted({*map(_enclave_of, elsewhere)})),
         complete,
@@ -159,8 +172,9 @@ def _is_of(process: Process, folder: Path) -> bool:
     return named and not _folder_is_known(process)
 
 
-def _is_outdated(process: Process, enclave: ProcessEnclave) -> bool:
-    return any(newer_files(process, enclave))
+def _is_older(process: Process, moments: Mapping[str, datetime]) -> bool:
+    moment = moments.get(_enclave_of(process))
+    return moment is not None and process.started < moment
 
 
 def _is_key_readable(enclave: ProcessEnclave) -> bool:

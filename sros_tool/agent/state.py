@@ -49,9 +49,11 @@ class AgentState:
     files that decide whom the enclave trusts.  A change of a digest, whoever wrote the files, makes
     a restart due; ``list_since`` maps enclaves to the time since when the second digest is the
     same.  ``fetched`` and ``sent`` are when the source and the inbox were last reached.
-    ``repaired`` is a sentence on files that were not those of the release and were replaced, at
-    ``repaired_at``.  ``exposed`` maps paths of private keys that others could read, until the agent
-    closed them, to the time of that round.
+    ``replaced`` and ``list_replaced`` map enclaves of `due` and `list_due` to when the agent last
+    replaced their files, in seconds since the start of the machine: no setting of its clock changes
+    that.  ``repaired`` is a sentence on files that were not those of the release and were replaced,
+    at ``repaired_at``.  ``exposed`` maps paths of private keys that others could read, until the
+    agent closed them, to the time of that round.
     """
 
     release: int = 0
@@ -69,6 +71,8 @@ class AgentState:
     repaired: str = ""
     repaired_at: datetime | None = None
     list_since: Mapping[str, datetime] = field(default_factory=dict)
+    replaced: Mapping[str, float] = field(default_factory=dict)
+    list_replaced: Mapping[str, float] = field(default_factory=dict)
     exposed: Mapping[str, datetime] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
 
@@ -122,6 +126,11 @@ def _state_from(value: Any) -> AgentState:
         value[moments] = {
             _text(path): parse_iso(_text(moment))
             for path, moment in dict(value.get(moments, {})).items()
+        }
+    for seconds in ("replaced", "list_replaced"):
+        value[seconds] = {
+            check_enclave_name(_text(name)): float(moment)
+            for name, moment in dict(value.get(seconds, {})).items()
         }
     value["problems"] = tuple(map(_text, value["problems"]))
     return AgentState(**value)

@@ -589,6 +589,20 @@ def test_a_look_at_the_processes_has_its_own_time(r1: Robot) -> None:
     assert now < looked <= now + passed
 
 
+def test_a_clock_that_was_set_makes_no_process_newer_than_files(home: Home, r1: Robot) -> None:
+    """On a robot without a battery for its clock, nodes start before the clock is set."""
+    r1.round()
+    r1.release = home.revoked
+    r1.started = {"/r1/a": moment() - timedelta(minutes=1)}
+    assert r1.round().restart == ("/r1/a",)
+    set_forward = timedelta(hours=1)
+    r1.started["/r1/a"] += set_forward  # by the clock of now; the files are an hour old then
+    assert r1.round(moment() + set_forward).restart == r1.message().restart == ("/r1/a",)
+    assert r1.message().crl_restart is None
+    r1.started["/r1/a"] = moment() + set_forward + timedelta(seconds=1)
+    assert not r1.round(moment() + set_forward).restart
+
+
 @pytest.mark.parametrize("how", ["restart of the machine", "somebody says so"])
 def test_a_restart_of_all_ends_what_cannot_be_seen(how: str, home: Home, r1: Robot) -> None:
     r1.round()
