@@ -32,9 +32,9 @@ from sros_tool.demo.scenarios.attacks import (
 from sros_tool.demo.scenarios.model import (
     DEFAULT_TOPIC,
     DENIED_TOPIC,
+    OUTCOMES,
     OWN,
     SERVICE,
-    STATUS_OF,
     Party,
     Role,
     Row,
@@ -166,7 +166,7 @@ class UserKeystore(NamedTuple):
             return row
         wild = next((f" by {expression}" for expression in expressions if _is_wild(expression)), "")
         claim = row.claims[0]
-        success = STATUS_OF[claim.relation, True]
+        success = OUTCOMES[claim.relation][True]
         return replace(
             row,
             expected=success,

@@ -11,13 +11,14 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
+from itertools import chain
 from typing import Annotated, NamedTuple
 
 from sros_tool.dds.advisories import Advisory, known_vulnerabilities
 from sros_tool.demo.backend import CYCLONE, RCLPY, ZENOH
 from sros_tool.demo.casting import CastMember
 from sros_tool.demo.scenarios.model import (
-    STATUS_OF,
+    OUTCOMES,
     SUCCESSES,
     Claim,
     Party,
@@ -205,7 +206,7 @@ def _observe(record: RowRecord) -> _Finding:
     controls = [(claim, _judge_claim(claim, record)) for claim in record.row.controls]
     wrong = [finding for claim, finding in claims if finding.status is not claim.expected]
     if wrong:
-        definite = wrong[0].status in STATUS_OF.values()
+        definite = wrong[0].status in chain(*OUTCOMES.values())
         several = len(claims) > 1
         status = RowStatus.DISTURBED if several and definite else wrong[0].status
         return _Finding(status, wrong[0].detail)
@@ -243,7 +244,7 @@ class _Case:
 
     def result(self, holds: bool, detail: str) -> _Finding:
         """Return the finding that the claim's relation ``holds``, or that it does not."""
-        return _Finding(STATUS_OF[self.claim.relation, holds], detail)
+        return _Finding(OUTCOMES[self.claim.relation][holds], detail)
 
     def messages_sent(self, party: PartyRecord) -> list[Event]:
         """Return the messages that a party sent during the observation."""
@@ -903,9 +904,8 @@ def _attack_lines(
         "| --- | --- | --- | --- | --- |",
     ]
     for row in closed:
-        twins = "; ".join(
-            _unique(_twin_text(twin) for twin in rows_without_defence if twin.attack == row.attack)
-        )
+        texts = (_twin_text(twin) for twin in rows_without_defence if twin.attack == row.attack)
+        twins = "; ".join(dict.fromkeys(texts))
         lines.append(f"| {_cells(row)} | {row.mechanism} | {twins} |")
     if open_:
         lines += ["", "## Attacks known to succeed, and remedies", ""]
@@ -923,10 +923,6 @@ def _twin_text(row: RowResult) -> str:
         # The defence is a fault of the attacker's own files.
         return f"{row.observed} with the right {row.defence_removed.removeprefix('the wrong ')}"
     return f"{row.observed} without {row.defence_removed}"
-
-
-def _unique(texts: Iterable[str]) -> list[str]:
-    return list(dict.fromkeys(texts))
 
 
 def _rows_table(rows: Sequence[RowResult]) -> list[str]:

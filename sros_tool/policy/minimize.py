@@ -245,9 +245,6 @@ class _Narrowing:
             return True
         return is_expression(part.name) and self._rules.overlaps(part)
 
-    def _is_observed(self, rule: Right) -> bool:
-        return self._use.overlaps(rule)
-
     def result(self) -> tuple[Enclave, EnclaveUse]:
         if not self._observed:
             return self._enclave, self._use_of({*self._stated}, ())
@@ -259,7 +256,7 @@ class _Narrowing:
 
     def _use_of(self, kept_rights: set[Right], wide: Sequence[WideRule]) -> EnclaveUse:
         is_observed = bool(self._observed)
-        unused = [right for right in self._stated if not self._is_observed(right)]
+        unused = [right for right in self._stated if not self._use.overlaps(right)]
         rewritten = {wildcard.rule for wildcard in wide}
         remaining = [*kept_rights, *(right for wildcard in wide for right in wildcard.replacement)]
         in_use = self._pairs(self._in_use)
@@ -286,7 +283,7 @@ class _Narrowing:
         if rule in self._common:
             return True
         if not is_expression(rule.name):
-            return self._is_observed(rule)
+            return self._use.overlaps(rule)
         return any(
             is_expression(used.name)
             and (used.name == part.name or not covers(part.name, used.name))

@@ -292,10 +292,6 @@ class Writer:
         if code < 0:
             raise DdsError("cannot write", _describe_return(self._library, code))
 
-    def matched(self) -> int:
-        """Return the number of readers that this writer sends to."""
-        return max(0, int(self._library.api.dds_get_matched_subscriptions(self.handle, None, 0)))
-
 
 class Reader:
     """A reader of strings, created by `Participant.reader`."""
@@ -327,10 +323,6 @@ class Reader:
     def count(self) -> int:
         """Return how many messages were received since the last call."""
         return len(_take_samples(self._library, self.handle, 64, lambda _: None))
-
-    def matched(self) -> int:
-        """Return the number of writers that this reader receives from."""
-        return max(0, int(self._library.api.dds_get_matched_publications(self.handle, None, 0)))
 
 
 def security_properties(enclave: Path, plugins: Path | None) -> dict[str, str]:
@@ -721,14 +713,6 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "dds_return_loan": (
         ctypes.c_int32,
         [_ENTITY, ctypes.POINTER(ctypes.c_void_p), ctypes.c_int32],
-    ),
-    "dds_get_matched_subscriptions": (
-        ctypes.c_int32,
-        [_ENTITY, ctypes.c_void_p, ctypes.c_size_t],
-    ),
-    "dds_get_matched_publications": (
-        ctypes.c_int32,
-        [_ENTITY, ctypes.c_void_p, ctypes.c_size_t],
     ),
     "dds_create_waitset": (_ENTITY, [_ENTITY]),
     "dds_create_readcondition": (_ENTITY, [_ENTITY, ctypes.c_uint32]),

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import chain
+
 import pytest
 
 from sros_tool.demo.scenarios import SCENARIOS, choose_scenarios
 from sros_tool.demo.scenarios.communication import ROWS
 from sros_tool.demo.scenarios.model import (
     CALLING,
+    OUTCOMES,
     SPEAKING,
-    STATUS_OF,
     Relation,
     Role,
     Row,
@@ -41,7 +43,7 @@ def test_what_is_expected_of_a_row_is_what_its_claims_say(row: Row) -> None:
     if len(row.claims) == 1:
         assert row.claims[0].expected is row.expected
     else:
-        assert row.expected not in STATUS_OF.values()
+        assert row.expected not in chain(*OUTCOMES.values())
 
 
 @for_every(ROWS, lambda row: row.name)

@@ -127,8 +127,6 @@ def test_what_is_written_is_read_and_seen(child: Callable[[Identity, str], list[
         """
         with join() as p:
             reader, writer = p.reader("rt/chatter"), p.writer("rt/chatter")
-            while not (reader.matched() and writer.matched()):
-                time.sleep(0.01)
             writer.write("Grüße")
             writer.write("")
             heard = []

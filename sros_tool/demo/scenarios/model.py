@@ -107,36 +107,25 @@ class Relation(StrEnum):
     READABLE = "is readable"
 
 
-STATUS_OF: dict[tuple[Relation, bool], RowStatus] = {
-    (Relation.HEARS, True): RowStatus.HEARD,
-    (Relation.HEARS, False): RowStatus.NOT_HEARD,
-    (Relation.HEARS_AGAIN, True): RowStatus.HEARD_AGAIN,
-    (Relation.HEARS_AGAIN, False): RowStatus.NOT_HEARD_AGAIN,
-    (Relation.BELIEVES, True): RowStatus.DECEIVED,
-    (Relation.BELIEVES, False): RowStatus.NOT_DECEIVED,
-    (Relation.HEARS_EXPIRED, True): RowStatus.STILL_HEARD,
-    (Relation.HEARS_EXPIRED, False): RowStatus.CUT_OFF,
-    (Relation.EXECUTES, True): RowStatus.EXECUTED,
-    (Relation.EXECUTES, False): RowStatus.NOT_EXECUTED,
-    (Relation.IS_ANSWERED, True): RowStatus.ANSWERED,
-    (Relation.IS_ANSWERED, False): RowStatus.NOT_ANSWERED,
-    (Relation.IS_REFUSED, True): RowStatus.REFUSED,
-    (Relation.IS_REFUSED, False): RowStatus.STARTED,
-    (Relation.STARTS, True): RowStatus.STARTED,
-    (Relation.STARTS, False): RowStatus.REFUSED,
-    (Relation.SEES, True): RowStatus.VISIBLE,
-    (Relation.SEES, False): RowStatus.NOT_VISIBLE,
-    (Relation.LOSES, True): RowStatus.ERASED,
-    (Relation.LOSES, False): RowStatus.NOT_ERASED,
-    (Relation.READABLE, True): RowStatus.READABLE,
-    (Relation.READABLE, False): RowStatus.NOT_READABLE,
+OUTCOMES: Mapping[Relation, tuple[RowStatus, RowStatus]] = {
+    Relation.HEARS: (RowStatus.NOT_HEARD, RowStatus.HEARD),
+    Relation.HEARS_AGAIN: (RowStatus.NOT_HEARD_AGAIN, RowStatus.HEARD_AGAIN),
+    Relation.BELIEVES: (RowStatus.NOT_DECEIVED, RowStatus.DECEIVED),
+    Relation.HEARS_EXPIRED: (RowStatus.CUT_OFF, RowStatus.STILL_HEARD),
+    Relation.EXECUTES: (RowStatus.NOT_EXECUTED, RowStatus.EXECUTED),
+    Relation.IS_ANSWERED: (RowStatus.NOT_ANSWERED, RowStatus.ANSWERED),
+    Relation.IS_REFUSED: (RowStatus.STARTED, RowStatus.REFUSED),
+    Relation.STARTS: (RowStatus.REFUSED, RowStatus.STARTED),
+    Relation.SEES: (RowStatus.NOT_VISIBLE, RowStatus.VISIBLE),
+    Relation.LOSES: (RowStatus.NOT_ERASED, RowStatus.ERASED),
+    Relation.READABLE: (RowStatus.NOT_READABLE, RowStatus.READABLE),
 }
-
+"""The statuses of a relation that does not hold, and of one that holds."""
 
 SUCCESSES = frozenset(
-    status
-    for (relation, holds), status in STATUS_OF.items()
-    if holds and relation not in (Relation.IS_REFUSED, Relation.STARTS)
+    holding
+    for relation, (_, holding) in OUTCOMES.items()
+    if relation not in (Relation.IS_REFUSED, Relation.STARTS)
 )
 """Statuses of an attack that succeeded."""
 
@@ -227,7 +216,7 @@ class Claim:
     @property
     def expected(self) -> RowStatus:
         """The status that the claim expects."""
-        return self.denied or STATUS_OF[self.relation, self.holds]
+        return self.denied or OUTCOMES[self.relation][self.holds]
 
     def expecting(self, status: RowStatus) -> Claim:
         """Return the claim with another expected status.
@@ -238,7 +227,7 @@ class Claim:
         if status in DENIALS:
             return replace(self, holds=False, denied=status)
         for holds in (True, False):
-            if STATUS_OF[self.relation, holds] is status:
+            if OUTCOMES[self.relation][holds] is status:
                 return replace(self, holds=holds, denied=None)
         raise ValueError(f"a claim {self.relation.value!r} cannot have status {status.value!r}")
 
