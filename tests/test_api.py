@@ -418,12 +418,12 @@ def test_requirements_are_decided(tmp_path: Path) -> None:
     policy, required = tmp_path / "robot.xml", tmp_path / "required.toml"
     policy.write_text(policy_text({"/a": publish("/x*"), "/b": publish("/y")}))
     required.write_text('[[nobody]]\npublish = ["/xyz"]\n[[nobody]]\npublish = ["/z"]\n')
-    broken, vacuous = sros_tool.check_requirements(policy, required)
+    broken, unnamed = sros_tool.check_requirements(policy, required)
     assert (broken.id, broken.subject, broken.line) == ("requirement.violated", "/a", 1)
     assert broken.text == "may publish /xyz by /x*, but nobody may publish /xyz"
     assert [str(each) for each in broken.related] == [f"{required}:1"]
-    assert (vacuous.id, vacuous.file, vacuous.line) == ("requirement.vacuous", str(required), 3)
-    assert sros_tool.check_requirements(policy, required, vendor="zenoh") == (broken, vacuous)
+    assert (unnamed.id, unnamed.file, unnamed.line) == ("requirement.unnamed", str(required), 3)
+    assert sros_tool.check_requirements(policy, required, vendor="zenoh") == (broken, unnamed)
     policy.write_text(policy_text({"/{robot}/a": publish("/{robot}/x")}))
     fleet, more = tmp_path / "fleet.toml", tmp_path / "more.toml"
     fleet.write_text("[robots.r1]\n")

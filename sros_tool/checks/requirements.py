@@ -27,8 +27,8 @@ UNNAMED = FindingKind(
     "requirement.unnamed",
     NOTE,
     "a requirement about a name that no right states",
-    "Only wildcards match the name. A misspelled name looks like this, and so does one that is to "
-    "stay unused.",
+    "At most wildcards match the name. A misspelled name looks like this, and so does one that is "
+    "to stay unused.",
     "The requirements file.",
     "Compare the name with those of the robot; ignore this if it is to stay unused.",
     prominent=True,

@@ -645,8 +645,9 @@ def _unused_names(
 ) -> tuple[list[str], list[str]]:
     """Return clauses on names in a requirement without users, and the names that no right states.
 
-    The latter are in use only by wildcards.  Such a name counts as one without users if a right
-    states another name that differs by one slip, as in ``/cmd_vle``.
+    The latter are in use only by wildcards, or nobody may use them and they are to stay unused
+    (`Nobody`).  Such a name counts as one without users if a right states another name that differs
+    by one slip, as in ``/cmd_vle``, or if the name is in use as another kind (service or action).
     """
     clauses, unnamed = [], []
     for right, name, parts in _restricted_names(requirement):
@@ -657,10 +658,13 @@ def _unused_names(
         )
         meant = "" if known else _meant(name, _stated_names(world, right))
         if not _is_used_by_anybody(world, parts, name, limit):
-            other = _OF_OTHER_KIND.get(right, "") if verb == right else ""
+            other = _OF_OTHER_KIND.get(right, "")
             if other and _is_used_by_anybody(world, _sufficient_parts(other), name, limit):
                 meant = f", but some may {other} {_named_right(other, name)}"
-            clauses.append(f"no enclave may {verb} {named}{meant}")
+            if isinstance(requirement, Nobody) and not meant:
+                unnamed.append(named)
+            else:
+                clauses.append(f"no enclave may {verb} {named}{meant}")
         elif meant:
             clauses.append(f"only wildcards match {named}{meant}")
         elif not known:

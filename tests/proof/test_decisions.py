@@ -184,6 +184,26 @@ def test_a_guard_of_a_name_that_only_wildcards_match(name: str) -> None:
     assert (stated.vacuous, stated.unnamed) == ((), ())
 
 
+@pytest.mark.parametrize(
+    ("required", "reason"),
+    [
+        ('publish = ["*joint_commands"]', ""),
+        ('call = ["/move"]', ""),
+        ('call = ["/set"]', "no enclave may use action /set, but some may request service /set"),
+        ('publish = ["/cmd_vle"]', "no enclave may use topic /cmd_vle (perhaps /cmd_vel is meant)"),
+    ],
+)
+def test_a_package_may_promise_what_its_nodes_never_do(required: str, reason: str) -> None:
+    rights = {"/a": may("publish", "/cmd_vel") + may("request", "/set")}
+    found = decided(rights, f"[[nobody]]\n{required}")
+    assert found.violations == ()
+    assert [each for _, reasons in found.vacuous for each in reasons] == [reason] * bool(reason)
+    assert bool(found.unnamed) is not bool(reason)
+    rights["/b"] = may("publish", "/arm/joint_commands")
+    broken = decided(rights, '[[nobody]]\npublish = ["*joint_commands"]')
+    assert len(broken.violations) == 1
+
+
 def test_what_is_proposed_can_fail() -> None:
     two = {"/a": may("publish", "/x", "/*"), "/b": may("subscribe", "/x")}
     system = robot(two)
