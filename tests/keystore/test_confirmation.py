@@ -148,7 +148,7 @@ def hostile() -> list[tuple[str, bytes]]:
     ]
     faults: dict[str, tuple[object, ...]] = {
         "format": (True, "1", 2, 1.0, None, [1]),
-        "robot": (7, "", "a" * 65, "r7/..", "r7\n", "r__7", CONTROLS, None, {}),
+        "robot": (7, "", "a" * 65, "r7/..", "r7\n", "r-7", CONTROLS, None, {}),
         "time": (
             0, "", "2027-05-21", "2027-13-01T00:00:00Z", "0000-00-00T00:00:00Z",
             "2027-05-21T12:50:48+01:00", "2027-05-21T12:50:48Z\n", CONTROLS, None,
