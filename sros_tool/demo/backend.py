@@ -296,6 +296,7 @@ def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Co
     return frozenset(name for name, holds in holding.items() if holds) | vendor
 
 
+_SECONDS_TO_STOP = 5.0
 _SILENCE = 5.0
 """Seconds without a message or connection after which a node reports silence."""
 
@@ -418,8 +419,9 @@ def run_by_hand(node: HandNode, say: Callable[[str], None]) -> int:
     stopped = threading.Event()
 
     def stop(*_: object) -> None:
+        again = stopped.is_set()
         stopped.set()
-        process.terminate()
+        end_within(0 if again else _SECONDS_TO_STOP, process)
 
     with subprocess.Popen(command, pass_fds=[writing], preexec_fn=end_with_starter()) as process:
         os.close(writing)
@@ -429,7 +431,8 @@ def run_by_hand(node: HandNode, say: Callable[[str], None]) -> int:
             last = _tell(node, pipe.fileno(), say)
         status = process.wait()
     if stopped.is_set():
-        say("stopped")
+        by_force = ", by force: it did not end by itself" * (status == -signal.SIGKILL)
+        say(f"stopped{by_force}")
     elif last and last.stage is ProcessStage.ENDPOINT and os.environ.get(ENABLE) == "true":
         verb = "publish" if node.role is Role.TALKER else "subscribe"
         asked = shlex.join((os.environ.get(KEYSTORE, ""), os.environ.get(ENCLAVE) or "/", verb))
@@ -437,6 +440,17 @@ def run_by_hand(node: HandNode, say: Callable[[str], None]) -> int:
     elif status and node.backend == RCLPY:
         say("`sros doctor` says whether rclpy on this machine can be secured")
     return status
+
+
+def end_within(seconds: float, process: subprocess.Popen[bytes]) -> None:
+    """Ask a process to end, and kill it if it runs for ``seconds`` more.
+
+    A node that waits in its library, such as for a router that is gone, handles no signal.
+    """
+    process.terminate()
+    timer = threading.Timer(seconds, process.kill)
+    timer.daemon = True
+    timer.start()
 
 
 def _tell(node: HandNode, pipe: int, say: Callable[[str], None]) -> Event | None:

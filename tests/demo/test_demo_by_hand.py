@@ -14,7 +14,7 @@ from unittest.mock import Mock
 import pytest
 
 from sros_tool.demo import backend, ros_node
-from sros_tool.demo.backend import HandNode, backend_by_hand, security_of
+from sros_tool.demo.backend import HandNode, backend_by_hand, end_within, security_of
 from sros_tool.demo.cyclone_node import CycloneNode
 from sros_tool.demo.nodes import ROLES, NodeOptions
 from sros_tool.demo.scenarios.model import Role
@@ -92,6 +92,14 @@ def test_a_secured_node_runs_on_what_the_robot_runs_on(
 
 
 @pytest.mark.dds
+def test_a_node_that_handles_no_signal_is_stopped_in_time() -> None:
+    command = ["sh", "-c", "trap '' TERM; echo; exec sleep 60"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        assert process.stdout and process.stdout.readline()
+        end_within(0.01, process)
+        assert process.wait(10) == -signal.SIGKILL
+
+
 def test_a_node_by_hand_says_what_others_have_of_another_type(tmp_path: Path) -> None:
     try:
         load_cyclone()

@@ -80,7 +80,10 @@ def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
         file = enclave.file(problem.file)
         lacks_key = (problem.file, problem.fault) == (KEY_FILE, Fault.FILE_MISSING)
         if lacks_key and not enclave.keystore.opened.has_keys:
-            text += ", as all keys here: nothing is wrong if this is a copy without keys"
+            text += (
+                ", as all keys here: nothing is wrong if this is a copy without keys (`--exclude "
+                f"{kind.id}` leaves this out)"
+            )
         remedy = fault_remedy(enclave, problem.fault, problem.file)
         accepted = enclave.accepts_expiry if problem.fault in _EXPIRED else ""
         yield kind.found(enclave.name, text, file, remedy=remedy, accepted=accepted)
