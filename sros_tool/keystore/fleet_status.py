@@ -439,12 +439,14 @@ class FleetStatus:
     """How the keystore's fleet file differs from the file that sros wrote, as a clause: the robots
     are then perhaps not all. Null if it does not differ."""
     revoked_until: datetime | None = None
-    """Until when robots need the revocation list, in UTC: the expiry of the last certificate on it.
-    Null if no certificate is on it, or if the ledger does not have all of them."""
+    """Until when robots need the revocation list, in UTC: the expiry of the last certificate on it,
+    or of the last revoked certificate of a replaced CA, while a robot may trust this CA. Null if
+    there is none, or if the ledger does not have all of them."""
     publication: PublishedMetadata | None = None
     """What robots fetch; null if nothing was published for a robot."""
     is_any_revoked: bool = False
-    """Whether the revocation list revokes a certificate."""
+    """Whether the revocation list revokes a certificate, or one was revoked whose CA was replaced,
+    and a robot may trust this CA."""
     groups: Mapping[str, Sequence[str]] = field(default_factory=dict)
     """The groups of the fleet file, with their robots."""
     awaited: frozenset[str] = frozenset()
@@ -552,6 +554,11 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
     )
     if older := records.age_clause:  # there may be a later list, which it does not have
         statuses = tuple(status.without_list() for status in statuses)
+    is_any_listed, any_waits = (
+        records.is_any_listed(),
+        any(status.crl_in_force is False for status in statuses),
+    )
+    is_any_revoked = is_any_listed or (any_waits and records.is_any_revoked)
     return FleetStatus(
         keystore.root,
         stages.of_keystore,
@@ -559,9 +566,9 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
         unassigned,
         older=older,
         edited=edited_fleet(keystore, keystore.ledger_with("what", "fleet")),
-        revoked_until=records.revoked_until(),
+        revoked_until=records.revoked_until() if is_any_revoked else None,
         publication=records.publication,
-        is_any_revoked=records.is_any_revoked(),
+        is_any_revoked=is_any_revoked,
         groups=fleet.groups,
         awaited=stages.awaited,
         recorded=keystore.ledger_file.last_time(),
@@ -612,10 +619,19 @@ class _ComparedRobot(NamedTuple):
         return self.received.confirmation if self.received else None
 
     def has_all(self, kind: str, is_equal: Callable[[_Difference], bool] = lambda _: False) -> bool:
-        """Return whether all its files of a kind are current, or other files that are equal."""
-        others = [file for file in self.different if _kind_of(file.path) == kind]
+        """Return whether all its files of a kind are current, or other files that are equal.
+
+        Enclaves that the robot does not have yet do not count: no process can run in them.
+        """
+        had = {enclave_of(path) for path in self.confirmed.files} if self.confirmed else set()
+        there = {*self.enclaves} & {*had, *(self.running() or ())}
+        others = [
+            file
+            for file in self.different
+            if _kind_of(file.path) == kind and (file.confirmed or enclave_of(file.path) in there)
+        ]
         number = self.current.get(kind, 0) + len(others)
-        return number == len(self.enclaves) and all(map(is_equal, others))
+        return 0 < number == len(there) and all(map(is_equal, others))
 
     def running(self) -> Mapping[str, RunningFiles] | None:
         """Return what the processes of its enclaves have loaded; None if not reported."""
@@ -996,7 +1012,12 @@ class _KeystoreRecords:
         entries = self._keystore.ledger_with("what", "release").entries
         return {entry.number: parse_iso(entry.time) for entry in entries if entry.what == "release"}
 
+    @property
     def is_any_revoked(self) -> bool:
+        """Whether a certificate was revoked; the list of its CA may be gone with the CA."""
+        return bool(self._revoked_serials)
+
+    def is_any_listed(self) -> bool:
         """Return whether the revocation list revokes a certificate, or cannot be read."""
         try:
             return any(crl.revoked for crl in self._keystore.revocation_lists)
@@ -1004,14 +1025,18 @@ class _KeystoreRecords:
             return self.has_list
 
     def revoked_until(self) -> datetime | None:
-        """Return when the last certificate on the revocation list expires; None if unknown."""
+        """Return when the last certificate on the revocation list expires; None if unknown.
+
+        If the list is empty: when the last revoked certificate expires.
+        """
         with suppress(SrosError):
             lists = self._keystore.revocation_lists
             listed_serials = {f"{entry.serial:x}" for crl in lists for entry in crl.revoked}
-            entries = self._keystore.ledger_file.with_values("serial", listed_serials).entries
+            serials = listed_serials or self._revoked_serials
+            entries = self._keystore.ledger_file.with_values("serial", serials).entries
             expiries = {entry.serial: entry.not_after for entry in entries if entry.not_after}
-            if listed_serials and listed_serials <= expiries.keys():
-                return parse_iso(max(expiries[serial] for serial in listed_serials))
+            if serials and serials <= expiries.keys():
+                return parse_iso(max(expiries[serial] for serial in serials))
         return None
 
     def revoked(self, robot: Robot) -> tuple[str, ...]:

@@ -671,6 +671,29 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     assert "\nthe revocation list is in force on all 3 robots; robots need it until " in said
     said = field.run("fleet", "status", "ks", "--robot", "r3").out
     assert "\nthe revocation list is in force on 1 robot; robots need it until " in said
+    rights = {f"/{{robot}}/{name}": publish("/{robot}/x") for name in ("base", "new")}
+    (field.folder / "more.xml").write_text(policy_text(rights))
+    field.run("generate_artifacts", "-k", "ks", "-p", "more.xml", "--fleet", "fleet.toml")
+    assert in_force() == [True, True, True], "nothing runs in an enclave that a robot does not have"
+
+
+def test_a_list_whose_ca_was_replaced_is_missed_until_nothing_trusts_the_ca(field: Field) -> None:
+    """Robots with the files of before the rotation have no list, and let the revoked one in."""
+
+    def said() -> tuple[str, list[float]]:
+        ended = sros("fleet", "status", "ks", cwd=field.folder).out
+        text = sros("fleet", "status", "ks", "--prometheus", cwd=field.folder).out
+        values = [value for _, value in samples(text, "sros_fleet_revocation_list_in_force")]
+        return next((line for line in ended.splitlines() if "in force" in line), ""), values
+
+    field.run("revoke", "ks", "--robot", "r3")
+    field.run("rotate_ca", "ks", "--identity", "--finish", "--allow-unconfirmed")
+    text, values = said()
+    assert "in force on 0 of 2 robots; robots need it until " in text and values == [0, 0]
+    field.deliver("r1", restart=[])
+    assert "on 1 of 2 robots" in said()[0] and said()[1] == [1, 0]
+    field.deliver("r2", restart=[])
+    assert said() == ("", []) and field.status()["revoked_until"] is None
 
 
 def test_an_earlier_list_that_revokes_the_same_stays_in_force(field: Field) -> None:
