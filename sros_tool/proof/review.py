@@ -40,7 +40,15 @@ from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.folders import Folder
 from sros_tool.keystore.expiry import ExpiryCheck, Threshold, due_enclaves
 from sros_tool.keystore.fleet import load_fleet
-from sros_tool.keystore.layout import FLEET, GOVERNANCE_P7S, KEY_FILE, SETTINGS, is_keystore
+from sros_tool.keystore.layout import (
+    ENCLAVES,
+    FLEET,
+    GOVERNANCE_FILE,
+    KEY_FILE,
+    PERMISSIONS_FILE,
+    SETTINGS,
+    is_keystore,
+)
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import RightsSource, SourcesDifference, compare_sources
 from sros_tool.keystore.template import Template, load_template, read_template, template_names
@@ -812,16 +820,17 @@ class _Review:
             yield f"the checkout differs from the reviewed commit: {files}"
 
     def _unnamed_keystores(self) -> list[str]:
-        """Return the folders of HEAD that are keystores, and are not reviewed or left out."""
+        """Return the folders of HEAD that are keystores or exports, and not reviewed or left out."""
         with suppress(SrosError):  # said by the step on changed files
             known = (*self.request.keystores, *self.request.left_out)
-            folders = (
-                path.removesuffix(GOVERNANCE_P7S)
+            folders = {
+                f"/{path}".partition(f"/{ENCLAVES}/")[0]
                 for path, _ in self._changed_files(self.head, None)
-                if f"/{path}".endswith(f"/{GOVERNANCE_P7S}")
-            )
+                if f"/{ENCLAVES}/" in f"/{path}"
+                and path.endswith((f"/{GOVERNANCE_FILE}", f"/{PERMISSIONS_FILE}"))
+            }
             return sorted(
-                folder.rstrip("/") or "." for folder in folders if not _is_below(folder, known)
+                folder[1:] or "." for folder in folders if not _is_below(folder[1:], known)
             )
         return []
 

@@ -897,8 +897,10 @@ def test_whether_a_keystore_is_signed_for_the_policies(
     change.commit({"robot.xml": policy_text(ROBOT | {"/a": publish("/x2")})})
     ended = change.review(*words, "--new-access", "allow").ok()
     assert "permissions (-) and policy (+) differ: - ALLOW publish topic /x" in ended.out, ended
+    change.commit({"r1/export/enclaves/a/permissions.p7s": "x", "enclaves/governance.p7s": "x"})
     unnamed = change.review("--policy", "robot.xml", "--new-access", "allow").ok().out
-    assert "'ks' is a keystore and is not reviewed" in unnamed
+    for path in ("ks", "r1/export", "."):
+        assert f"'{path}' is a keystore and is not reviewed" in unnamed
 
 
 def test_private_keys_in_a_commit_are_named(change: Change, made_keystores: Path) -> None:
