@@ -820,7 +820,7 @@ class _Review:
             yield f"the checkout differs from the reviewed commit: {files}"
 
     def _unnamed_keystores(self) -> list[str]:
-        """Return the folders of HEAD that are keystores or exports, and not reviewed or left out."""
+        """Return the keystores and exports in HEAD that are neither reviewed nor left out."""
         with suppress(SrosError):  # said by the step on changed files
             known = (*self.request.keystores, *self.request.left_out)
             folders = {
