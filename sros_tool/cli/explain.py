@@ -227,7 +227,8 @@ def _refuse_ignored(mode: str) -> None:
     "logs",
     metavar="FILE",
     multiple=True,
-    help="Explain the lines of one DDS log; - is standard input.",
+    help="Explain the lines of one DDS log, with a keystore, an enclave's folder or a policy; - is "
+    "standard input.",
 )
 @json_option
 def explain(
@@ -292,13 +293,6 @@ def explain(
     check_one_decider()
     root, rest = _split(arguments, keystore, verb=0 if who else 1)
     names_policy = root is not None and is_policy(root)
-    if names_policy and logs:
-        raise UsageError(
-            f"--log takes a keystore or an enclave's folder, and '{root}' is neither",
-            "A process loads signed files, and its log is explained by them.",
-            "Name the keystore, or ask the policy about a name in the log: `sros explain "
-            f"{quote(str(root))} ENCLAVE publish|subscribe|call|serve NAME`.",
-        )
     if names_policy and not (policy or reach):
         policy, root = root, None
     opened = OpenedKeystore(root) if root else None
@@ -317,7 +311,7 @@ def explain(
     asking = _circumstances(moment, domain, time_zone, fleet_file)
     print_notes([*_notes_on_past(asking.at, opened)])
     if logs:
-        return _show_log(logs[0], opened, rest, asking, as_json)
+        return _show_log(logs[0], opened, rest, asking, policy, as_json)
     if vendor == ZENOH and distro:
         text = "Zenoh decides alike in every distribution."
         raise UsageError("--vendor zenoh takes no --distro", text, "Leave it out.")
@@ -1070,6 +1064,7 @@ def _show_log(
     keystore: OpenedKeystore | None,
     other_arguments: tuple[str, ...],
     asking: AskingContext,
+    policy: Path | None,
     as_json: bool,
 ) -> int:
     """Print explanations of a DDS log, or of standard input for "-"; return 1 if there are any."""
@@ -1078,7 +1073,7 @@ def _show_log(
     if len(other_arguments) > 1:
         raise UsageError("--log takes at most a keystore and an enclave")
     text = read_log(log)
-    explained = explain_log_of(log, text, keystore, "".join(other_arguments), asking)
+    explained = explain_log_of(log, text, keystore, "".join(other_arguments), asking, policy)
     if as_json:
         print_json(explained)
         return 1 if explained.findings else 0

@@ -21,7 +21,14 @@ from sros_tool.dds.decision.access import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import Note, SrosError, UsageError
 from sros_tool.explain.answer import Answer, Evaluator, Part, Question, ask
-from sros_tool.explain.asking import AskingContext, signed_enclave
+from sros_tool.explain.asking import (
+    AskingContext,
+    fleet_of,
+    not_in_policy_error,
+    planned_enclave,
+    policy_to_ask,
+    signed_enclave,
+)
 from sros_tool.explain.denials import Denial, read_denials, serving_node
 from sros_tool.explain.explanation import likely_names, remedy
 from sros_tool.faults import NEEDS_CA_KEYS, ORIGINAL_KEYSTORE, Fault, remedy_in_original_keystore
@@ -35,7 +42,7 @@ from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.selection import likely_names as likely_enclaves
 from sros_tool.names import ACTION_SEPARATOR, SERVICE_ENDS, check_enclave_name, nodes_served
 from sros_tool.pki.certificates import IDENTITY_DIGITS
-from sros_tool.policy.model import ALLOW
+from sros_tool.policy.model import ALLOW, Policy
 from sros_tool.policy.patterns import covers
 from sros_tool.runtime.log_texts import NO_ENCLAVE, RUNS_OPEN, UNKNOWN, LogText
 from sros_tool.runtime.vendor_log import (
@@ -192,18 +199,30 @@ FindEnclave = Callable[[str], LoadedEnclave | None]
 
 
 def explain_log_of(
-    log: str, text: str, keystore: OpenedKeystore | None, name: str, asking: AskingContext
+    log: str,
+    text: str,
+    keystore: OpenedKeystore | None,
+    name: str,
+    asking: AskingContext,
+    policy_file: Path | None = None,
 ) -> ExplainedLog:
     """Explain the security messages of a log, and examine the enclaves that it names.
 
     ``name`` is the enclave, or its folder, whose processes wrote the log; "" if the log names the
-    enclave itself.
+    enclave itself.  With ``policy_file`` there is no keystore, and only denials are compared: with
+    what the policy gives.
 
     Raises:
         UsageError: ``name`` is an enclave, and there is no keystore.
+        PolicyError: the policy cannot be read, or does not have the enclave ``name``.
     """
     named: LoadedEnclave | None = None
-    if name:
+    policy: Policy | None = None
+    if policy_file:
+        _, policy = policy_to_ask(policy_file, fleet_of(asking.fleet_file, None))
+        if name and policy.enclave(name) is None:
+            raise not_in_policy_error(policy, name, policy_file)
+    elif name:
         named = signed_enclave(keystore, name, asking.at)
         if named is None and not name.startswith("/"):
             raise UsageError(
@@ -221,6 +240,9 @@ def explain_log_of(
     def find(enclave: str) -> LoadedEnclave | None:
         if named is not None and enclave in ("", named.name):
             return named
+        if policy is not None:
+            stated = policy.enclave(enclave or name)
+            return planned_enclave(stated, None, asking) if stated else None
         if keystore is None or not enclave:
             return None
         try:
@@ -235,6 +257,7 @@ def explain_log_of(
         lambda enclave: asking.context(enclave.joined_domains),
         str(keystore.root) if keystore else "",
         SearchedKeystore(keystore) if keystore and is_keystore(keystore.root) else None,
+        str(policy_file or ""),
     )
     return ExplainedLog(log, findings, _NOTES if any(e.found for e in findings) else ())
 
@@ -254,6 +277,7 @@ def explain_log(
     context: Callable[[LoadedEnclave], JoinContext],
     root: str = "",
     keystore: SearchedKeystore | None = None,
+    policy: str = "",
 ) -> tuple[LogFinding, ...]:
     """Return the security messages of a log, each once, in the order of the log.
 
@@ -261,10 +285,10 @@ def explain_log(
 
     ``find`` loads an enclave; ``context`` returns domain and time for it.  ``root`` is the path of
     the keystore as suggested commands name it.  The enclaves of peers and nodes in the log are
-    looked up in ``keystore``.
+    looked up in ``keystore``.  ``policy`` is the path of the policy if enclaves are from one.
     """
     plain = plain_text(text)
-    examiner = _Examiner(find, context, root, keystore)
+    examiner = _Examiner(find, context, root, keystore, policy)
     lines = log_lines(plain)
     denied = read_denials(plain)
     naming = _lines_naming(lines, denied)
@@ -539,8 +563,10 @@ class _Examiner:
         context: Callable[[LoadedEnclave], JoinContext],
         root: str,
         keystore: SearchedKeystore | None,
+        policy: str,
     ) -> None:
         self._find = find
+        self._policy = policy
         self._context = context
         self._root = root
         self._keystore = keystore
@@ -577,7 +603,7 @@ class _Examiner:
         if better := self._other_folder_remedy(first.fields.get("path", ""), remedy_of):
             return replace(plain, remedy=better)
         examined = meaning.faults or meaning.id == "service"
-        enclave = named if examined else None
+        enclave = named if examined and not self._policy else None
         if enclave is None:
             return plain
         answer = self._answer(enclave, meaning.vendor or Vendor.FAST, ask("join"))
@@ -745,12 +771,16 @@ class _Examiner:
         ]
         answer = answers[0]
         if all(answer.allowed for answer in answers):
-            facts = ["the current permissions allow it"]
+            allowing = "policy allows" if self._policy else "current permissions allow"
+            facts = [f"the {allowing} it"]
             elsewhere, remedy = self._other_folder_cause(denial, enclave)
             facts += elsewhere
             remedy = remedy or (
-                "Restart the process: it loaded earlier permissions. If it runs from an export, "
-                "export the enclave again first."
+                "The process loaded permissions of another policy, or earlier ones: sign this "
+                "policy, export the enclave, and restart the process."
+                if self._policy
+                else "Restart the process: it loaded earlier permissions. If it runs from an "
+                "export, export the enclave again first."
             )
         elif not denial.direction:
             facts = [answer.decision.text for answer in answers]
@@ -835,9 +865,10 @@ class _Examiner:
     def _how_to_ask(self, denial: Denial, name: str) -> str:
         """Return the commands that show which rights a policy lacks for the topic of a denial."""
         root, enclave = self._root or "KEYSTORE", denial.enclave or "ENCLAVE"
+        asked = quote(self._policy) if self._policy else root
         enclave = "PEER" if denial.remote else enclave
         commands = [
-            f"`sros explain {root} {quote(enclave)} {word} {quote(name)}`"
+            f"`sros explain {asked} {quote(enclave)} {word} {quote(name)}`"
             for word in _words_to_ask(denial, name)
         ]
         if commands:

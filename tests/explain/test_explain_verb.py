@@ -522,7 +522,6 @@ def test_access_control_that_is_off_is_told(tmp_path: Path) -> None:
         (["--who", "join", "--policy", "p.xml", "--vendor", "zenoh"], "on Zenoh takes no policy"),
         (["--who", "join", "--policy", "p.xml", "--robot", "r1"], "--robot takes a keystore"),
         (["--log", "-", "--policy", "p.xml"], "--log takes no --policy"),
-        ([str(POLICY), "--log", "-"], "is neither"),
         (["/a", "publish", "/x", "--infrastructure"], "goes with --reach only"),
         ([], "no keystore is named"),
     ],

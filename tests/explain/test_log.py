@@ -878,6 +878,21 @@ def test_a_process_that_was_not_restarted_in_a_rotation_is_named(
 # ── denials ────────────────────────────────────────────────────────────────────────────────
 
 
+def test_a_log_is_explained_by_a_policy_alone(tmp_path: Path) -> None:
+    """Its maintainer does not have the keystore of the user who sends the log."""
+    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    policy.write_text(policy_text({"/a": publish("/y")}))
+    denied = "[SECURITY Error] rt/{} topic not found in allow rule. -> check_create_datawriter\n"
+    log.write_text(
+        denied.format("x") + denied.format("y") + f"{FAST_LINE}PKCS7 data verification f"
+    )
+    said = sros("explain", policy, "/a", "--log", log).out
+    assert f"`sros explain {policy} /a publish /x` shows what is missing in the policy" in said
+    assert "no rule allows publish rt/x" in said and "the policy allows it" in said
+    assert "now has no fault" not in said
+    assert "unable to find enclave /b" in sros("explain", policy, "/b", "--log", log).err
+
+
 def test_a_topic_that_is_denied_in_either_direction_is_looked_up_in_both(
     keystore: Path, tmp_path: Path
 ) -> None:
