@@ -674,7 +674,6 @@ def _relative(file: str) -> str:
 
 def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
     from sros_tool.keystore.expiry import (
-        clock_notes,
         describe_lifetime,
         due_enclaves,
         expiring_enclaves,
@@ -705,7 +704,7 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
                 echo(line)
             for remark in filter(None, ("" if lines else none_due, left_out)):
                 echo(remark, err=True)
-    notes = tuple(clock_notes(keystore, moment))
+    notes = tuple(keystore.ledger_file.clock_notes(moment))
     print_notes(notes)
     is_unknown = expiring.unreadable or (notes and not expiring.due)
     return NOT_DONE if is_unknown else 1 if expiring.due else 0

@@ -403,9 +403,7 @@ def _circumstances(
 def _notes_on_past(moment: datetime, keystore: OpenedKeystore | None) -> Iterator[Note]:
     """Yield a note if the moment is in the past, where other files may have been in force."""
     if moment > now() - timedelta(minutes=1):
-        from sros_tool.keystore.expiry import clock_notes
-
-        yield from clock_notes(keystore, moment) if keystore else ()
+        yield from keystore.ledger_file.clock_notes(moment) if keystore else ()
         return
     changes = 0
     if keystore:

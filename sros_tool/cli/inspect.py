@@ -107,7 +107,6 @@ def inspect(
     """
     from sros_tool.errors import DocumentError, UsageError
     from sros_tool.keystore.describe import describe, problems_of
-    from sros_tool.keystore.expiry import clock_notes
     from sros_tool.keystore.reader import OpenedKeystore
 
     if not path.exists():
@@ -134,7 +133,7 @@ def inspect(
     else:
         for line in _TEXT[described.kind](described):
             echo(line)
-    print_notes([*clock_notes(keystore, now())] if keystore.root.is_dir() else [])
+    print_notes([*keystore.ledger_file.clock_notes(now())] if keystore.root.is_dir() else [])
     if problems_of(described):
         return 1
     if signature and not signature.signed:  # documents in clear, such as governance.xml, exist

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import NamedTuple
 from cryptography import x509
 
 from sros_tool.dds.permissions import Grant
-from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
+from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.layout import CERTIFICATE_FILE, remedy_in_keystore
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import Template
@@ -45,14 +45,6 @@ def renewal_command(root: Path, *names: str) -> str:
         limit = OpenedKeystore(root).template.renewal_limit
     words = ("sros", "renew", str(root), *names, "--all-expiring", duration_text(limit))
     return " ".join(map(quote, words))
-
-
-def clock_notes(keystore: OpenedKeystore, now: datetime) -> Iterator[Note]:
-    """Yield a note if the clock is behind the ledger, so that nothing seems to have expired."""
-    with suppress(SrosError):  # a ledger that cannot be read, which `sros check` reports
-        if behind := keystore.ledger_file.clock_behind(now):
-            text = f"{behind}: what has expired may count as valid. Set the clock."
-            yield Note("keystore.clock", text)
 
 
 class Lifetime(NamedTuple):

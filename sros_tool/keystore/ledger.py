@@ -45,7 +45,7 @@ from typing import TYPE_CHECKING, BinaryIO, NamedTuple, TypeAlias
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 
-from sros_tool.errors import IndexDamagedError, KeystoreError, PkiError, SrosError
+from sros_tool.errors import IndexDamagedError, KeystoreError, Note, PkiError, SrosError
 from sros_tool.keystore.layout import (
     LEDGER,
     LEDGER_HEAD,
@@ -442,6 +442,13 @@ class LedgerFile:
     def clock_behind(self, now: datetime) -> str:
         """Return, as a clause, how far the clock is behind the last entries; "" if it is not."""
         return behind_clause(now, self.last_time(), "the last entry of the ledger")
+
+    def clock_notes(self, now: datetime) -> Iterator[Note]:
+        """Yield a note if the clock is behind the ledger, so that nothing seems to have expired."""
+        with suppress(SrosError):  # a ledger that cannot be read, which `sros check` reports
+            if behind := self.clock_behind(now):
+                text = f"{behind}: what has expired may count as valid. Set the clock."
+                yield Note("keystore.clock", text)
 
     def last_time(self) -> datetime | None:
         """Return the time of the last entries, in UTC; None without an entry.

@@ -59,7 +59,6 @@ from sros_tool.distributions import Distribution, find_distribution
 from sros_tool.errors import SrosError
 from sros_tool.faults import NEEDS_CA_KEYS, ORIGINAL_KEYSTORE, remedy_in_original_keystore
 from sros_tool.fleet.robots import Fleet
-from sros_tool.keystore.expiry import renewal_command
 from sros_tool.keystore.fleet import publish_command, stated_distributions
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
@@ -404,6 +403,8 @@ def _with_cause_of_expiry(findings: Sequence[Finding], keystore: OpenedKeystore)
     soon = [f for f in findings if f.kind is EXPIRES_SOON and not f.accepted and not f.cause]
     if not soon:
         return list(findings)
+    from sros_tool.keystore.expiry import renewal_command  # which reads all about renewals
+
     enclaves = len({finding.subject for finding in soon})
     first = min(soon, key=lambda finding: finding.text.rpartition(" ")[2])
     published = publish_command(keystore.root)

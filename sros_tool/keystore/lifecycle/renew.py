@@ -14,7 +14,6 @@ from sros_tool.keystore.expiry import (
     Credentials,
     Threshold,
     UnreadableEnclave,
-    clock_notes,
     read_credentials,
     refuse_unreadable,
     survey,
@@ -99,7 +98,7 @@ def renew(
                 text = f"short-lived, and renewed only if named: {first_few(short_lived, 3)}"
                 change.notes.append(Note("renew.short-lived", text))
         if not wanted:  # no CA key is asked for
-            change.notes += clock_notes(change.keystore, now)
+            change.notes += change.keystore.ledger_file.clock_notes(now)
             with suppress(SrosError):
                 change.notes += change.edit_notes()
             return change.result(Changed)
