@@ -785,7 +785,7 @@ class _Run:
             newest = max([*own, *published], key=lambda each: validity_of(each).not_before)
             lost = authority_key(newest) not in map(authority_key, own)
             if lost or retired_authorities(published, own):
-                flag = f"--{role} " * (len(self.keystore.authority_files) > 1)
+                flag = f" --{role}" * (len(self.keystore.authority_files) > 1)
                 by_hand = (
                     f", bring the files of each robot by hand (`sros distribute_key {where} "
                     "--robot NAME FOLDER --force`), because robots accept releases only of the "
@@ -798,7 +798,7 @@ class _Run:
                     "Publishing would put robots back on the earlier CA, whose key somebody may "
                     "have copied.",
                     "Restore a backup from after the rotation. If there is none, repeat later "
-                    f"revocations, replace the CA again (`sros rotate_ca {where} {flag}--finish "
+                    f"revocations, replace the CA again (`sros rotate_ca {where}{flag} --finish "
                     f"--allow-unconfirmed`){by_hand} and repeat this command.",
                 )
 
