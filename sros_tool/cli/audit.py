@@ -121,6 +121,7 @@ def audit(
     from sros_tool.explain import audit as audits
     from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.keystore.participant import JoinContext
+    from sros_tool.runtime.environment import RMW_ZENOH
     from sros_tool.runtime.rmw import chosen_vendor
     from sros_tool.runtime.variables import ENCLAVE, domain_from
 
@@ -166,6 +167,8 @@ def audit(
             "there is nothing to audit: no node was observed",
             why_no_node_was_observed(environment, snapshot.seconds, rmw, enclave),
         )
+    if rmw == RMW_ZENOH:
+        audited = replace(audited, notes=(*audited.notes, audits.ON_ZENOH))
     existed = patch is not None and patch.exists()
     written = _write_patch(audited, patch, dry_run=dry_run)
     if as_json:
@@ -194,7 +197,7 @@ def audit(
             )
         )
     else:
-        _show(audited, enclaves, kept_changing)
+        _show(audited, enclaves, kept_changing, on_zenoh=rmw == RMW_ZENOH)
     print_notes((*audited.notes, *audited.missing.notes))
     if audited.allowed and not fine:
         echo(_NOT_ALL, err=True)
@@ -256,7 +259,9 @@ def _advice_to_add_by_hand(sources: Sequence[Path], fleet: Fleet, audited: Audit
 # ── output ──────────────────────────────────────────────────────────────────────────────
 
 
-def _show(audited: Audit, enclaves: AuditedEnclaves, changing_seconds: float) -> None:
+def _show(
+    audited: Audit, enclaves: AuditedEnclaves, changing_seconds: float, *, on_zenoh: bool
+) -> None:
     """Print denied rights, unseen nodes and a verdict that says what the audit did not cover."""
     for line in (*audited.lines().values(), *(f"not seen: {node}" for node in audited.unseen)):
         echo(line)
@@ -265,7 +270,8 @@ def _show(audited: Audit, enclaves: AuditedEnclaves, changing_seconds: float) ->
     verdict = f"{' and '.join(problems) or 'nothing'} would be denied to "
     verdict += f"{counted(len(audited.observation.nodes), 'node')} with "
     verdict += (
-        f"{counted(audited.observation.endpoint_count, 'endpoint')}, on {enclaves.vendor.title}"
+        f"{counted(audited.observation.endpoint_count, 'endpoint')}, "
+        f"{'by the rules of' if on_zenoh else 'on'} {enclaves.vendor.title}"
     )
     if audited.unseen:
         number, of = len(audited.expected), len(audited.expected) - len(audited.unseen)

@@ -64,6 +64,12 @@ from sros_tool.wording import counted, first_few
 
 _DENY_RULE = "deny-rule"
 _USE = "use"
+ON_ZENOH = Note(
+    "audit.on-zenoh",
+    "these nodes run on Zenoh, and sros decided by the rules of a DDS vendor; on Zenoh, the files "
+    "of `sros zenoh` decide, which state the same rights if `sros zenoh KEYSTORE --check` finds "
+    "them up to date",
+)
 
 # ── the enclaves to audit ──────────────────────────────────────────────────────────────────
 

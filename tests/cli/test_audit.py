@@ -9,6 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.cli import audit
+from sros_tool.cli.observing import observe
+from sros_tool.runtime.environment import RMW_ZENOH
 from tests.graph.fake_graph import Beside, graph
 from tests.support.harness import Ended, sros
 from tests.support.long_form import some
@@ -41,6 +44,15 @@ def test_nothing_would_be_denied(program: Program, tmp_path: Path) -> None:
     ended = program(both, "robot.xml", "hall.xml", *SHORT)
     summary = "nothing would be denied to 2 nodes with 2 endpoints, on Fast DDS 2.14\n"
     assert ended == Ended(0, "", summary)
+
+
+def test_an_audit_on_zenoh_says_by_whose_rules_it_decides(
+    program: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    on_zenoh = lambda *asked, **more: (observe(*asked, **more)[0], RMW_ZENOH)  # noqa: E731
+    monkeypatch.setattr(audit, "observe", on_zenoh)
+    ended = program(graph(FINE), "robot.xml", *SHORT)
+    assert "with 1 endpoint, by the rules of Fast DDS 2.14\nnote [audit.on-zenoh]: " in ended.err
 
 
 TO_ALLOW = (
