@@ -61,6 +61,14 @@ if TYPE_CHECKING:
     "that do not begin with '/'.",
 )
 @click.option(
+    "--remap",
+    "remaps",
+    metavar="[NODE:]FROM:=TO",
+    multiple=True,
+    help="Remap a name of OTHER, as -r does when its nodes start; also __node:=NAME and __ns:=NS. "
+    "Applies after --namespace.  Can be repeated.",
+)
+@click.option(
     "--enclave",
     metavar="ENCLAVE",
     help="Put all nodes of OTHER into this enclave: one process composes them.",
@@ -81,6 +89,7 @@ def merge_policy(
     policy: Path,
     others: tuple[Path, ...],
     namespace: str | None,
+    remaps: tuple[str, ...],
     enclave: str | None,
     nodes: tuple[str, ...],
     output: Path | None,
@@ -105,6 +114,8 @@ def merge_policy(
       note [merge.still-denied]: /talker DENY publish topic /cmd_vel stays ...
       replaced 'robot.xml'
       $ sros merge_policy robot.xml gripper.xml --namespace /left --in-place
+      $ sros merge_policy robot.xml camera.xml --remap image:=/front/image \\
+            --in-place
       $ sros merge_policy robot.xml camera.xml --enclave /pipeline \\
             --node driver --node rectify --in-place
     """
@@ -133,6 +144,18 @@ def merge_policy(
     if namespace is not None:
         namespace = namespace_of_option(namespace)
         additions = [policy_in_namespace(addition, namespace) for addition in additions]
+    if remaps:
+        from sros_tool.policy.remapping import parse_remapping, remapped_policy
+
+        rules = [parse_remapping(text) for text in remaps]
+        remapped = [remapped_policy(addition, rules) for addition in additions]
+        additions = [addition for addition, _ in remapped]
+        if unused := [rule for rule in rules if not any(rule in used for _, used in remapped)]:
+            raise UsageError(
+                f"--remap {unused[0]}: no policy to merge has this name, or node",
+                "",
+                "Write the names as the nodes of the policy use them.",
+            )
     if enclave is not None:
         check_enclave_name(enclave)
         additions = [policy_in_enclave(addition, enclave) for addition in additions]

@@ -90,6 +90,15 @@ def test_the_nodes_of_a_package_are_merged_into_the_enclave_that_composes_them(
     assert ended.status == 2 and "is not a valid enclave name" in ended.err
 
 
+def test_the_names_of_a_merged_policy_are_remapped(folder: Path) -> None:
+    (folder / "cam.xml").write_text(policy_text({"/cam": publish("/image")}))
+    words = ("merge_policy", "cam.xml", "cam.xml", "--remap")
+    ended = sros(*words, "image:=/front/image", "--json", cwd=folder).ok()
+    assert [right["name"] for right in json.loads(ended.out)["added"]] == ["/front/image"]
+    ended = sros(*words, "imag:=/front/image", cwd=folder)
+    assert (ended.status, "no policy to merge has this name" in ended.err) == (2, True), ended
+
+
 def test_many_rights_of_a_merge_are_folded_by_enclave(folder: Path) -> None:
     names = [f"/n{number:02}" for number in range(12)]
     (folder / "b.xml").write_text(policy_text({"/b": publish(*names), "/c": publish(*names)}))

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 
+from sros_tool.errors import UsageError
 from sros_tool.policy.document import policy_xml, read_policy
 from sros_tool.policy.merge import merge_all, merge_into, merge_notes, plan_merge
 from sros_tool.policy.model import (
@@ -20,6 +21,7 @@ from sros_tool.policy.model import (
     Profiles,
     policy_in_namespace,
 )
+from sros_tool.policy.remapping import parse_remapping, remapped_policy
 from sros_tool.policy.rights import Right, policy_rights
 from tests.policy.drawn_policies import PATHS, effective, meant, policies
 
@@ -73,6 +75,37 @@ def test_a_policy_in_a_namespace(namespace: str, path: str, relative: str) -> No
     assert [enclave.path for enclave in moved.enclaves] == [path]
     names = {right.name for right in policy_rights(moved)}
     assert names == {relative, f"{relative[:-1]}n/y", "/z"}
+
+
+@pytest.mark.parametrize(
+    ("rules", "names"),
+    [
+        (["x:=/front/x"], {"/front/x", "/n/y", "/z", "/w/*"}),
+        (["/x:=y", "/y:=/never"], {"/y", "/n/y", "/z", "/w/*"}),
+        (["n:~/y:=~/q"], {"/x", "/n/q", "/z", "/w/*"}),
+        (["other:x:=/front/x"], None),
+        (["__node:=m", "__ns:=/left", "x:=a"], {"/left/a", "/left/m/y", "/z", "/w/*"}),
+        (["/w/a:=/b"], {"/x", "/n/y", "/z", "/w/*", "/b"}),
+        (["/gone:=/b"], None),
+    ],
+)
+def test_a_policy_whose_names_are_remapped(rules: list[str], names: set[str] | None) -> None:
+    remappings = [parse_remapping(rule) for rule in rules]
+    before = one(group("topics", "x ~/y /z /w/*", publish="ALLOW"))
+    remapped, used = remapped_policy(before, remappings)
+    if names is None:
+        assert (remapped, used) == (before, set())
+    else:
+        assert {right.name for right in policy_rights(remapped)} == names
+        assert remappings[0] in used
+
+
+@pytest.mark.parametrize(
+    "rule", ["x", "x:=", "x:=/a b", "/*:=/x", "x:=/y*", "__node:=a/b", "a:b:c:=d"]
+)
+def test_what_is_no_remapping(rule: str) -> None:
+    with pytest.raises(UsageError):
+        parse_remapping(rule)
 
 
 TOPICS = group("topics", "/x /cam/*", publish="ALLOW")

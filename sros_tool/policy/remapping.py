@@ -1,0 +1,107 @@
+"""Remapping of the names in a policy, as ROS remaps the names of the nodes that it is for.
+
+A rule is that of ``--ros-args -r`` (ROS 2 design, "Static Remapping"): ``[NODE:]FROM:=TO``, where
+``__node`` and ``__ns`` stand for name and namespace of a node.  Both names are relative to the node
+unless they are absolute, and the first rule that fits a name counts.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+from sros_tool.errors import UsageError
+from sros_tool.names import check_namespace, expand, expression_problem, is_expression
+from sros_tool.policy.model import Group, Policy, Profile
+from sros_tool.policy.patterns import matches
+
+_RULE = re.compile(r"(?:([A-Za-z_]\w*):)?([^:=]+):=([^:=]+)")
+_NODE_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
+_NODE, _NAMESPACE = "__node", "__ns"
+
+
+class Remapping(NamedTuple):
+    """A rule that remaps a name for the nodes named ``node`` ("": for all nodes)."""
+
+    node: str
+    old: str
+    new: str
+
+    def __str__(self) -> str:
+        return f"{self.node}{':' * bool(self.node)}{self.old}:={self.new}"
+
+
+def parse_remapping(text: str) -> Remapping:
+    """Return the rule in a text such as ``image:=/left/image`` or ``driver:__node:=left_driver``.
+
+    Raises:
+        UsageError: it is not such a rule.
+        InvalidNameError: it has a namespace that is not valid.
+    """
+    rule = _RULE.fullmatch(text)
+    if not rule:
+        raise UsageError(
+            f"'{text}' is not a remapping", "", "Write it as [NODE:]FROM:=TO, such as image:=/cam."
+        )
+    node, old, new = rule[1] or "", rule[2], rule[3]
+    if old == _NODE:
+        problem = "" if _NODE_NAME.fullmatch(new) else f"'{new}' is not the name of a node."
+    elif old == _NAMESPACE:
+        problem = "It has a wildcard." if is_expression(new) else ""
+        new = check_namespace(new)
+    else:
+        problem = next(filter(None, map(expression_problem, (old, new))), "")
+        if not problem and (is_expression(old) or is_expression(new)):
+            problem = "A name has a wildcard."
+    if problem:
+        raise UsageError(f"'{text}' is not a remapping", problem, "Write it as image:=/left/image.")
+    return Remapping(node, old, new)
+
+
+def remapped_policy(policy: Policy, rules: Sequence[Remapping]) -> tuple[Policy, set[Remapping]]:
+    """Return a policy with remapped names, and the rules that changed something.
+
+    Where a wildcard matches the old name, the new name is added to the wildcard.
+    """
+    used: set[Remapping] = set()
+
+    def remapped(profile: Profile) -> Profile:
+        of_node = [rule for rule in rules if rule.node in ("", profile.node)]
+        own = {rule.old: rule for rule in reversed(of_node) if rule.old in (_NODE, _NAMESPACE)}
+        used.update(own.values())
+        node = own[_NODE].new if _NODE in own else profile.node
+        ns = own[_NAMESPACE].new if _NAMESPACE in own else profile.ns
+        of_names = [rule for rule in of_node if rule.old not in own]
+        groups = tuple(_remapped_group(group, of_names, ns, node, used) for group in profile.groups)
+        return replace(profile, ns=ns, node=node, groups=groups)
+
+    enclaves = tuple(enclave.with_profiles(remapped) for enclave in policy.enclaves)
+    return replace(policy, enclaves=enclaves), used
+
+
+def _remapped_group(
+    group: Group, rules: Iterable[Remapping], ns: str, node: str, used: set[Remapping]
+) -> Group:
+    """Return a group of a node with remapped names; add the rules that apply to ``used``."""
+    by_name: dict[str, Remapping] = {}
+    for rule in rules:
+        by_name.setdefault(expand(rule.old, ns, node), rule)
+
+    def new_names(name: str) -> Iterator[str]:
+        full = expand(name, ns, node)
+        fitting = [rule for old, rule in by_name.items() if matches(full, old)]
+        used.update(fitting)
+        if not fitting or is_expression(full):
+            yield name
+        yield from (rule.new for rule in fitting)
+
+    pairs = [
+        (new, group.source_of(index).line)
+        for index, name in enumerate(group.names)
+        for new in new_names(name)
+    ]
+    names = tuple(name for name, _ in pairs)
+    lines = tuple(line for _, line in pairs) if group.lines else ()
+    return replace(group, names=names, lines=lines)
