@@ -32,6 +32,7 @@ from sros_tool.xml import read_bytes
 _STATE = "state.json"
 _LOCK = "lock"
 _FORMAT = 1
+_LONGEST_UPTIME = 1e10  # seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,11 +130,17 @@ def _state_from(value: Any) -> AgentState:
         }
     for seconds in ("replaced", "list_replaced"):
         value[seconds] = {
-            check_enclave_name(_text(name)): float(moment)
+            check_enclave_name(_text(name)): _uptime(moment)
             for name, moment in dict(value.get(seconds, {})).items()
         }
     value["problems"] = tuple(map(_text, value["problems"]))
     return AgentState(**value)
+
+
+def _uptime(value: Any) -> float:
+    if not isinstance(value, int | float) or not 0 <= value <= _LONGEST_UPTIME:
+        raise ValueError(f"{value!r} is not a number of seconds since the start of a machine")
+    return float(value)
 
 
 def _text(value: Any) -> str:

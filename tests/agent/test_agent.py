@@ -320,6 +320,7 @@ def test_an_older_release_is_refused_also_without_a_state(home: Home, r1: Robot)
     damaged += [{**whole, key: {}} for key in whole]
     damaged += [{**whole, key: True} for key in whole]
     damaged += [{**whole, key: 10**12} for key in ("release", "accepted", "sequence")]
+    damaged += [{**whole, "replaced": {"/r1/a": seconds}} for seconds in (-1e300, 10**400)]
     for value in damaged:
         path.write_text(json.dumps(value))
         assert read_state(r1.folder).accepted == 2, value
