@@ -238,7 +238,8 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
     elif process.enclave in closed.absent:
         state = "not running"
     elif process.pid:
-        state = f"process {process.pid}" + ("" if runs else f", known by its {process.known_by}")
+        sign = process.known_by if process.known_by == "elimination" else f"its {process.known_by}"
+        state = f"process {process.pid}" + ("" if runs else f", known by {sign}")
     elif runs:
         state = "started by another command than observed"
     else:

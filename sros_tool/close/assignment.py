@@ -130,9 +130,10 @@ def _process_prefix(node: ObservedNode) -> str:
 
 def _shows_its_id(process: Process, node: ObservedNode, process_ids: Mapping[str, int]) -> bool:
     """Return whether a node's participant has or states the process id."""
+    pid = process.own_pid or process.pid
     if not node.participant.startswith(_FAST_DDS):
-        return process_ids.get(node.participant) == process.pid
-    low, high = process.pid & 0xFF, process.pid >> 8 & 0xFF
+        return process_ids.get(node.participant) == pid
+    low, high = pid & 0xFF, pid >> 8 & 0xFF
     is_fast = bool(process.libraries & {"libfastrtps", "libfastdds"})
     return is_fast and node.participant[8:12] == f"{low:02x}{high:02x}"
 

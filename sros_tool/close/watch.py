@@ -181,7 +181,9 @@ def _observed_processes(
 ) -> ObservedProcesses:
     """Return the processes of the observed nodes, also those that ended while sros watched."""
     processes, domain = running.in_domain, running.robot.domain
-    pids = [process.pid for process in processes if "libddsc" in process.libraries]
+    pids = [
+        process.own_pid or process.pid for process in processes if "libddsc" in process.libraries
+    ]
     stayed = [node for node in nodes if node.participant not in ended_participants]
     observed = assign(stayed, processes, domain, process_ids_of_cyclone(pids, domain))
     ended = {node.enclaves[0] for node in nodes} - {node.enclaves[0] for node in stayed}

@@ -103,7 +103,8 @@ class Process:
     ``dds`` the DDS libraries with their versions.  ``network`` names its network
     namespace; "" is the namespace of this process.  ``enclave`` is the enclave that it names, if it
     asks for security, and ``configuration`` the file that it names for Zenoh.  ``forked_by`` are
-    the id and command of the first process of its program, if another one started it.
+    the id and command of the first process of its program, if another one started it.  ``own_pid``
+    is the id that the process itself sees; in a container, it differs from ``pid``.
     """
 
     pid: int
@@ -117,6 +118,7 @@ class Process:
     configuration: LoadedFile | None = None
     dds: tuple[MappedLibrary, ...] = ()
     forked_by: tuple[int, tuple[str, ...]] = (0, ())
+    own_pid: int = 0
 
     @property
     def program(self) -> tuple[int, tuple[str, ...]]:
@@ -449,17 +451,18 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
     libraries = frozenset(library.decode() for library in _LIBRARIES.findall(maps))
     if not libraries and not _may_speak(command):
         return None
-    network = os.readlink("ns/net", dir_fd=folder)
+    network, status = os.readlink("ns/net", dir_fd=folder), _read(folder, "status", _MOST_BYTES)
     return Process(
         pid,
         command,
         environment,
         started,
         libraries,
-        _user(folder),
+        _number(_USER, status),
         "" if network == _namespace(Path("/proc/thread-self/ns/net")) else network,
         dds=_mapped_dds(maps),
         forked_by=_forked_by(folder, command),
+        own_pid=_number(_OWN_PID, status) or pid,
     )
 
 
@@ -539,7 +542,7 @@ class ProcessOrigin(NamedTuple):
 
     ``unit`` is its systemd system service, ``folder`` its working directory, ``launch`` the
     command of the ``ros2 launch`` that started it, or that it is, and ``container`` the id of its
-    Docker container.
+    container of Docker or Podman.
     """
 
     unit: str = ""
@@ -554,7 +557,7 @@ def process_origin(pid: int, proc: Path = Path("/proc")) -> ProcessOrigin:
     with suppress(OSError):
         text = (proc / str(pid) / "cgroup").read_text(errors="surrogateescape")
         unit = service[1] if (service := _SERVICE.search(text)) else ""
-        container = docker[1][:12] if (docker := _DOCKER.search(text)) else ""
+        container = named[1][:12] if (named := _CONTAINER.search(text)) else ""
         folder = str((proc / str(pid) / "cwd").readlink())
     with suppress(OSError, IndexError, ValueError):
         while pid > 1:
@@ -582,8 +585,8 @@ _SERVICE = re.compile(
     r"^(?:0:|\d+:name=systemd):/system\.slice/(?:.*/)?(" + SERVICE_NAME + r")$", re.M | re.A
 )
 """A line of /proc/PID/cgroup, of version 2 or 1 (cgroups(7)); not for users' own services."""
-_DOCKER = re.compile(r"/docker[-/]([0-9a-f]{64})(?:\.scope)?(?:/|$)", re.M | re.A)
-"""The same for a container, as Docker's two cgroup drivers name it."""
+_CONTAINER = re.compile(r"/(?:docker|libpod)[-/]([0-9a-f]{64})(?:\.scope)?(?:/|$)", re.M | re.A)
+"""The same for a container, as the two cgroup drivers of Docker and of Podman name it."""
 
 
 def _version(name: str) -> str:
@@ -642,9 +645,15 @@ def _stat(folder: int) -> _Stat:
     return _Stat(int(numbers[1]), int(numbers[19]), identity, numbers[20], is_idle)
 
 
-def _user(folder: int) -> int:
-    """Return the effective user id of a process."""
-    match = re.search(rb"^Uid:\s+\d+\s+(\d+)", _read(folder, "status", _MOST_BYTES), re.MULTILINE)
+_USER = re.compile(rb"^Uid:\s+\d+\s+(\d+)", re.MULTILINE)
+"""The effective user id in /proc/PID/status."""
+_OWN_PID = re.compile(rb"^NSpid:(?:\s+\d+)*\s+(\d+)$", re.MULTILINE)
+"""The process id in the innermost PID namespace, in /proc/PID/status."""
+
+
+def _number(pattern: re.Pattern[bytes], status: bytes) -> int:
+    """Return the number that a pattern finds in /proc/PID/status, or 0."""
+    match = pattern.search(status)
     return int(match[1]) if match else 0
 
 

@@ -30,6 +30,16 @@ def node(name: str, participant: str = "01", ns: str = "/") -> ObservedNode:
             [process(0x130A5, "x"), process(2, "a")],
             {"/a": "process id"},
         ),
+        (  # in a container, and beside a process that has this id on the host
+            [node("a", "010f7f010700")],
+            [process(0x130A5, "x", own_pid=7), process(2, "y")],
+            {"/a": "process id"},
+        ),
+        (
+            [node("a", "010f7f010700")],
+            [process(0x130A5, "x", own_pid=7), process(7, "y", own_pid=7)],
+            {},
+        ),
         ([node("a", "01107f01a530")], [process(0x130A5, "x"), process(2, "y")], {}),
         (
             [node("a", "1", "/n"), node("b", "2")],

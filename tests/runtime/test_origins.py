@@ -54,7 +54,9 @@ def test_the_program_of_a_process(
     assert first == (program, commands[program - 7] if program else ())
 
 
-@pytest.mark.parametrize("path", ["system.slice/docker-{}.scope", "docker/{}"])
+@pytest.mark.parametrize(
+    "path", ["system.slice/docker-{}.scope", "docker/{}", "machine.slice/libpod-{}.scope/container"]
+)
 def test_the_container_of_a_process(tmp_path: Path, path: str) -> None:
     made_up(tmp_path, 7, "/opt/talker", parent=1, cgroup=f"0::/{path.format('0af' * 21 + '0')}\n")
     assert process_origin(7, tmp_path) == ProcessOrigin("", "/opt", (), "0af0af0af0af")

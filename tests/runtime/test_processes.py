@@ -51,7 +51,7 @@ class Proc:
         (folder / "cmdline").write_bytes("\0".join((*command, "")).encode())
         (folder / "environ").write_bytes(environment)
         (folder / "maps").write_text(f"7f00-7f01 r-xp 0 08:01 7 {maps}\n" if maps else "")
-        (folder / "status").write_text("Name:\ta\nUid:\t7\t8\t9\t9\n")
+        (folder / "status").write_text("Name:\ta\nUid:\t7\t8\t9\t9\nNSpid:\t70\t7\n")
         for link, target in (("ns/net", "net:[1]"), ("cwd", "/"), ("root", str(self.path))):
             (folder / link).unlink(missing_ok=True)
             (folder / link).symlink_to(target)
@@ -110,7 +110,7 @@ def test_the_first_of_two_variables_counts_as_for_getenv(proc: Proc) -> None:
     (process,) = proc.look().processes
     assert process.domain == "3"
     assert process.environment["Z"] == "\udcff"
-    assert (process.user, process.network) == (8, "net:[1]")
+    assert (process.user, process.own_pid, process.network) == (8, 7, "net:[1]")
     for text, domain in (
         *(("0x0", "0"), ("010", "8"), (" +5", "5"), ("", "0"), ("0XfF", "255")),
         *(("x\n", "'x?'"), ("-1", "'-1'"), ("\u0665", "'\u0665'")),
