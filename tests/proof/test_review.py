@@ -71,7 +71,19 @@ class Change:
         return commit
 
     def review(self, *words: str) -> Ended:
-        return sros("review", "--base", self.base, *words, cwd=self.folder)
+        """Review the change; whatever fails the review has to be in its SARIF, with a place."""
+        sarif = self.folder.with_name(f"{self.folder.name}.sarif")
+        sarif.unlink(missing_ok=True)
+        output = () if "--sarif" in words else ("--sarif", str(sarif))
+        ended = sros("review", "--base", self.base, *output, *words, cwd=self.folder)
+        if ended.status and sarif.exists():
+            results = json.loads(sarif.read_text())["runs"][0]["results"]
+            assert {"error", "warning"} & {each["level"] for each in results}, ended
+            places = [each["physicalLocation"] for one in results for each in one["locations"]]
+            uris = [place["artifactLocation"]["uri"] for place in places]
+            assert len(places) == len(results), results
+            assert not any(uri.startswith(("..", "/", "git%3A")) for uri in uris), uris
+        return ended
 
 
 @pytest.fixture(scope="module")
