@@ -49,6 +49,9 @@ html_extra_path = ["_root"]
 html_theme_options = {"navigation_with_keys": True}
 
 
+_HEAD = re.compile(r"<th\b[^>]*>(.*?)</th>", re.DOTALL)
+
+
 def _mark_lines(code: re.Match[str]) -> str:
     """Mark commands, and lines of code so that the rest of a long line is indented further."""
     marked = []
@@ -60,10 +63,22 @@ def _mark_lines(code: re.Match[str]) -> str:
     return f"{code[1]}{''.join(marked)}</pre>"
 
 
+def _label_cells(table: re.Match[str]) -> str:
+    """Give each cell after the first of its row the words above its column, which a phone shows."""
+    heads = [re.sub(r"<[^>]+>", "", head).strip() for head in _HEAD.findall(table[0])]
+    labels = heads if len(heads) > 2 else []
+
+    def labelled(row: re.Match[str]) -> str:
+        above = iter(["", *labels[1:]])
+        return re.sub("<td", lambda _: f'<td data-label="{next(above, "")}"', row[0])
+
+    return re.sub(r"<tr.*?</tr>", labelled, table[0], flags=re.DOTALL)
+
+
 def _mark_code(
     _app: Sphinx, _page: str, _template: str, context: dict[str, Any], _tree: object
 ) -> None:
-    """Mark lines of code, and options in commands, within which a browser would break the line."""
+    """Mark cells, lines of code, and options in commands, in which no line may be broken."""
     context["body"] = re.sub(
         r"<pre>.*?</pre>|<code .*?</code>",
         lambda pre: re.sub(
@@ -72,6 +87,7 @@ def _mark_code(
         context.get("body", ""),
         flags=re.DOTALL,
     )
+    context["body"] = re.sub(r"<table.*?</table>", _label_cells, context["body"], flags=re.DOTALL)
     # Pygments closes every span at the end of a line.
     context["body"] = re.sub(
         r"(<pre><span></span>)(.*?)</pre>", _mark_lines, context["body"], flags=re.DOTALL

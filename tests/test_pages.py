@@ -46,6 +46,7 @@ def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_
     options = (tmp_path / "site" / "docs" / "reference" / "options.html").read_text("utf-8")
     assert "--all-vendors" in options and not set("\u2013\u2014\u201c\u201d") & set(options)
     assert '<span class="line" style="--rest: 4ch">  ' in page  # long lines are indented further
+    assert '<td data-label="what to do">' in page  # a phone has no columns
     assert (tmp_path / "site" / "index.html").exists()
     loaded = subprocess.run(
         ["grep", "-rlE", r"(src|href)=\"https?://[^\"]+\.(js|css|woff2?)", tmp_path / "site"],
