@@ -574,6 +574,8 @@ def test_overlays_can_be_filtered_and_listed(browser: Browser, tmp_path: Path) -
         page.click("#tab-differences")
         text = page.inner_text("#differences")
         assert "allowed, never observed" in text and "observed, not allowed" in text
+    with opened(browser, path, "phone") as page:
+        assert page.locator("#panel-differences").is_visible()
 
 
 @pytest.mark.parametrize("size", SIZES)

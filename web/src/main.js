@@ -397,10 +397,10 @@ function start() {
   window.addEventListener("resize", resized);
   window.addEventListener("beforeprint", unfoldAll);
   window.addEventListener("afterprint", foldAgain);
-  // A small screen has no room for the columns of the whole map, and the table fits.
+  // A small screen has no room for the columns of the whole map; the table and the differences fit.
   if (isSmall()) for (const fold of document.querySelectorAll(".fold")) fold.open = false;
   fillLists();
-  showTab(isSmall() && !model.overlay && model.scenes[0].id !== "focus" ? "names" : "map");
+  showTab(!isSmall() || model.scenes[0].id === "focus" ? "map" : model.overlay ? "differences" : "names");
   showMap();
   if (startsWithoutEnclaves()) showTab("names");
   document.body.dataset.ready = "true";
