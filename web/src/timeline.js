@@ -7,7 +7,6 @@ import { counted, el, svg } from "./dom.js";
 
 const DAY = 86400000;
 const WIDTH = 520;
-const MOST_ROWS = 80;
 
 export const daysLeft = (validity) => Math.floor((Date.parse(validity.not_after) - Date.now()) / DAY);
 export const dateText = (moment) => moment.slice(0, 10);
@@ -25,14 +24,17 @@ function state(validity) {
   return days < 30 ? "warning" : "good";
 }
 
-// What is valid for the very same time is one row: with a hundred enclaves there are a hundred.
+// What is valid for the same days is one row, which is as good as the worst of it: the first to
+// expire, as they come, and the last to begin.
 function rows(validities) {
   const groups = new Map();
   for (const validity of validities) {
-    const alone = validities.length <= MOST_ROWS || !validity.enclave;
-    const key = [validity.kind, validity.not_before, validity.not_after, alone ? validity.title : ""].join(" ");
+    const days = [validity.not_before, validity.not_after].map(dateText);
+    const key = [validity.kind, ...days, validity.enclave ? "" : validity.title].join(" ");
     if (!groups.has(key)) groups.set(key, { ...validity, members: [] });
-    groups.get(key).members.push(validity.title);
+    const group = groups.get(key);
+    group.members.push(validity);
+    if (validity.not_before > group.not_before) group.not_before = validity.not_before;
   }
   return [...groups.values()];
 }
@@ -68,12 +70,10 @@ function row(validity, scale, onEnclave) {
     beyond ? svg("path", { class: `span ${state(validity)}`, d: `M${to - 2} 2l8 8l-8 8z` }) : null,
     svg("line", { class: "today", x1: today, x2: today, y1: 0, y2: 20 }),
   );
-  const many = validity.members.length > 1;
-  const label = many
-    ? el("details", {}, el("summary", { text: `${validity.kind} of ${validity.members.length} enclaves` }), validity.members.join(", "))
-    : validity.enclave
-      ? [`${validity.kind} `, el("button", { type: "button", class: "link-button", text: validity.title, onclick: () => onEnclave(validity.enclave) })]
-      : validity.title;
+  const { kind, enclave, members } = validity;
+  const names = members.map(({ title, enclave: path }) => el("button", { type: "button", class: "link-button", text: title, onclick: () => onEnclave(path) }));
+  const folded = () => el("details", {}, el("summary", { text: `${kind} of ${members.length} enclaves` }), el("ul", { class: "plain" }, names.map((name) => el("li", {}, name))));
+  const label = !enclave ? validity.title : members.length > 1 ? folded() : [`${kind} `, ...names];
   return el(
     "tr",
     {},
