@@ -326,9 +326,7 @@ def test_the_timeline_holds_everything_that_ends(browser: Browser, robot_page: P
         assert page.locator("#panel-timeline").is_visible()
 
 
-def test_what_ends_on_the_same_day_is_one_row(
-    browser: Browser, tmp_path: Path
-) -> None:
+def test_what_ends_on_the_same_day_is_one_row(browser: Browser, tmp_path: Path) -> None:
     source = tmp_path / "large.xml"
     source.write_text(large_policy(10, 10, 2))
     picture = compose(
