@@ -120,7 +120,8 @@ def inspect(
         return _show_history(keystore, policy, as_json)
     if policy:
         raise UsageError("--policy is for --history", "", "Add --history.")
-    described = describe(path, now=now(), authority=authority)
+    opened = keystore if path == keystore.root else None
+    described = describe(path, now=now(), authority=authority, keystore=opened)
     signature = getattr(described, "signature", None)
     if authority and signature is None:
         raise UsageError(

@@ -16,7 +16,7 @@ from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import Note, SrosError
 from sros_tool.explain.answer import Evaluator, Question, acting_parts
 from sros_tool.explain.asking import AskingContext, domains_decided_alike
-from sros_tool.keystore.known_keys import IssuedEarlier, revoked_issues
+from sros_tool.keystore.known_keys import IssuedEarlier, removed_enclaves, revoked_issues
 from sros_tool.keystore.layout import LEDGER, PERMISSIONS_FILE, REVOKED, ROUTER_FILE
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.participant import LoadedEnclave
@@ -83,10 +83,19 @@ def note_on_revoked_enclaves(
         if gaps := keystore.ledger_with("what", "revocation").gaps:
             yield _unknown(keystore, kind, f"{LEDGER}: {first_few(gaps, 1)}")
         revoked = tuple(_revoked_with_right(keystore, question, vendor, asking))
+        removed = removed_enclaves(keystore, asking.at)
     except SrosError as error:
         yield _unknown(keystore, kind, error.what, error.remedy)
         return
     root = quote(str(keystore.root))
+    if removed:
+        text = (
+            f"{first_few(sorted(removed), 3)}: removed from the keystore, and not revoked. Whoever "
+            f"kept the files may have the right, until {max(removed.values())}. To revoke them, "
+            f"create them again (`sros create_enclave {root} ENCLAVE`), and run `sros revoke "
+            f"{root} ENCLAVE`."
+        )
+        yield Note("explain.removed-enclaves", text)
     if vendor:
         old = "the current revocation list"
         remedy = "the list at a restart (with a fleet, `sros fleet status "

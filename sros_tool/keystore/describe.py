@@ -530,6 +530,7 @@ def describe(
     now: datetime,
     authority: Path | None = None,
     files: FilesReadOnce | None = None,
+    keystore: OpenedKeystore | None = None,
 ) -> Described:
     """Describe the content of ``path``.
 
@@ -539,6 +540,7 @@ def describe(
         authority: file of the permissions CA certificate that verifies a signed document; by
             default the file next to the document.
         files: files that were read before.
+        keystore: the keystore at ``path``, if it is opened already.
 
     Raises:
         DocumentError: ``path`` is none of these kinds, or cannot be read.
@@ -546,7 +548,7 @@ def describe(
     files = files or FilesReadOnce()
     if path.is_dir():
         if is_keystore(path):
-            return _describe_keystore(OpenedKeystore(path), now)
+            return _describe_keystore(keystore or OpenedKeystore(path), now)
         of_enclave = (CERTIFICATE_FILE, PERMISSIONS_FILE, KEY_URI_FILE)
         if any((path / name).exists() for name in of_enclave):
             state = open_enclave(path, now=now, files=files)

@@ -26,7 +26,7 @@ from sros_tool.keystore.layout import (
     REVOKED,
     revoked_certificates,
 )
-from sros_tool.keystore.ledger import RESTORED, SAME_KEY, Entry
+from sros_tool.keystore.ledger import REPORTED, RESTORED, SAME_KEY, Entry
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import (
@@ -93,6 +93,31 @@ def revoked_issues(keystore: OpenedKeystore) -> Iterator[Entry]:
             serials.remove(entry.serial)
             if _is_of_trusted(keystore, entry, since):
                 yield entry
+
+
+def removed_enclaves(keystore: OpenedKeystore, now: datetime) -> Mapping[str, str]:
+    """Map enclaves that are no longer in a keystore, and were not revoked, to their expiry.
+
+    Whoever has their files can use them until then, with a CA that the keystore trusts.
+    """
+    recorded = keystore.ledger_file.recorded_enclaves()
+    if recorded is None:
+        recorded = [entry.enclave for entry in keystore.ledger.entries]
+    gone = {*recorded}.difference(keystore.names, ("",))
+    revoked = {f"{serial:x}" for serial in revoked_serials(keystore)} if gone else set()
+    since = _trusted_since(keystore) if gone else ""
+    expiry: dict[str, str] = {}
+    for entry in keystore.ledger_file.with_values("enclave", gone).entries if gone else ():
+        if (
+            entry.what == "certificate"
+            and entry.enclave in gone
+            and entry.serial not in revoked
+            and entry.reason != REPORTED
+            and entry.time >= since
+            and entry.not_after > iso(now)
+        ):
+            expiry[entry.enclave] = max(entry.not_after, expiry.get(entry.enclave, ""))
+    return expiry
 
 
 def unlisted_revocations(keystore: OpenedKeystore, now: datetime) -> Sequence[str]:

@@ -24,7 +24,7 @@ from sros_tool.pki.keys import key_pem, load_key
 from sros_tool.policy.document import read_policy
 from tests.checks.bench import SECRET, Bench, new_key
 from tests.checks.keystore_cases import CASES, STRANGER, also_trusted, give_away
-from tests.support.harness import copy_of, sros
+from tests.support.harness import copy_of, policy_text, publish, sros
 from tests.support.long_form import some
 
 pytest_plugins = ["tests.checks.sound_keystore"]
@@ -256,6 +256,20 @@ def test_a_ca_that_was_added_is_found_and_not_exported(
     refused = sros("distribute_key", bench.root, "/base", tmp_path / "robot")
     assert refused.status == 2 and "has a CA that the keystore does not know" in refused.err
     assert not (tmp_path / "robot").exists()
+
+
+@pytest.mark.parametrize("file", ["enclaves/base/permissions.p7s", "enclaves/governance.p7s"])
+def test_an_earlier_document_is_not_exported(file: str, bench: Bench, tmp_path: Path) -> None:
+    earlier, secret = bench.path(file).read_bytes(), {"SROS_CA_PASSPHRASE": SECRET}
+    looser = ("--set", "protection.discovery=NONE", "--allow-looser")
+    (tmp_path / "policy.xml").write_text(policy_text({"/base": publish("x")}))
+    sros("create_permission", bench.root, "/base", tmp_path / "policy.xml", env=secret).ok()
+    sros("update_keystore", bench.root, *looser, env=secret).ok()
+    words = ("distribute_key", bench.root, "/base", tmp_path / "robot")
+    sros(*words, "--dry-run").ok()
+    bench.path(file).write_bytes(earlier)
+    refused = sros(*words)
+    assert refused.status == 2 and "is an earlier document than the last one" in refused.err
 
 
 def test_an_earlier_revocation_list_is_not_exported(bench: Bench, tmp_path: Path) -> None:

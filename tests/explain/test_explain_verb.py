@@ -791,6 +791,20 @@ def test_a_revoked_enclave_that_processes_without_the_list_still_accept(keystore
     assert "is not known: ledger.jsonl is missing" in revoked_notes(*other)
 
 
+@pytest.mark.parametrize("vendor", ["fastdds", "zenoh"])
+def test_an_enclave_that_was_removed_without_a_revocation(vendor: str, keystore: Path) -> None:
+    asked = ("explain", keystore, "--who", "publish", "/chatter", "--vendor", vendor)
+    sros("zenoh", keystore).ok()
+    assert "removed-enclaves" not in sros(*asked).ok().err
+    shutil.rmtree(keystore / f"enclaves{ENCLAVE}")
+    note = f"note [explain.removed-enclaves]: {ENCLAVE}: removed from the keystore, and not revok"
+    assert note in sros(*asked).err
+    assert "removed-enclaves" not in sros(*asked, "--at", "2090-01-01").err
+    sros("create_enclave", keystore, ENCLAVE).ok()
+    sros("revoke", keystore, ENCLAVE).ok()
+    assert "removed-enclaves" not in sros(*asked).err
+
+
 def test_a_revoked_enclave_with_earlier_permissions(keystore: Path, tmp_path: Path) -> None:
     policy = tmp_path / "robot.xml"
     policy.write_text(policy_text({ENCLAVE: publish("/other")}))

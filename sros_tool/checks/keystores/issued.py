@@ -20,11 +20,12 @@ from sros_tool.dds.governance import parse_governance
 from sros_tool.dds.permissions import Grant, mistaken_names, pairs_text
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import robot_of
-from sros_tool.keystore.known_keys import known_authorities
+from sros_tool.keystore.known_keys import known_authorities, removed_enclaves
 from sros_tool.keystore.layout import (
     CLOSED_OBSERVER,
     CRL_FILE,
     IDENTITY_CA_FILE,
+    LEDGER,
     PERMISSIONS_CA_FILE,
     ROLES,
     ca_certificate,
@@ -159,6 +160,15 @@ REVOKED_BY_NEWER_LIST = FindingKind(
     "start, and communicates with all processes that have not loaded the newer list.",
     "RFC 5280, 5; rmw_dds_common (crl.pem).",
     "Remove the enclave's folder.",
+)
+REMOVED = FindingKind(
+    "keystore.enclave-removed",
+    NOTE,
+    "an enclave that was removed from the keystore, and not revoked",
+    "Whoever kept its files, such as a robot or a backup, has its rights until they expire.",
+    "sros: ledger.jsonl has the certificate, and no revocation of it.",
+    "Restore its folder; or create it again with `sros create_enclave KEYSTORE ENCLAVE`, and run "
+    "`sros revoke KEYSTORE ENCLAVE`, which revokes all its certificates.",
 )
 OLDER_LIST = FindingKind(
     "enclave.crl-older",
@@ -335,7 +345,9 @@ def _trust_findings(
     old and the new CA, so one common CA is enough.
     """
     for role, authorities in keystore.authorities.items():
-        known = known_authorities(keystore.opened, role)
+        known = None
+        with suppress(SrosError):  # a ledger that cannot be read is unread
+            known = known_authorities(keystore.opened, role)
         strangers = () if known is None else [ca for ca in authorities if digest(ca) not in known]
         for authority in strangers:
             text = f"{authority_text(authority)} is not in the ledger"
@@ -415,6 +427,10 @@ def _ledger_findings(
     for entry in entries:
         if entry.what == "permissions":
             signed[entry.enclave].append(entry.sha256)
+    with suppress(SrosError):  # as above
+        for name, expiry in sorted(removed_enclaves(keystore.opened, keystore.now).items()):
+            text = f"the ledger has a certificate that is valid until {expiry}"
+            yield REMOVED.found(name, text, keystore.shown(LEDGER))
     for summary in summaries:
         place = f"{keystore.root}/{enclave_folder(summary.name)}"
         if f"{summary.serial:x}" in revoked:

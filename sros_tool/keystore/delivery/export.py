@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tomllib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -27,6 +28,7 @@ from sros_tool.keystore.layout import (
     AGENT,
     CRL_FILE,
     ENCLAVES,
+    GOVERNANCE_FILE,
     IDENTITY,
     IDENTITY_CA_FILE,
     KEY_FILE,
@@ -35,6 +37,7 @@ from sros_tool.keystore.layout import (
     OPTIONAL_FILES,
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
+    PERMISSIONS_FILE,
     PRIVATE,
     REQUIRED_FILES,
     ZENOH_FILES,
@@ -349,6 +352,8 @@ def _files_of(
     return _read_files(keystore, name, _FILES)
 
 
+_RECORDED_BY = {PERMISSIONS_FILE: "enclave", GOVERNANCE_FILE: "what"}
+"""The field by which the ledger is asked for the entries of a signed document."""
 _ROLES_OF_FILES = {IDENTITY_CA_FILE: IDENTITY, PERMISSIONS_CA_FILE: PERMISSIONS}
 _FILES = (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES, *ZENOH_FILES)
 
@@ -371,6 +376,9 @@ def _read_files(
                     raise _ca_key_error(keystore.root / path)
                 if role := _ROLES_OF_FILES.get(file):
                     _check_authorities(keystore, role, keystore.root / path, files[path])
+                if field := _RECORDED_BY.get(file):
+                    value = name if field == "enclave" else file.partition(".")[0]
+                    _check_last(keystore, (field, value), keystore.root / path, files[path])
     return files
 
 
@@ -395,6 +403,28 @@ def _check_authorities(keystore: OpenedKeystore, role: str, path: Path, data: by
             f"'{path}' has a CA that the keystore does not know (SHA-256 {strangers[0][:8]})",
             "Robots would trust everything that is issued with its key.",
             f"Find out who added it: `sros check {quote(str(keystore.root))}`.",
+        )
+
+
+def _check_last(
+    keystore: OpenedKeystore, recorded_by: tuple[str, str], path: Path, data: bytes
+) -> None:
+    """Raise `KeystoreError` if the ledger has a later document than a signed one.
+
+    What ros2/sros2 signed is not in the ledger, and exported as it is.
+    """
+    (field, value), kind = recorded_by, path.name.partition(".")[0]
+    signed = [
+        entry.sha256
+        for entry in keystore.ledger_file.with_values(field, (value,)).entries
+        if entry.what == kind and getattr(entry, field) == value
+    ]
+    sha256 = hashlib.sha256(data).hexdigest()
+    if sha256 in signed and sha256 != signed[-1]:
+        raise KeystoreError(
+            f"'{path}' is an earlier document than the last one that was signed",
+            f"Somebody put it back, and robots would get the earlier {kind}.",
+            f"Find out who did: `sros check {quote(str(keystore.root))}` says what to do.",
         )
 
 
