@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from sros_tool.automata import SearchLimit
@@ -25,7 +25,7 @@ from sros_tool.names import (
     service_of,
 )
 from sros_tool.policy.model import Source
-from sros_tool.policy.rights import KIND_OF
+from sros_tool.policy.rights import KIND_OF, Right
 from sros_tool.proof.decide import MOST_STEPS, KeptUse, Use, Verdict, Witness, Worlds
 from sros_tool.proof.requirements import (
     Apart,
@@ -208,20 +208,28 @@ def _in_all(lists: Iterable[Sequence[str]]) -> tuple[str, ...]:
 _SHOWN = 5
 
 
-def requirement_findings(requirements: Sequence[Requirement], system: System) -> list[Finding]:
+def requirement_findings(
+    requirements: Sequence[Requirement], system: System, before: Iterable[Right] = ()
+) -> list[Finding]:
     """Return a finding for each requirement that does not hold, or that cannot fail.
+
+    ``before`` are the rights before a change, which may have renamed what a requirement names.
 
     Raises:
         DocumentError: there are too many wildcards to decide a requirement.
     """
-    return decided_findings(decide_all(requirements, system), system)
+    return decided_findings(decide_all(requirements, system), system, before)
 
 
-def decided_findings(decided: Decided, system: System) -> list[Finding]:
+def decided_findings(
+    decided: Decided, system: System, before: Iterable[Right] = ()
+) -> list[Finding]:
     """Return the findings of decisions: broken requirements first, in order."""
     findings = [_violation_finding(violation) for violation in decided.violations]
     findings += [_vacuous_finding(requirement, why) for requirement, why in decided.vacuous]
-    findings += [_unnamed_finding(requirement, names) for requirement, names in decided.unnamed]
+    if decided.unnamed:
+        known = {f"{right.kind.removesuffix('s')} {right.name}" for right in before}
+        findings += [_unnamed_finding(*unnamed, known) for unnamed in decided.unnamed]
     findings += [_assumption_finding(*assumption) for assumption in decided.assumed]
     findings += [_not_crossing_finding(*kept_use) for kept_use in decided.kept]
     if system.is_export:
@@ -348,8 +356,12 @@ def _vacuous_finding(requirement: Requirement, why: Sequence[str]) -> Finding:
     return VACUOUS.found(place.file, text, place.file, place.line)
 
 
-def _unnamed_finding(requirement: Requirement, names: Sequence[str]) -> Finding:
+def _unnamed_finding(
+    requirement: Requirement, names: Sequence[str], known_before: Container[str]
+) -> Finding:
     place = requirement.source
+    if gone := [name for name in names if name in known_before]:
+        return _vacuous_finding(requirement, [f"no right names {_listed_names(gone)} any more"])
     text = f"no right names {_listed_names(names)}: {demand(requirement)}"
     return UNNAMED.found(place.file, text, place.file, place.line)
 

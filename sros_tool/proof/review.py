@@ -393,9 +393,15 @@ class _Review:
         for path, keystore in keystores.items():
             with suppress(SrosError):  # what is wrong with it is a finding
                 self.robots[path] = load_fleet(OpenedKeystore(keystore))
-        yield from self._requirements(of_head, head_fleet, base_fleet, keystores)
+        base_keystores = yield from self._base_keystores(keystores)
+        before = cache(partial(load_policies, of_base, _BASE, base_fleet))
+        earlier: dict[str, Callable[[], AccessSource]] = {
+            path: partial(load_side, folder) for path, folder in base_keystores.items()
+        }
+        if of_base:
+            earlier[named] = before
+        yield from self._requirements(of_head, head_fleet, base_fleet, keystores, earlier)
         if self.base:
-            before = cache(partial(load_policies, of_base, _BASE, base_fleet))
             after = cache(partial(load_policies, of_head, _HEAD, head_fleet))
             moving = cache(lambda: [*_fixed_or_moving_names(before(), after())])
             yield from self._step_result(
@@ -411,7 +417,8 @@ class _Review:
                 only_with_result=bool(of_base),
             )
         for path, keystore in keystores.items():
-            yield from self._keystore(path, keystore, of_head, head_fleet)
+            earlier_keystore = base_keystores.get(path)
+            yield from self._keystore(path, keystore, earlier_keystore, of_head, head_fleet)
         yield from self._step_result("files", "", self._converted_step)
         yield from self._step_result("keystore", " ".join(asked.keystores), self._keys_step)
         if self.base:
@@ -500,6 +507,18 @@ class _Review:
             except (SrosError, OSError) as error:
                 known = error if isinstance(error, SrosError) else DocumentError(str(error))
                 yield ReviewStep("keystore", path, _UNDECIDED, known)
+        return keystores
+
+    def _base_keystores(self, paths: Iterable[str]) -> Generator[ReviewStep, None, dict[str, Path]]:
+        """Return the folders of those keystores that BASE has; yield the steps that read them."""
+        keystores: dict[str, Path] = {}
+        for path in paths if self.base else ():
+            assert self.base
+            try:
+                if folder := self.base.tree(path):
+                    keystores[path] = folder
+            except SrosError as error:
+                yield ReviewStep("new-access", path, _UNDECIDED, error)
         return keystores
 
     def _missing_file_error(self, path: str) -> DocumentError:
@@ -927,6 +946,7 @@ class _Review:
         fleet: Fleet | None,
         base_fleet: Fleet | None,
         keystores: Mapping[str, Path],
+        earlier_sources: Mapping[str, Callable[[], AccessSource]],
     ) -> Iterator[ReviewStep]:
         if not self.request.requirements:
             return
@@ -964,10 +984,14 @@ class _Review:
             earlier = yield from _read(
                 base_files, partial(_without_left_robots, before, system.fleet)
             )
+            rights: frozenset[Right] = frozenset()
+            with suppress(SrosError, OSError):  # said by the comparison
+                if subject in earlier_sources:
+                    rights = earlier_sources[subject]().rights
             yield from self._step_result(
                 "requirements",
                 subject,
-                partial(_decided_requirements, wanted, system),
+                partial(_decided_requirements, wanted, system, rights),
                 only_with_result=bool(files),
             )
             if dropped_requirements(earlier, wanted):
@@ -1025,14 +1049,13 @@ class _Review:
     # ── keystores ──────────────────────────────────────────────────────────────────────────
 
     def _keystore(
-        self, path: str, folder: Path, policies: Sequence[Path], fleet: Fleet | None
+        self,
+        path: str,
+        folder: Path,
+        before: Path | None,
+        policies: Sequence[Path],
+        fleet: Fleet | None,
     ) -> Iterator[ReviewStep]:
-        before = None
-        if self.base:
-            try:
-                before = self.base.tree(path)
-            except SrosError as error:
-                yield ReviewStep("new-access", path, _UNDECIDED, error)
         settings = f"{path}/{SETTINGS}"
         is_same = before is not None and _is_same_file(self.base, self.head, settings)
 
@@ -1155,9 +1178,9 @@ def _status(chosen_findings: ChosenFindings) -> int:
 
 
 def _decided_requirements(
-    requirements: Sequence[Requirement], system: System
+    requirements: Sequence[Requirement], system: System, before: Iterable[Right]
 ) -> tuple[int, ChosenFindings]:
-    chosen = FindingFilter().choose(requirement_findings(requirements, system))
+    chosen = FindingFilter().choose(requirement_findings(requirements, system, before))
     return _status(chosen), chosen
 
 

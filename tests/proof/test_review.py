@@ -873,6 +873,22 @@ def test_a_keystore_fails_for_a_finding_an_expiry_and_a_link_out_of_it(
     assert (linked.status, "cert.pem' is a link out of 'ks'" in linked.out) == (2, True), linked
 
 
+def test_a_change_renames_nothing_out_of_a_requirement(change: Change) -> None:
+    """A wildcard matches the old name still, so that the requirement is about something."""
+    enclaves = {"/a": publish("/x"), "/b": publish("/*")}
+    required = '[[only]]\npublish = ["/x"]\nenclaves = ["/a", "/b"]\n'
+    change.base = change.commit({"robot.xml": policy_text(enclaves), "robot.toml": required})
+    words = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
+    renamed = {"/a": publish("/drive"), "/b": publish("/*"), "/c": publish("/drive")}
+    change.commit({"robot.xml": policy_text(renamed)})
+    ended = change.review(*words)
+    assert "no right names topic /x any more: only /a, /b may publish /x" in ended.out, ended
+    assert ended.status == 1
+    change.base = change.commit({"README": "x"})
+    change.commit({"README": "y"})
+    assert "any more" not in change.review(*words).out
+
+
 def test_requirements_get_the_protection_of_a_template(change: Change) -> None:
     protected = '[[protected]]\ntopics = ["/x"]\nlevel = "encrypt"\n'
     template = (templates_dir() / "production.toml").read_text()
