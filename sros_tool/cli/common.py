@@ -253,14 +253,19 @@ def fleets_of(files: Sequence[Path]) -> tuple[Fleet | None, Fleet | None]:
     return (fleets[0], fleets[-1]) if fleets else (None, None)
 
 
-def fleet_policies(files: Sequence[Path], fleet_file: Path) -> list[FleetPolicy]:
-    """Return the policies in files, expanded for the fleet in the --fleet file."""
+def fleet_policies(
+    files: Sequence[Path], fleet_file: Path, robots: Sequence[str] = ()
+) -> list[FleetPolicy]:
+    """Return the policies in files, expanded for the fleet in the --fleet file.
+
+    With ``robots``, only the enclaves of these robots count.
+    """
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.policy.document import read_policy
 
     fleet = read_fleet(fleet_file)
-    return [FleetPolicy(read_policy(file, placeholders=True), fleet) for file in files]
+    return [FleetPolicy(read_policy(file, placeholders=True), fleet, robots) for file in files]
 
 
 def policy_for(file: Path, fleet_file: Path | None) -> Policy:

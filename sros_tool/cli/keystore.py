@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING
@@ -35,10 +36,10 @@ from sros_tool.cli.common import (
     keystore_arguments,
     keystore_from_environment,
     now,
-    policy_for,
     print_json,
     print_signed,
     progress,
+    robot_option,
     ros_domain,
     several_enclaves,
     split_root,
@@ -135,6 +136,7 @@ def create_permission(
     """
     from sros_tool.keystore.lifecycle.create import create_permission as create
     from sros_tool.keystore.reader import OpenedKeystore
+    from sros_tool.policy.document import read_policy
 
     root, rest = split_root(arguments)
     if len(rest) < (1 if all_enclaves or patterns or robots else 2):
@@ -144,10 +146,13 @@ def create_permission(
     *given, last = rest
     file = PATH.convert(last, None, None)
     _check_order(root, given, file)
-    policy = policy_for(file, fleet_file)
+    for_fleet = fleet_policies([file], fleet_file)[0] if fleet_file else None
+    policy = for_fleet.policy() if for_fleet else read_policy(file)
+    keystore = OpenedKeystore(root)
+    chosen = chosen_enclaves(keystore, given, patterns, robots, all_enclaves=all_enclaves)
     result = create(
         root,
-        chosen_enclaves(OpenedKeystore(root), given, patterns, robots, all_enclaves=all_enclaves),
+        chosen,
         policy,
         now=now(),
         domain=ros_domain(),
@@ -157,6 +162,16 @@ def create_permission(
         allow_refusal=allow_refusal,
         dry_run=dry_run,
     )
+    left_out = [
+        name
+        for name in for_fleet or ()
+        if for_fleet and (robot := for_fleet.stated(name)[1])
+        if robot.name in robots and name not in chosen
+    ]
+    if left_out:
+        text = "left out, because the keystore does not have them, or not as enclaves of a robot: "
+        text += f"{shown_names(left_out)}. `sros generate_artifacts --robot` creates them, too."
+        result = replace(result, notes=(*result.notes, Note("enclave.left-out", text)))
     _show(result, as_json, [policy])
 
 
@@ -199,6 +214,7 @@ class _SeveralEnclavesAndPolicies(SeveralValues):
     "The robots that the placeholders of the policies stand for: a TOML file, or an Ansible "
     "inventory."
 )
+@robot_option("Only the enclaves of this robot; those of other robots stay as they are.")
 @click.option(
     "--template",
     "template_name",
@@ -216,6 +232,7 @@ def generate_artifacts(
     enclaves: tuple[str, ...],
     policy_files: tuple[Path, ...],
     fleet_file: Path | None,
+    robots: tuple[str, ...],
     template_name: str | None,
     revoke_old: bool,
     allow_refusal: tuple[Vendor, ...],
@@ -237,6 +254,8 @@ def generate_artifacts(
       created enclave /talker_listener/talker
       ...
       $ sros generate_artifacts -k keystore -p robot.xml --fleet fleet.toml
+      $ sros generate_artifacts -k keystore -p robot.xml --fleet fleet.toml \
+            --robot r7
     """
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.layout import is_keystore
@@ -256,8 +275,10 @@ def generate_artifacts(
             "",
             "Give -p FILE... .",
         )
+    if robots and not fleet_file:
+        raise UsageError("--robot needs the fleet of the policies", "", "Give --fleet FILE.")
     if fleet_file:
-        policies: list[Policy | FleetPolicy] = [*fleet_policies(policy_files, fleet_file)]
+        policies: list[Policy | FleetPolicy] = [*fleet_policies(policy_files, fleet_file, robots)]
     else:
         policies = [read_policy(path) for path in policy_files]
     template = load_template(template_name or DEFAULT_TEMPLATE)
@@ -340,14 +361,21 @@ def _created_lines(result: Creation) -> Iterator[str]:
 
 def _next_step_hints(result: Creation, as_json: bool) -> Iterator[str]:
     """Yield hints for standard error: how enclaves get to robots, and unchanged enclaves."""
-    from sros_tool.keystore.fleet import publish_command
+    from sros_tool.fleet.robots import robot_of
+    from sros_tool.keystore.fleet import load_fleet, publish_command
     from sros_tool.keystore.layout import FLEET
+    from sros_tool.keystore.reader import OpenedKeystore
 
     if len(result.created) > MAX_NAMES and not (as_json or result.dry_run):
         selection = "--robot NAME" if (result.root / FLEET).exists() else "ENCLAVE..."
         yield f"to send them: `sros distribute_key {quote(str(result.root))} {selection} FOLDER`"
     published = "" if as_json or result.dry_run else publish_command(result.root)
-    if published and (result.changed or result.completed):
+
+    def has_robot(names: Iterable[str]) -> bool:
+        fleet = load_fleet(OpenedKeystore(result.root))
+        return fleet is not None and any(robot_of(fleet, name) for name in names)
+
+    if published and has_robot((*result.changed, *result.completed)):
         yield f"robots that fetch get the change by {published}"
     elif result.changed and not (as_json or result.dry_run):
         yield (

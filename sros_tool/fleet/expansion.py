@@ -7,7 +7,7 @@ grammar of a policy, so that no value can add an element, a right or a wildcard.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -35,17 +35,21 @@ class FleetPolicy(Mapping[str, Enclave]):
     ``protects`` says whether it states the protection of a name.
     """
 
-    def __init__(self, policy: Policy, fleet: Fleet) -> None:
+    def __init__(self, policy: Policy, fleet: Fleet, robots: Collection[str] = ()) -> None:
         """Compute the paths of all enclaves.
 
         Args:
             policy: a policy that was read with its placeholders.
             fleet: the robots.
+            robots: leave out all enclaves but those of these robots; none: leave out nothing.
 
         Raises:
             PolicyError: a path is not valid for a robot, two enclaves have the same path, or a
                 group is not one of the fleet; with file and line.
+            DocumentError: the fleet has no such robot.
         """
+        for name in robots:
+            fleet.robot(name)
         self._policy = policy
         self.fleet = fleet
         self._of: dict[str, tuple[Enclave, Robot | None]] = {}
@@ -61,6 +65,8 @@ class FleetPolicy(Mapping[str, Enclave]):
         )
         for enclave in policy.enclaves:
             for path, robot in self._paths(enclave):
+                if robots and (robot is None or robot.name not in robots):
+                    continue
                 if path in self._of:
                     raise _duplicate_path_error(path, enclave, self._of[path][0])
                 self._of[path] = enclave, robot

@@ -170,6 +170,25 @@ def publish_command(root: Path) -> str:
     return f"`sros fleet publish {quote(str(root))} PUB`" if (root / FLEET_ROOT).exists() else ""
 
 
+def unrecorded_notes(
+    keystore: OpenedKeystore, fleet: Fleet | None, names: Collection[str]
+) -> Iterator[Note]:
+    """Yield a note for each robot below whose folder enclaves are that the fleet does not record.
+
+    Neither ``--robot`` nor a release includes these enclaves.
+    """
+    robots = fleet.robots if fleet else {}
+    found = unrecorded_enclaves(fleet, names, robots.keys()) if fleet else {}
+    for robot, (below, _) in found.items():
+        if below:
+            text = f"{first_few(below, _SHOWN)}: of no robot, because no policy for the fleet had "
+            text += f"this path: it is not in what `--robot {robot}` chooses, nor in a release, "
+            text += "and an agent removes it. To make it an enclave of the robot: `sros "
+            text += f"generate_artifacts -k {quote(str(keystore.root))} -p POLICY --fleet FILE "
+            text += f"--robot {robot}`, with a policy that has it."
+            yield Note("fleet.unrecorded", text)
+
+
 def deliver_first(root: Path) -> str:
     """Return a sentence on how new files get to robots, before processes restart with them."""
     published = publish_command(root)

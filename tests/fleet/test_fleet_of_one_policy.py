@@ -256,6 +256,43 @@ def test_what_differs_in_the_robot_is_said_once(made: Path, tmp_path: Path) -> N
     assert gains.startswith("/{robot}/base gains: publish topic {namespace}/grip/force"), gains
 
 
+def test_a_new_node_comes_to_one_robot_first(made: Path, tmp_path: Path) -> None:
+    """As do its rights; and who makes its enclave otherwise is told what it lacks."""
+    folder = copied(made, tmp_path)
+    lamp = POLICY[POLICY.index("<enclave ") : POLICY.index("</enclave>")].replace("base", "lamp")
+    (folder / "robot.xml").write_text(
+        POLICY.replace("<topic>odom", "<topic>grip</topic><topic>odom").replace(
+            "<enclave ", f"{lamp}</enclave>\n<enclave ", 1
+        )
+    )
+    sros("fleet", "publish", "ks", "pub", cwd=folder).ok()
+    names = enclave_names(folder / "ks")
+    chosen = ("create_permission", "ks", "--robot", "r7", "robot.xml", *FLEET)
+    said = sros(*chosen, "--dry-run", cwd=folder).ok().err
+    assert "note [enclave.left-out]: " in said and ": /r7/lamp. " in said
+    first = ("generate_artifacts", "-k", "ks", "-p", "robot.xml", *FLEET, "--robot", "r7")
+    assert "has no robot 'r70'" in sros(*first[:-1], "r70", cwd=folder).err
+    bare = copy_of(folder / "ks", folder / "bare")
+    done = sros(*first, cwd=folder).ok()
+    assert done.out.splitlines() == [
+        "created enclave /r7/lamp",
+        "replaced the permissions of enclave /r7/base",
+    ]
+    assert {*enclave_names(folder / "ks")} == {*names, "/r7/lamp"}
+    assert "left-out" not in sros(*chosen, cwd=folder).ok().err
+    said = sros("fleet", "publish", "ks", "pub", "--dry-run", cwd=folder).ok().out
+    assert "new releases of 1 robot" in said
+    # By hand, it is an enclave of no robot, and no release has it.
+    for verb in (
+        ("create_enclave", bare, "/r7/lamp"),
+        ("create_permission", bare, "/r7/lamp", "robot.xml", *FLEET),
+        ("distribute_key", bare, "/r7/lamp", "lamp"),
+    ):
+        said = sros(*verb, cwd=folder).ok().err
+        assert "note [fleet.unrecorded]: /r7/lamp: of no robot" in said, verb
+        assert "robots that fetch" not in said
+
+
 def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
     """Renewed and revoked by robot; a robot that leaves; a domain that changes; an edit by hand."""
     folder = copied(made, tmp_path)

@@ -22,7 +22,7 @@ from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import enclave_of
 from sros_tool.keystore.delivery.archive import SUFFIXES, file_mode, pack
 from sros_tool.keystore.delivery.robot import check_same_authority
-from sros_tool.keystore.fleet import load_fleet
+from sros_tool.keystore.fleet import load_fleet, unrecorded_notes
 from sros_tool.keystore.known_keys import known_authorities, unlisted_revocations
 from sros_tool.keystore.layout import (
     AGENT,
@@ -141,7 +141,7 @@ def distribute(
             ``target`` has other content, which only ``force`` replaces.
     """
     files = exported_files(keystore, names, now, keyless=keyless)
-    notes = tuple(_token_notes(files))
+    notes = (*_token_notes(files), *unrecorded_notes(keystore, load_fleet(keystore), names))
     if target.name.endswith(_ARCHIVE_SUFFIXES):
         return Export(target, tuple(names), _write_archive(target, files, force, dry_run), notes)
     changes = _write_folder(keystore, target, files, force, dry_run)

@@ -36,6 +36,7 @@ from sros_tool.keystore.fleet import (
     load_fleet,
     publish_command,
     refuse_stale_domains,
+    unrecorded_notes,
 )
 from sros_tool.keystore.issuing.acceptance import imported_notes
 from sros_tool.keystore.issuing.authority import create_authorities, write_copies
@@ -361,6 +362,7 @@ def _expired_enclaves(change: KeystoreChange, names: Iterable[str]) -> Iterator[
 
 def creation(change: KeystoreChange, rights: tuple[ReplacedRights, ...]) -> Creation:
     """Return the result of a change that created or changed enclaves."""
+    change.notes += unrecorded_notes(change.keystore, change.fleet, change.outcomes)
     return change.result(
         Creation,
         rights=rights,
