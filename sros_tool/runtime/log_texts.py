@@ -716,7 +716,8 @@ UNKNOWN = LogText(
         # Any line of the file of ROS_SECURITY_LOG_FILE: without trouble, it stays empty.
         r"|\[[A-Z]{4,13}\] [^\s|]+\|[^\s|]+ \d+ \w+::\w+ :"
         # Cyclone DDS; what it traces of success is no trouble.
-        r"|\A\d+\.\d+ \[\d*\]\s+\S+: (?!send \w+ tokens|.*(?:DDS Security plugins have been loaded"
+        r"|\A\d+\.\d+ \[\d*\]\s+\S+: (?! *(?:set|send|remember) \w+ tokens"
+        r"| *(?:set|match)_remote_|.*(?:DDS Security plugins have been loaded|is already loaded"
         r"|using security settings from|allow non-secure remote|FSM: |handshake (?:delete|resend)"
         r"|config: |(?:PARTICIPANT|WRITER|READER) \S+ QOS=|write_sample |data\(builtin"
         r"|validate_local_identity: candidate_guid|cleanup participant|SPDP ST"

@@ -335,6 +335,9 @@ def test_without_a_keystore(file: str, ids: list[str]) -> None:
         "SPDP ST3 8:9:d:1c1 unknown not allowed",
         "cleanup participant 8:9:d:1c1 security attributes",
         "send crypto tokens(8:9:d:ff0202c3 --> f:1:4:ff0202c4)",
+        " set participant tokens src(d:d:e:1c1) dst(f:5:7:1c1)",
+        "set_remote_writer_crypto_tokens d:d:e:ff0101c2 with reader f:5:7:ff0101c7",
+        "match_remote_reader d:d:e:c2 with writer f:5:7:c7: tokens available",
         "match_remote_reader: proxypp_crypto=14 wr_crypto=94 prd_crypto=14",
         "connect_proxy_writer_with_reader (pwr f:1:4:c2) with (rd 8:9:d:c7) waiting for approval "
         "by security",
