@@ -614,6 +614,18 @@ def test_a_focus_says_its_answer_and_shows_what_leads_to_it(
         }
         tops = [places[name]["y"] for name in ("controller", "velocity_mux", "/cmd_vel", "base")]
         assert tops == sorted(set(tops))
+        # No link goes through a card as if it were its own; it only touches those at its ends.
+        through = """() => [...document.querySelectorAll('#map .link')].map(link => {
+            const step = link.getTotalLength() / 59;
+            const points = Array.from({length: 60}, (_, n) => link.getPointAtLength(step * n));
+            return [...document.querySelectorAll('#map .card')].filter(card => {
+                const {e: x, f: y} = card.transform.baseVal[0].matrix;
+                const {width, height} = card.querySelector('rect').getBBox();
+                return points.some(point => x + 2 < point.x && point.x < x + width - 2
+                    && y + 2 < point.y && point.y < y + height - 2);
+            }).length;
+        })"""
+        assert set(page.evaluate(through)) == {0}
         page.focus("#map .card.chosen")
         page.keyboard.press("ArrowUp")
         assert "velocity_mux" in page.evaluate("document.activeElement.textContent")

@@ -2,7 +2,7 @@
 // are wider than the window into it.
 
 import dagre from "@dagrejs/dagre";
-import { curveBumpX, line, linkVertical } from "d3-shape";
+import { curveBumpX, curveBumpY, line } from "d3-shape";
 import { KINDS, counted, sends } from "./words.js";
 
 const SIZES = { letter: 7.4, smallLetter: 6.2, line: 16, small: 14, pad: 7 };
@@ -241,7 +241,8 @@ export function fitted(scene, room) {
 }
 
 // A flow of more columns than the window has room for goes from top to bottom: each column is a band
-// with two cards next to each other, below what the column is.
+// with two cards next to each other, below what the column is.  A link passes other rows of a band
+// between their cards, not behind them, where it would seem to be theirs.
 function stacked(scene, columnsOf, room) {
   const cards = [];
   const bandHeads = [];
@@ -251,6 +252,8 @@ function stacked(scene, columnsOf, room) {
     if (head) bandHeads.push({ text: head.text, x: 8, y: y + 16, anchor: "start" });
     y += head ? 24 : 8;
     const width = Math.floor((room - 32) / 2);
+    const top = y;
+    const placed = [];
     let row = [];
     for (const old of column) {
       const frame = scene.frames.find((each) => contains(each, old));
@@ -262,22 +265,27 @@ function stacked(scene, columnsOf, room) {
       if (isNew && frame) y += LEAD;
       const x = column.length === 1 ? Math.round((room - width) / 2) : 8 + row.length * (width + 16);
       row.push({ ...rewrapped(old, width, true), frame, x, y });
-      cards.push(row.at(-1));
+      placed.push(row.at(-1));
     }
+    const [first, last] = [placed[0].y, row[0].y];
     y = below(row) + NARROW_GAP;
+    for (const card of placed) cards.push({ ...card, enters: card.y > first ? top : 0, leaves: card.y < last ? y - NARROW_GAP : 0 });
   }
   const frames = scene.frames.map((frame) => ({ ...around(frame, cards.filter((card) => card.frame === frame)), x: 2, width: room - 4 }));
   const box = new Map(cards.map((card) => [card.id, card]));
-  const down = linkVertical();
+  const down = line().curve(curveBumpY);
+  const middle = room / 2;
   const links = scene.links.map((link) => {
     const [from, to] = [box.get(link.source), box.get(link.target)];
-    const path = down({ source: [from.x + from.width / 2, from.y + from.height], target: [to.x + to.width / 2, to.y - 1] });
-    return { ...link, path };
+    const [start, end] = [from.y + from.height, to.y - 1];
+    const out = from.leaves ? [[middle, start + 13], [middle, from.leaves]] : [];
+    const into = to.enters ? [[middle, to.enters], [middle, end - 13]] : [];
+    return { ...link, path: down([[from.x + from.width / 2, start], ...out, ...into, [to.x + to.width / 2, end]]) };
   });
   return { ...scene, width: room, height: y, slim: true, stacked: true, cards, links, frames, heads: bandHeads };
 }
 
-const below = (row) => Math.max(...row.map((card) => card.y + card.height)) + 9;
+const below = (row) => Math.max(...row.map((card) => card.y + card.height)) + 14;
 
 // Cards from left to right in columns, and in each column from the top.
 function byColumn(cards) {
