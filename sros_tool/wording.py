@@ -21,6 +21,12 @@ def first_few(
     return separator.join(texts[:maximum]) + (f"{joint}{left_out} more" if left_out > 0 else "")
 
 
+def shortened(value: object) -> str:
+    """Return the form of a value in Python, of which 80 characters are shown at most."""
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:80]}..."
+
+
 def enumerated(texts: Sequence[str]) -> str:
     """Return all texts as in a sentence: "a, b and c"."""
     *first, last = texts

@@ -181,16 +181,6 @@ def require_child(root: etree._Element, tag: str, name: str, label: str) -> etre
     raise DocumentError(f"{name} is not a {label} document", why)
 
 
-def serialize(root: etree._Element, *, indent: bool = True) -> bytes:
-    """Return the XML document of ``root`` in UTF-8, with an XML declaration.
-
-    With ``indent``, indent ``root`` in place.
-    """
-    if indent:
-        etree.indent(root, space="  ")
-    return etree.tostring(root, xml_declaration=True, encoding="UTF-8") + b"\n"
-
-
 def tag_of(element: etree._Element) -> str:
     """Return the tag of an element as a string."""
     return str(element.tag)

@@ -38,6 +38,7 @@ from sros_tool.fleet.robots import (
 )
 from sros_tool.names import distribution_problem, namespace_problem
 from sros_tool.values import parse_json
+from sros_tool.wording import shortened
 from sros_tool.xml import read_bytes
 
 MAX_BYTES = 4 * 1024 * 1024
@@ -148,7 +149,7 @@ class _Reader:
                 raise self._invalid_value_error("routers", routers, text)
         if ambiguous := sorted(fleet.robots.keys() & fleet.groups.keys()):
             raise self._error(
-                f"{_short_value(ambiguous[0])} is a robot and a group",
+                f"{shortened(ambiguous[0])} is a robot and a group",
                 "Ansible would confuse them.",
                 "Give one of them another name.",
             )
@@ -253,19 +254,14 @@ class _Reader:
                 raise self._error(f"{where} is not a known key", f"There are {', '.join(known)}.")
 
     def _invalid_value_error(self, at: str, value: object, problem: str) -> DocumentError:
-        return self._error(f"{at} has {_short_value(value)}, which is not valid", problem)
+        return self._error(f"{at} has {shortened(value)}, which is not valid", problem)
 
     def _error(self, problem: str, why: str = "", remedy: str = "") -> DocumentError:
         return DocumentError(f"{self._what}: {problem}", why, remedy)
 
 
-def _short_value(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else f"{text[:80]}..."
-
-
 def _key(text: str) -> str:
-    return text if text.isidentifier() and len(text) <= 80 else _short_value(text)
+    return text if text.isidentifier() and len(text) <= 80 else shortened(text)
 
 
 # ── writing ────────────────────────────────────────────────────────────────────────────────

@@ -209,7 +209,7 @@ def hand_edits(
     settings: tuple[str, ...] = ()
     unsigned: tuple[str, ...] = ()
     if present and recorded:
-        settings = tuple(_difference_clauses(recorded, present, "written by sros"))
+        settings = tuple(_difference_clauses(recorded, present))
     if present and governance:
         stated = governance_for(present.protection, governance.domains().closed())
         if stated != governance:
@@ -225,7 +225,7 @@ def _unsigned_clauses(
         yield f"the signed governance differs from [protection] in {SETTINGS}"
 
 
-def _difference_clauses(old: Template, new: Template, origin: str) -> Iterator[str]:
+def _difference_clauses(old: Template, new: Template) -> Iterator[str]:
     """Yield a clause for each key with different values; name and description do not count."""
     if old == new:
         return
@@ -233,7 +233,7 @@ def _difference_clauses(old: Template, new: Template, origin: str) -> Iterator[s
     for key in dict.fromkeys((*before, *after)):
         old_value, new_value = before.get(key, "nothing"), after.get(key, "nothing")
         if old_value != new_value and key not in ("name", "description"):
-            yield f"{key} in {SETTINGS} is {new_value}, but {old_value} was {origin}"
+            yield f"{key} in {SETTINGS} is {new_value}, but {old_value} was written by sros"
 
 
 def _governance_edit(keystore: OpenedKeystore) -> str:

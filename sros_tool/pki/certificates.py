@@ -527,10 +527,12 @@ def is_signed(
     return True
 
 
-def extension(certificate: x509.Certificate, kind: type[Extension]) -> Extension | None:
-    """Return an extension of a certificate, or None."""
+def extension(
+    signed: x509.Certificate | x509.CertificateRevocationList, kind: type[Extension]
+) -> Extension | None:
+    """Return an extension of a certificate or revocation list, or None."""
     try:
-        return certificate.extensions.get_extension_for_class(kind).value
+        return signed.extensions.get_extension_for_class(kind).value
     except x509.ExtensionNotFound:
         return None
 

@@ -20,7 +20,6 @@ from cryptography.x509.oid import CRLEntryExtensionOID, ExtensionOID
 from sros_tool.errors import PkiError
 from sros_tool.pki import der, pem, tolerant
 from sros_tool.pki.certificates import (
-    Extension,
     authority_identifier,
     extension,
     is_signed,
@@ -447,10 +446,10 @@ def _best_list(
     best: tuple[x509.CertificateRevocationList, x509.Certificate, _Score] | None = None
     for crl in lists:
         issuer = _issuer(chain, crl)
-        point = _value(crl, x509.IssuingDistributionPoint)
+        point = extension(crl, x509.IssuingDistributionPoint)
         if issuer is None or (point and (point.indirect_crl or point.only_some_reasons)):
             continue
-        if _value(crl, x509.DeltaCRLIndicator) or _value(crl, ContradictoryPoint):
+        if extension(crl, x509.DeltaCRLIndicator) or extension(crl, ContradictoryPoint):
             continue
         score = _Score(
             not _entries(_Content(crl)).has_unknown,
@@ -473,7 +472,7 @@ def _issuer(
     """
     if not same_name(crl.issuer, chain[0].issuer):
         return None
-    identifier = _value(crl, x509.AuthorityKeyIdentifier)
+    identifier = extension(crl, x509.AuthorityKeyIdentifier)
     first = 1 if len(chain) > 1 else 0
     for place, certificate in enumerate(chain[first:]):
         named = place == 0 or same_name(certificate.subject, crl.issuer)
@@ -596,10 +595,3 @@ def _covers_all_reasons(certificate: x509.Certificate, crl: x509.CertificateRevo
 def _has_expired(crl: x509.CertificateRevocationList, moment: datetime) -> bool:
     expiry = next_update(crl)
     return expiry is not None and expiry <= moment
-
-
-def _value(crl: x509.CertificateRevocationList, kind: type[Extension]) -> Extension | None:
-    try:
-        return crl.extensions.get_extension_for_class(kind).value
-    except x509.ExtensionNotFound:
-        return None

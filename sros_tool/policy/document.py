@@ -62,7 +62,7 @@ from sros_tool.policy.placeholders import (
     sample,
 )
 from sros_tool.values import DryRun, FileChange, FileChanges, Notes, shows
-from sros_tool.xml import parse, read_bytes, serialize, tag_of
+from sros_tool.xml import parse, read_bytes, tag_of
 
 _NAMESPACES = ("http://www.w3.org/2001/XInclude", "http://www.w3.org/2003/XInclude")
 INCLUDES = frozenset(f"{{{ns}}}include" for ns in _NAMESPACES)
@@ -1112,7 +1112,7 @@ def policy_xml(policy: Policy) -> bytes:
         last, element = profiles[-1], parse(text.encode(), "metadata")
         last.tail, element.tail = profiles.text, last.tail
         profiles.append(element)
-    return serialize(root, indent=False)
+    return etree.tostring(root, xml_declaration=True, encoding="UTF-8") + b"\n"
 
 
 def checked_text(

@@ -47,7 +47,7 @@ from sros_tool.policy.placeholders import (
 )
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.values import shows
-from sros_tool.wording import counted, first_few
+from sros_tool.wording import counted, first_few, shortened
 from sros_tool.xml import read_bytes
 
 _MOST_REQUIREMENTS = 1000
@@ -360,7 +360,7 @@ def _stated_tables(data: bytes, file: str) -> list[_Table]:
         if kind not in _READERS:
             line = next((number for number, name in _headers(text) if name == kind), 0)
             raise DocumentError(
-                f"{Source(file, line)}: {_short(kind)} is not a kind of requirement",
+                f"{Source(file, line)}: {shortened(kind)} is not a kind of requirement",
                 f"The kinds are {', '.join(_READERS)}.",
             )
         lines = places.get(kind, [])
@@ -449,7 +449,7 @@ class _Table:
             if key not in known_keys:
                 raise self.error(
                     key,
-                    f"{_short(key)} is not a key of [[{self.kind}]]",
+                    f"{shortened(key)} is not a key of [[{self.kind}]]",
                     (f"There are {', '.join(known_keys)}."),
                 )
         texts = {key: self.text(key) if key in self.values else "" for key in _WORDS}
@@ -461,7 +461,7 @@ class _Table:
         if not isinstance(value, str) or not value or len(value) > _LONGEST_TEXT:
             raise self.error(
                 key,
-                f"{key} has {_short(value)}, which is not a text",
+                f"{key} has {shortened(value)}, which is not a text",
                 f"It has 1 to {_LONGEST_TEXT} characters.",
             )
         return value
@@ -493,7 +493,7 @@ class _Table:
             if not problem and name == "/":
                 problem = "It is a namespace."
             if problem:
-                raise self.error(key, f"{_short(name)} is not valid in {key}", problem)
+                raise self.error(key, f"{shortened(name)} is not valid in {key}", problem)
         return tuple(
             name if name.startswith("*") else expand(name, self.namespace, "") for name in names
         )
@@ -507,7 +507,7 @@ class _Table:
             if not problem and name[0] not in "/*?[":
                 problem = "An enclave begins with '/'."
             if problem:
-                raise self.error(key, f"{_short(enclave)} is not an enclave in {key}", problem)
+                raise self.error(key, f"{shortened(enclave)} is not an enclave in {key}", problem)
         if all(enclave.startswith(EXCEPT) for enclave in enclaves):
             raise self.error(
                 key,
@@ -608,12 +608,12 @@ def _placeholders(table: _Table) -> dict[Placeholder, str]:
             try:
                 placeholders = placeholders_of(parts_of(name.removeprefix(EXCEPT)))
             except ValueError as error:
-                text = f"{_short(name)} is not valid in {key}"
+                text = f"{shortened(name)} is not valid in {key}"
                 raise table.error(key, text, str(error)) from None
             if isinstance(value, str) and any(placeholder.plural for placeholder in placeholders):
                 raise table.error(
                     key,
-                    f"{_short(name)} is not valid in {key}",
+                    f"{shortened(name)} is not valid in {key}",
                     "It stands for several names, but only one can be here.",
                 )
             used |= dict.fromkeys(placeholders, key)
@@ -736,7 +736,7 @@ def _must_from(table: _Table) -> Must:
     if enclave != "/" and (problem or not enclave.startswith("/")):
         raise table.error(
             "enclave",
-            f"{_short(enclave)} is not an enclave",
+            f"{shortened(enclave)} is not an enclave",
             problem or "An enclave begins with '/'.",
         )
     return Must(**common, rights=table.rights(), enclave=table.enclave_below(enclave))
@@ -748,7 +748,7 @@ def _at_most_from(table: _Table) -> AtMost:
     if type(most) is not int or not 0 < most < 2**31:
         raise table.error(
             "enclaves",
-            f"enclaves has {_short(most)}, which is not a number",
+            f"enclaves has {shortened(most)}, which is not a number",
             "Write how many enclaves may use one name, from 1; for none there is [[nobody]].",
         )
     return AtMost(**common, rights=table.rights(), most=most)
@@ -772,7 +772,7 @@ def _not_both_from(table: _Table) -> NotBoth:
         if not isinstance(value, dict) or not value or set(value) - set(KIND_OF):
             raise table.error(
                 key,
-                f"{key} has {_short(value)}, which does not state rights",
+                f"{key} has {shortened(value)}, which does not state rights",
                 'Write for example first = { publish = ["/cmd_vel"] }.',
             )
         line = table.lines.get(key, table.source.line)
@@ -787,7 +787,7 @@ def _protected_from(table: _Table) -> Protected:
     level = table.values.get("level")
     if not isinstance(level, str) or level not in _LEVELS:
         raise table.error(
-            "level", f"level has {_short(level)}", f"Write {' or '.join(map(repr, _LEVELS))}."
+            "level", f"level has {shortened(level)}", f"Write {' or '.join(map(repr, _LEVELS))}."
         )
     names = tuple((k, name) for k in RIGHTS if k in table.values for name in table.names(k))
     if not names:
@@ -816,11 +816,6 @@ _READERS: Mapping[str, Callable[[_Table], Requirement]] = {
 }
 KINDS = tuple(_READERS)
 """The kinds of requirements, as a file names them."""
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else f"{text[:80]}..."
 
 
 @shows("change", "demand", "name", "why", "file", "line", "now")

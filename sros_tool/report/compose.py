@@ -181,9 +181,7 @@ def overlay(
     )
 
 
-def with_requirements(
-    picture: Picture, requirements: Requirements, governance: Governance | None = None
-) -> Picture:
+def with_requirements(picture: Picture, requirements: Requirements) -> Picture:
     """Return a picture in which the rights that break requirements are marked.
 
     A right to a name that the picture does not have is added, such as a name that only wildcards
@@ -206,10 +204,7 @@ def with_requirements(
             edges.append(Edge(use.enclave, use.kind, use.name, use.right, ALLOW, by, violates=True))
     known = {(name.kind, name.name) for name in picture.names}
     new = {(edge.kind, edge.name) for edge in edges} - known
-    names = [
-        Name(kind, name, namespace_of(name), protection_of(governance, kind, name))
-        for kind, name in new
-    ]
+    names = [Name(kind, name, namespace_of(name), UNKNOWN) for kind, name in new]
     paths = {enclave.path for enclave in picture.enclaves}
     return replace(
         picture,

@@ -14,7 +14,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from sros_tool.dds.decision.elements import UnreadableError, XmlElement
+from sros_tool.dds.decision.elements import UnreadableError, XmlElement, decoded
 from sros_tool.dds.domains import MAX_DOMAIN, DomainRange, DomainSet
 from sros_tool.dds.governance import (
     Attribute,
@@ -109,7 +109,7 @@ class _Reader:
             if not self._take("="):
                 raise self._error(f"the attribute {name} has no value")
             self._skip()
-            element.attributes[name] = _decoded(self._string())
+            element.attributes[name] = decoded(self._string())
             self._skip()
         if self._take("/>"):
             return element
@@ -175,7 +175,7 @@ class _Reader:
             if len(text) - self._index < _ROOM:
                 break
         content = (done + self._unescaped(pending)).strip(_BLANKS)
-        return _decoded(content.partition("\0")[0])
+        return decoded(content.partition("\0")[0])
 
     def _unescaped(self, text: str) -> str:
         return _REFERENCE.sub(self._referenced_character, text) if "&" in text else text
@@ -190,10 +190,6 @@ class _Reader:
             if code <= 0x10FFFF:
                 return chr(code).encode("utf-8", "surrogatepass").decode("latin-1")
         raise self._error(f"&{word} is not a character reference")
-
-
-def _decoded(text: str) -> str:
-    return text if text.isascii() else text.encode("latin-1").decode("utf-8", "surrogateescape")
 
 
 _SCHEMA_ATTRIBUTES = ("xmlns:xsi", "xsi:nonamespaceschemalocation")

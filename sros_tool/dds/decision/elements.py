@@ -25,6 +25,11 @@ from sros_tool.dds.permissions import Permissions, parse_permissions
 from sros_tool.xml import tag_of
 
 
+def decoded(text: str) -> str:
+    """Return the text whose bytes in UTF-8, perhaps malformed, are the characters of ``text``."""
+    return text if text.isascii() else text.encode("latin-1").decode("utf-8", "surrogateescape")
+
+
 class UnreadableError(Exception):
     """The reason why a vendor does not accept a document.
 

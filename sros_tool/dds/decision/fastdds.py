@@ -13,7 +13,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from sros_tool.dds.decision.elements import NodeMark, UnreadableError, XmlElement
+from sros_tool.dds.decision.elements import NodeMark, UnreadableError, XmlElement, decoded
 from sros_tool.dds.domains import DomainRange, DomainSet
 from sros_tool.dds.governance import (
     Attribute,
@@ -89,10 +89,10 @@ class _Reader:
             if closing and not closed:
                 if len(stack) == 1:
                     return  # what follows the root is not read
-                if stack.pop().name != _decoded(name):
+                if stack.pop().name != decoded(name):
                     raise self._error(f"</{name}> closes another element")
                 continue
-            element = XmlElement(_decoded(name), self._attributes(tag[3]) if tag[3] else {})
+            element = XmlElement(decoded(name), self._attributes(tag[3]) if tag[3] else {})
             children.append(element)
             if not closed:
                 stack.append(element)
@@ -121,7 +121,7 @@ class _Reader:
                 raise self._error("a processing instruction follows the prolog")
             children.append(NodeMark.DECLARATION)
         elif begin == "<![CDATA[":
-            children.append(_decoded(_LINE_END.sub("\n", text[start:stop])))
+            children.append(decoded(_LINE_END.sub("\n", text[start:stop])))
         else:
             children.append(NodeMark.COMMENT if begin == "<!--" else NodeMark.OTHER)
 
@@ -131,17 +131,13 @@ class _Reader:
             if name in attributes:
                 raise self._error(f"the attribute {name} is given twice")
             attributes[name] = _plain(value[1:-1])
-        return {_decoded(name): value for name, value in attributes.items()}
-
-
-def _decoded(text: str) -> str:
-    return text if text.isascii() else text.encode("latin-1").decode("utf-8", "surrogateescape")
+        return {decoded(name): value for name, value in attributes.items()}
 
 
 def _plain(text: str) -> str:
     """Return the text up to a NUL, with normalized line ends and resolved references."""
     if "&" not in text:
-        return _decoded(_LINE_END.sub("\n", text) if "\r" in text or "\n" in text else text)
+        return decoded(_LINE_END.sub("\n", text) if "\r" in text or "\n" in text else text)
     # TinyXML-2 writes into the text that it reads: for a lone "&" it writes nothing, so the old
     # character stays at that position.
     written = list(text)
@@ -162,7 +158,7 @@ def _plain(text: str) -> str:
         written[place : place + len(into)] = into
         place += len(into)
         index += len(taken)
-    return _decoded("".join(written[:place]).partition("\0")[0])
+    return decoded("".join(written[:place]).partition("\0")[0])
 
 
 def _referenced_character(match: re.Match[str]) -> str | None:
