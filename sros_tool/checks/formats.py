@@ -343,7 +343,12 @@ def keystore_metrics(
     lifetimes, unreadable = survey(keystore)
     expiries = [*_shared_expiries(keystore), *_enclave_expiries(keystore, lifetimes)]
     earliest: dict[str, datetime] = {}
+    settings = None
+    with suppress(SrosError):  # which a finding says
+        settings = keystore.settings
     for expiry in expiries:
+        if settings and expiry.enclave and settings.longest_validity(expiry.enclave) is not None:
+            continue
         earliest[expiry.kind] = min(expiry.moment, earliest.get(expiry.kind, expiry.moment))
     place = {"keystore": str(keystore.root.absolute())}
     severities = Counter(finding.severity for finding in findings)
@@ -366,7 +371,8 @@ def keystore_metrics(
         ),
         Metric(
             "sros_earliest_expiry_timestamp_seconds",
-            f"The first expiry of all files of a kind ({_KINDS}), in seconds since 1970.",
+            f"The first expiry of all files of a kind ({_KINDS}), in seconds since 1970, without "
+            "short-lived enclaves, which a person renews when they are needed.",
             tuple(
                 Sample(_seconds(moment), {**place, "kind": kind})
                 for kind, moment in earliest.items()

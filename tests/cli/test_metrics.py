@@ -62,6 +62,18 @@ def test_the_expiry_of_every_file_and_the_findings(keystore: Path) -> None:
     assert sum(found.get("sros_findings_of_kind", {}).values()) == sum(shown.values())
 
 
+def test_short_lived_enclaves_do_not_expire_first(tmp_path: Path) -> None:
+    """They expire all the time, and a person renews them when they are needed."""
+    home = tmp_path / "home"
+    sros("create_keystore", home, "--template", "production").ok()
+    sros("create_enclave", home, "/operator/anna", "/base").ok()
+    found = read(sros("metrics", home).ok().out)
+    earliest = found["sros_earliest_expiry_timestamp_seconds"]
+    for kind in ("certificate", "permissions"):
+        expiry = found["sros_expiry_timestamp_seconds"]
+        assert expiry[kind, "/operator/anna"] < earliest[kind,] == expiry[kind, "/base"]
+
+
 def test_the_running_processes_are_counted(keystore: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     process = Process(7, ("talker",), {}, datetime.now(UTC), network="net:[1]")
     unseen = UnseenProcess(8, ("init",), "Permission denied", speaks=False)
