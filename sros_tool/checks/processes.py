@@ -635,7 +635,7 @@ def process_findings(
             if is_secured_here and _network_and_domain(process) == own_domain:
                 yield from _daemon_findings(process, environment)
             continue
-        yield from _zenoh_findings(process)
+        yield from zenoh_findings(process)
         if process.asks_for_security:
             yield from _file_findings(process, now=now, zone=zone)
             yield from _unsecured_findings(process)
@@ -777,7 +777,8 @@ def _is_harmless_override(key: str, value: str) -> bool:
     return any(f"{key}/".startswith(f"{name}/") for name in _HARMLESS_OVERRIDES)
 
 
-def _zenoh_findings(process: Process) -> Iterator[Finding]:
+def zenoh_findings(process: Process) -> Iterator[Finding]:
+    """Yield a finding if a Zenoh process may not enforce what the files of its enclave say."""
     if not process.is_zenoh:
         return
     configuration = process.configuration

@@ -206,11 +206,7 @@ def _guests(running: RunningRobot) -> Iterator[str]:
 def _why_missing(running: RunningRobot, missing: Sequence[str], observed: ObservedProcesses) -> str:
     """Return which enclaves have no process, or an open one, and what the others lack."""
     robot = running.robot
-    outdated = {
-        enclave.name: (process, running.why_not_current(process, enclave))
-        for process, enclave in running.secured
-        if enclave.name in missing
-    }
+    outdated = {name: found for name, found in running.not_current.items() if name in missing}
     causes = {
         process.enclave: f"{process.unit} does not run it: systemctl status {process.unit}"
         if process.is_absent(running.processes)

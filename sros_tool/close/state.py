@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-from sros_tool.checks.processes import newer_files
+from sros_tool.checks.processes import newer_files, zenoh_findings
 from sros_tool.close.processes import (
     ClosedProcess,
     ObservedProcesses,
@@ -109,17 +109,29 @@ class RunningRobot:
 
     @cached_property
     def current_enclaves(self) -> Set[str]:
-        """The enclaves in which a process runs with the current files of the export.
+        """The enclaves whose processes all run with the current files of the export.
 
         Without the strategy Enforce, a process runs open if its files were not there at its start.
         """
+        return {enclave.name for _, enclave in self.secured} - self.not_current.keys()
+
+    @cached_property
+    def not_current(self) -> Mapping[str, tuple[Process, str]]:
+        """Map enclaves to a process that is not closed, with why, before "the processes of X".
+
+        A process of a user who cannot read the files only claims to run in an enclave: it counts
+        if no other one does.
+        """
+        by_enclave: dict[str, list[SecuredProcess]] = {}
+        for secured in self.secured:
+            by_enclave.setdefault(secured.enclave.name, []).append(secured)
         return {
-            enclave.name
-            for process, enclave in self.secured
-            if enclave.is_there
-            and self.may_use_files(process)
-            and process.environment.get(STRATEGY) == "Enforce"
-            and not [*newer_files(process, enclave)]
+            name: (process, why)
+            for name, processes in by_enclave.items()
+            for process, enclave in (
+                [each for each in processes if self.may_use_files(each.process)] or processes
+            )
+            if (why := self._why_not_current(process, enclave))
         }
 
     def may_use_files(self, process: Process) -> bool:
@@ -129,13 +141,18 @@ class RunningRobot:
         """
         return process.user in (0, self.robot.export.stat().st_uid)
 
-    def why_not_current(self, process: Process, enclave: ProcessEnclave) -> str:
-        """Return why a process is not closed, as text before "the processes of ENCLAVE"."""
+    def _why_not_current(self, process: Process, enclave: ProcessEnclave) -> str:
+        """Return why a process is not closed, as text before "the processes of X"; "" if it is."""
         if not self.may_use_files(process):
             return f"user {process.user}, who cannot read the files, runs"
         if process.environment.get(STRATEGY) != "Enforce":
             return f"no {STRATEGY}=Enforce in"
-        newer = first_few([*newer_files(process, enclave)], MOST_NAMES) or "files"
+        if not enclave.is_there:
+            return f"without files{f' ({enclave.problem})' * bool(enclave.problem)} run"
+        newer = first_few([*newer_files(process, enclave)], MOST_NAMES)
+        if not newer:
+            finding = next(zenoh_findings(process), None)
+            return f"not as the files say ({finding.text}) run" if finding else ""
         mode = enclave.file(KEY_FILE).mode
         readable = (
             f"others can read {KEY_FILE} (its mode is {mode:04o}): if anybody did, `sros renew "

@@ -82,7 +82,7 @@ def _text_of(payload: zenoh.ZBytes | None) -> str:
 class _ZenohNode:
     """One node in the graph; its enclave in tokens is what the process says of itself.
 
-    Its messages have ``size`` bytes or more.
+    Its messages have ``size`` bytes or more.  A router, which is no node, has no ``name``.
     """
 
     def __init__(
@@ -95,7 +95,8 @@ class _ZenohNode:
         self._graph: set[str] = set()
         self._declared: list[object] = []
         self._keep = self._declared.append  # what nobody keeps is undeclared
-        self._announce(NODE)
+        if name:
+            self._announce(NODE)
 
     def _announce(self, kind: str, name: str = "", types: tuple[str, str] = ("", "")) -> bytes:
         """Put an entity of the node into the graph, and return its GID."""
@@ -380,7 +381,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 0
         stage = ProcessStage.ENDPOINT
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
-        name = options.role if options.role != "router" else "rmw_zenohd"
+        name = options.role if options.role != "router" else ""
         node = _ZenohNode(session, domain, enclave_in(arguments, ""), name, options.size)
         kind = _Eraser if options.role == _ERASER else ROLES[options.role]
         role = kind(node, options, events)

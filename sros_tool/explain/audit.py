@@ -288,7 +288,8 @@ class AuditResult(NamedTuple):
     unseen: Sequence[EnclaveNode]
     """The nodes of the policy or keystore that were not seen, and so not judged."""
     unjudged: Sequence[str]
-    """Observed things that were not judged, as counts in words; ``notes`` has their names."""
+    """Observed things that were not judged, as counts in words with some names; ``notes`` has more.
+    """
     observation: Observation
     settled: bool
     """Whether the ROS graph stopped changing before the result."""
@@ -456,9 +457,9 @@ _STRAYS = "not judged, because the writers or readers of these topics belong to 
 
 
 def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
-    """Return notes on observed things that were not judged, each with their number in words.
+    """Return notes on observed things that were not judged, each with their number and names.
 
-    The words are "" for tools that only observe.
+    These are "" for tools that only observe.
     """
     tools = {node.fqn for node in observation.nodes if is_tool(node)}
     active = {node.fqn for node in observation.nodes if is_tool(node) and not _only_observes(node)}
@@ -479,7 +480,11 @@ def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
         ),
         (_note("stray", _STRAYS, strays), f"{counted(len(strays), 'topic')} of no node", strays),
     ]
-    return [(note, words if counts else "") for note, words, counts in notes if note]
+    return [
+        (note, f"{words} ({first_few(sorted(names), _MOST_NAMES)})" if names else "")
+        for note, words, names in notes
+        if note
+    ]
 
 
 def _note(kind: str, text: str, subjects: Iterable[str]) -> Note | None:
@@ -487,6 +492,7 @@ def _note(kind: str, text: str, subjects: Iterable[str]) -> Note | None:
     return Note(f"audit.{kind}", f"{text}: {first_subjects(names)}") if names else None
 
 
+_MOST_NAMES = 3
 _OF_EVERY_NODE = ("/rosout", "/parameter_events")
 
 

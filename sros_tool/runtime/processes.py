@@ -59,7 +59,9 @@ _MOST_COPIES_SOUGHT = 20
 unknown.
 """
 _DAEMON = ("_ros2_daemon", "ros2cli.daemon", "ros2-daemon")
-_ROUTERS = ("rmw_zenohd", "zenohd")
+_ZENOHD = "zenohd"
+"""The Zenoh router without rmw_zenoh, whose variables it does not read."""
+_ROUTERS = ("rmw_zenohd", _ZENOHD)
 _BRIDGES = ("zenoh-bridge-ros2dds", "zenoh-bridge-dds")
 _INTERPRETER = re.compile(r"(?:python[\d.]*|sh|bash|dash|perl|ruby|node)\Z")
 _SCRIPTS_OF_SROS = ("sros", "sros_tool")
@@ -166,8 +168,17 @@ class Process:
 
     @property
     def is_router(self) -> bool:
-        """Whether the process is a Zenoh router."""
-        return self.is_demo_router or any(Path(word).name in _ROUTERS for word in self.command[:3])
+        """Whether the process is a Zenoh router, by its program, or as it could be nothing else.
+
+        In the environment that ``sros run`` gives a router, no session of rmw_zenoh starts.
+        """
+        uris = self.environment.get(SESSION_URI), self.environment.get(ROUTER_URI, "")
+        is_no_session = uris[0] == NO_CONFIGURATION and uris[1] not in ("", NO_CONFIGURATION)
+        return (
+            self.is_demo_router
+            or (is_no_session and self.rmw.startswith(RMW_ZENOH))
+            or not _programs_in(self.command).isdisjoint(_ROUTERS)
+        )
 
     @property
     def is_demo_router(self) -> bool:
@@ -599,12 +610,16 @@ _FIRST_PID_NAMESPACE = "pid:[4026531836]"
 """The name of the namespace that has all processes (PROC_PID_INIT_INO of <linux/proc_ns.h>)."""
 
 
+def _programs_in(command: tuple[str, ...]) -> set[str]:
+    """Return the names that may be the program's, or that of a script which is interpreted."""
+    return {Path(word).name for word in command[:3]}
+
+
 def _may_speak(command: tuple[str, ...]) -> bool:
     """Return whether the command of a process shows that it uses ROS 2 or Zenoh."""
-    return ROS_ARGS in command or any(
-        Path(word).name in (*_ROUTERS, *_BRIDGES) or any(mark in word for mark in _DAEMON)
-        for word in command[:3]
-    )
+    is_of_zenoh = not _programs_in(command).isdisjoint((*_ROUTERS, *_BRIDGES))
+    is_daemon = any(mark in word for word in command[:3] for mark in _DAEMON)
+    return ROS_ARGS in command or is_of_zenoh or is_daemon
 
 
 def _is_sros_run(command: tuple[str, ...]) -> bool:
@@ -621,11 +636,17 @@ def _configuration_of(process: Process) -> LoadedFile | None:
     if not process.is_zenoh:
         return None
     by_rmw = RMW in process.environment or "librmw_zenoh_cpp" in process.libraries
-    is_rmw_router = process.is_router and "zenohd" not in {Path(e).name for e in process.command}
-    if not (by_rmw or is_rmw_router):
+    is_of_zenoh = not _programs_in(process.command).isdisjoint((_ZENOHD, *_BRIDGES))
+    if is_of_zenoh or not (by_rmw or process.is_router):
         return LoadedFile("", problem="its program or its arguments choose it")
-    path = process.environment.get(ROUTER_URI if process.is_router else SESSION_URI, "")
-    return LoadedFile(path) if path and path != NO_CONFIGURATION else None
+    session, router = (
+        "" if (uri := process.environment.get(name, "")) == NO_CONFIGURATION else uri
+        for name in (SESSION_URI, ROUTER_URI)
+    )
+    if session and router and not (process.is_router or "librcl" in process.libraries):
+        return LoadedFile("", problem=f"its program chooses {SESSION_URI} or {ROUTER_URI}")
+    path = router if process.is_router else session
+    return LoadedFile(path) if path else None
 
 
 def _stat(folder: int) -> _Stat:

@@ -5,16 +5,20 @@ from __future__ import annotations
 import os
 import subprocess
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from sros_tool.close.assignment import assign
 from sros_tool.close.processes import ClosedProcess, ObservedProcesses, run_words
+from sros_tool.close.state import RunningRobot
 from sros_tool.policy.model import Policy
-from sros_tool.runtime.environment import RMW_ZENOH
+from sros_tool.runtime.environment import NO_CONFIGURATION, RMW_ZENOH
 from sros_tool.runtime.processes import (
+    LoadedFile,
     Process,
     ProcessEnclave,
     ProcessOrigin,
@@ -126,3 +130,34 @@ def test_a_router_has_no_node_and_is_no_unknown_process() -> None:
     for router in (replace(demo, pid=8), process(8, "/opt/rmw_zenohd")):
         later = observed.with_current_pids(RunningProcesses((router,)), Path("/export"))
         assert ([known.pid for known in later.processes], later.unknown) == ([8], [])
+
+
+def test_an_enclave_is_closed_only_if_all_its_processes_are(tmp_path: Path) -> None:
+    """Such as two routers, of which one is old; a process of others only claims to be in one."""
+    now, state = datetime.now(UTC), tmp_path.stat()
+    file = LoadedFile("cert.pem", now)
+    folders = ((state.st_dev, state.st_ino),)
+    enclave = ProcessEnclave("/export", "/router", (file,), is_there=True, folders=folders)
+    variables = {
+        "RMW_IMPLEMENTATION": RMW_ZENOH,
+        "ROS_SECURITY_STRATEGY": "Enforce",
+        "ZENOH_SESSION_CONFIG_URI": NO_CONFIGURATION,
+    }
+    later, user = now + timedelta(1), os.geteuid()
+    fresh = Process(7, ("a",), variables, later, enclave=enclave, user=user)
+    old, unread = replace(fresh, started=now - timedelta(1)), LoadedFile("/s.json5", problem="odd")
+    robot: Any = SimpleNamespace(export=tmp_path, domain=0)
+    for processes, why in (
+        ((fresh,), None),
+        ((fresh, replace(old, user=4321)), None),
+        ((fresh, old), "cert.pem changed, or got another mode, after the start of"),
+        ((old, fresh), "cert.pem changed, or got another mode, after the start of"),
+        ((replace(fresh, user=4321),), "user 4321, who cannot read the files, runs"),
+        (
+            (replace(fresh, configuration=unread),),
+            "not as the files say ('/s.json5' cannot be read: odd) run",
+        ),
+    ):
+        running = RunningRobot(robot, RunningProcesses(processes))
+        assert running.not_current.get("/router", (old, None))[1] == why
+        assert ("/router" in running.current_enclaves) is (why is None)

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from unittest.mock import Mock
+from unittest.mock import MagicMock, Mock
 
 import pytest
 
@@ -191,6 +191,15 @@ def test_a_node_on_zenoh_ends_at_once_while_it_waits_for_a_router() -> None:
             assert node.wait(PATIENCE) == 0
         finally:
             node.kill()
+
+
+@pytest.mark.parametrize(("name", "tokens"), [("listener", 1), ("", 0)])
+def test_a_router_on_zenoh_is_no_node(name: str, tokens: int) -> None:
+    """As rmw_zenohd: the audit of a robot would otherwise find a node that it cannot judge."""
+    node = pytest.importorskip("sros_tool.demo.zenoh_node")
+    session = MagicMock()
+    node._ZenohNode(session, "0", "", name, 0)
+    assert session.liveliness().declare_token.call_count == tokens
 
 
 def _catches(status: str, number: signal.Signals) -> bool:

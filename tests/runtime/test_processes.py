@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.runtime import processes
-from sros_tool.runtime.environment import enclave_argument
+from sros_tool.runtime.environment import NO_CONFIGURATION, ROUTER_URI, enclave_argument
 from sros_tool.runtime.processes import (
     FileReader,
     LoadedFile,
@@ -127,6 +127,38 @@ def test_only_a_process_with_security_loads_an_enclave(
     proc.add(5, *ROS, environment="\0".join(variables).encode())
     (process,) = proc.look().processes
     assert (process.enclave is not None) is loads
+
+
+ZENOH = {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp", "ZENOH_SESSION_CONFIG_URI": "/s.json5"}
+FOR_ROUTER = {**ZENOH, "ZENOH_SESSION_CONFIG_URI": NO_CONFIGURATION, ROUTER_URI: "/r.json5"}
+FOR_BOTH = {**ZENOH, ROUTER_URI: "/r.json5"}
+REFUSED = {**FOR_ROUTER, ROUTER_URI: NO_CONFIGURATION}
+
+
+@pytest.mark.parametrize(
+    ("command", "environment", "library", "loaded"),
+    [
+        ("talker", ZENOH, "", "/s.json5"),
+        ("rmw_zenohd", FOR_BOTH, "", "/r.json5"),
+        ("python3 start_router.py", FOR_ROUTER, "zenoh", "/r.json5"),
+        ("start_router", FOR_ROUTER, "", "/r.json5"),
+        ("start_router", REFUSED, "", None),
+        ("start", FOR_BOTH, "", ""),
+        ("start", FOR_BOTH, "librcl", "/s.json5"),
+        ("zenohd -c /other.json5", FOR_ROUTER, "", ""),
+        ("zenoh-bridge-ros2dds", FOR_ROUTER, "", ""),
+        ("start_router", {**FOR_ROUTER, "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp"}, "", None),
+    ],
+)
+def test_the_configuration_of_zenoh_is_that_of_the_environment_whatever_the_program(
+    command: str, environment: dict[str, str], library: str, loaded: str | None, root: ProcessRoot
+) -> None:
+    """An empty name is for what sros cannot know."""
+    process = Process(7, tuple(command.split()), environment, NOW, frozenset({library} - {""}))
+    configuration = with_files(process, root, "/").configuration
+    assert (configuration and configuration.name) == loaded
+    if configuration:
+        assert bool(configuration.problem) is not bool(loaded)
 
 
 def test_endless_texts_are_not_looked_at_and_named(proc: Proc) -> None:
