@@ -344,7 +344,9 @@ class _Outputs:
     def _write_undecided(self, markdown: str, reason: str = "") -> None:
         from sros_tool.checks.review import UNDECIDED
 
-        undecided = UNDECIDED.found("the review", reason or markdown, self._first)
+        undecided = UNDECIDED.found(
+            "the review", (reason or markdown).removesuffix("."), self._first
+        )
         self._write(f"## Review: could not be decided\n\n{markdown}\n", [undecided])
 
     def _write(self, markdown: str, findings: Sequence[Finding]) -> None:
@@ -499,7 +501,7 @@ def _step_findings(result: Review, step: ReviewStep, request: ReviewRequest) -> 
                 is_file = step.kind in kinds
                 yield kinds.get(step.kind, NEW_ACCESS).found(name, text, name if is_file else path)
         case error:
-            yield UNDECIDED.found(step.subject or path, str(error), path)
+            yield UNDECIDED.found(step.subject or path, str(error).removesuffix("."), path)
 
 
 def _access_findings(change: AccessChange, path: str) -> Iterator[Finding]:

@@ -222,7 +222,7 @@ class Repository:
         if not kind:
             raise DocumentError(
                 f"the commit of '{name}' is not in the repository",
-                f"It is {digits}.",
+                "" if digits == name else f"It is {digits}.",
                 "In a shallow clone, such as on a server for tests, fetch it first: `git fetch "
                 "origin`, or `--fetch origin` of sros review.",
             )
