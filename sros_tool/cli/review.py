@@ -126,7 +126,7 @@ def _paths_option(name: str, help_text: str) -> Callable[[Decorated], Decorated]
 @_paths_option("keystore", "A keystore, or its public part.")
 @_paths_option(
     "leave-out",
-    "A file, or a folder, of policies that are not for the robot, such as tests.",
+    "A file, or a folder, of policies and keystores that are not for the robot, such as tests.",
 )
 @click.option(
     "--new-access",

@@ -627,7 +627,7 @@ class _Review:
     def _unreviewed_step(
         self, reviewed: Sequence[Path], fleet: Fleet | None
     ) -> tuple[int, Content] | None:
-        """Return the step on policy files that were changed or renamed, but are not reviewed."""
+        """Return the step on policies and keystores that change, but are not reviewed."""
         assert self.base
         lines: list[tuple[str, str]] = []
         named: list[tuple[str, str]] = []
@@ -642,6 +642,12 @@ class _Review:
             content = self.request.repository.content(entries[path].id)
             if (Path(path).name, content) not in shipped:
                 lines.append((f"{_NOT_USED} --leave-out {quote(path)}, or delete it", path))
+        for path in self._unreviewed_keystores(changed):
+            text = (
+                "is a keystore that changes and is not reviewed: name it with --keystore, or leave"
+            )
+            place = ENCLAVES if path == "." else path
+            lines.append((f"{text} it out with --leave-out {quote(place)}", path))
         for path in self._used_in_part(changed, reviewed, fleet):
             lines.append(("changes and is used only in part: the rest is not reviewed", path))
         for path in self._not_reviewed_users(changed):
@@ -816,8 +822,9 @@ class _Review:
             yield f"policies in '{path}'{but} are not reviewed, as the options say"
         if asked.keystores:
             yield "private keys of keystores are not reviewed"
-        for path in self._unnamed_keystores():
-            yield f"'{path}' is a keystore and is not reviewed"
+        with suppress(SrosError):  # said by the step on changed files
+            for path in self._unreviewed_keystores(self._changed_files(self.head, None)):
+                yield f"'{path}' is a keystore and is not reviewed"
         if self._template_changes():
             yield f"new access by the changes of '{asked.template}'"
         for path in self._changed_settings():
@@ -838,20 +845,17 @@ class _Review:
             files = first_few([f"'{path}'" for path in differing], 3)
             yield f"the checkout differs from the reviewed commit: {files}"
 
-    def _unnamed_keystores(self) -> list[str]:
-        """Return the keystores and exports in HEAD that are neither reviewed nor left out."""
-        with suppress(SrosError):  # said by the step on changed files
-            known = (*self.request.keystores, *self.request.left_out)
-            folders = {
-                f"/{path}".partition(f"/{ENCLAVES}/")[0]
-                for path, _ in self._changed_files(self.head, None)
-                if f"/{ENCLAVES}/" in f"/{path}"
-                and path.endswith((f"/{GOVERNANCE_FILE}", f"/{PERMISSIONS_FILE}"))
-            }
-            return sorted(
-                folder[1:] or "." for folder in folders if not _is_below(folder[1:], known)
-            )
-        return []
+    def _unreviewed_keystores(self, entries: Iterable[tuple[str, TreeEntry]]) -> list[str]:
+        """Return the keystores and exports with entries, which are not reviewed or left out."""
+        known = (*self.request.keystores, *self.request.left_out)
+        folders = {
+            f"/{path}".partition(f"/{ENCLAVES}/")[0][1:]
+            for path, _ in entries
+            if f"/{ENCLAVES}/" in f"/{path}"
+            and path.endswith((f"/{GOVERNANCE_FILE}", f"/{PERMISSIONS_FILE}"))
+            and not _is_below(path, known)
+        }
+        return sorted(folder or "." for folder in folders)
 
     def _changed_settings(self) -> list[str]:
         """Return changed TOML files that look like templates or requirements, and are not read."""

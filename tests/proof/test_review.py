@@ -929,6 +929,14 @@ def test_whether_a_keystore_is_signed_for_the_policies(
     unnamed = change.review("--policy", "robot.xml", "--new-access", "allow").ok().out
     for path in ("ks", "r1/export", "."):
         assert f"'{path}' is a keystore and is not reviewed" in unnamed
+    changed = change.review("--policy", "robot.xml", "--keystore", "ks")
+    assert changed.status == 1
+    assert "'r1/export' is a keystore that changes and is not reviewed: name it" in changed.out
+    assert "'ks' is a keystore" not in changed.out
+    left = ("--leave-out", "enclaves", "--leave-out", "r1/export", "--leave-out", "ks")
+    change.base = change.commit({})
+    change.commit({"ks/enclaves/a/permissions.p7s": "x", "enclaves/governance.p7s": "y"})
+    assert " is a keystore" not in change.review("--policy", "robot.xml", *left).ok().out
 
 
 def test_private_keys_in_a_commit_are_named(change: Change, made_keystores: Path) -> None:
