@@ -352,8 +352,6 @@ def _files_of(
     return _read_files(keystore, name, _FILES)
 
 
-_RECORDED_BY = {PERMISSIONS_FILE: "enclave", GOVERNANCE_FILE: "what"}
-"""The field by which the ledger is asked for the entries of a signed document."""
 _ROLES_OF_FILES = {IDENTITY_CA_FILE: IDENTITY, PERMISSIONS_CA_FILE: PERMISSIONS}
 _FILES = (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES, *ZENOH_FILES)
 
@@ -376,9 +374,8 @@ def _read_files(
                     raise _ca_key_error(keystore.root / path)
                 if role := _ROLES_OF_FILES.get(file):
                     _check_authorities(keystore, role, keystore.root / path, files[path])
-                if field := _RECORDED_BY.get(file):
-                    value = name if field == "enclave" else file.partition(".")[0]
-                    _check_last(keystore, (field, value), keystore.root / path, files[path])
+                if file in (GOVERNANCE_FILE, PERMISSIONS_FILE):
+                    _check_last(keystore, name, keystore.root / path, files[path])
     return files
 
 
@@ -406,18 +403,20 @@ def _check_authorities(keystore: OpenedKeystore, role: str, path: Path, data: by
         )
 
 
-def _check_last(
-    keystore: OpenedKeystore, recorded_by: tuple[str, str], path: Path, data: bytes
-) -> None:
-    """Raise `KeystoreError` if the ledger has a later document than a signed one.
+def _check_last(keystore: OpenedKeystore, name: str, path: Path, data: bytes) -> None:
+    """Raise `KeystoreError` if the ledger has a later document than a signed one of an enclave.
 
     What ros2/sros2 signed is not in the ledger, and exported as it is.
     """
-    (field, value), kind = recorded_by, path.name.partition(".")[0]
+    kind = path.name.partition(".")[0]
+    if kind == "governance":  # that of all enclaves
+        entries = keystore.ledger_with("what", kind).entries
+    else:
+        entries = keystore.ledger_file.with_values("enclave", (name,)).entries
     signed = [
         entry.sha256
-        for entry in keystore.ledger_file.with_values(field, (value,)).entries
-        if entry.what == kind and getattr(entry, field) == value
+        for entry in entries
+        if entry.what == kind and (kind == "governance" or entry.enclave == name)
     ]
     sha256 = hashlib.sha256(data).hexdigest()
     if sha256 in signed and sha256 != signed[-1]:
