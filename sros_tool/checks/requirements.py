@@ -21,7 +21,7 @@ VACUOUS = FindingKind(
     "exceptions cover every enclave.",
     "The requirements file.",
     "Correct the name or its kind (service or action), here or in the policy (was a topic "
-    "renamed?), or remove the requirement.",
+    "renamed?), or remove the requirement. For a name that is to stay unused, write [[nobody]].",
 )
 UNNAMED = FindingKind(
     "requirement.unnamed",
