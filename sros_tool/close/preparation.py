@@ -178,8 +178,7 @@ def steps(robot: LocalRobot, duration: str | None) -> Iterator[CommandStep]:
     yield CommandStep(("generate_artifacts", "-k", keystore, *policies), signs=True)
     if on_zenoh:
         yield CommandStep(("zenoh", keystore))
-    exported = *_enclaves_to_export(robot), str(robot.export)
-    yield CommandStep(("distribute_key", keystore, *exported, "--force"))
+    yield CommandStep(robot.export_words())
     yield CommandStep(("check", policy, keystore, "--policy", policy, *only_errors))
     yield CommandStep(("view", policy, *created, "-o", str(robot.page), "--force"))
 
@@ -218,14 +217,6 @@ def rmws_without_security(robot: LocalRobot, observed: ObservedProcesses) -> lis
     default = environment.get(RMW) or next(iter(rmw_implementations(environment)), "")
     rmws = sorted({process.rmw or default for process in observed.processes})
     return [rmw for rmw in rmws if built_without_security(rmw, environment)]
-
-
-def _enclaves_to_export(robot: LocalRobot) -> Sequence[str]:
-    """Return the words that select the enclaves of this machine."""
-    if not robot.not_here:
-        return ("--all",)
-    names = {OBSERVER} | robot.keystore_enclaves() | robot.policy_enclaves()
-    return sorted(names - robot.not_here)
 
 
 def _enclaves_without_origin(robot: LocalRobot) -> list[str]:

@@ -24,7 +24,7 @@ from sros_tool.close.state import (
     keystore_text,
     wait_until,
 )
-from sros_tool.errors import UnavailableError
+from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.explain.audit import DeniedRight
 from sros_tool.graph.learn import is_tool, stable_name
 from sros_tool.graph.observation import (
@@ -111,8 +111,19 @@ def _proof_of_files(robot: LocalRobot) -> Proof:
     """Ask `check` about the files that the processes use, such as a key that others read."""
     status = robot.shell.check(str(robot.export))
     reasons = {0: "sros check finds none", 1: "sros check finds one", 2: "they are not checked"}
-    holds = {0: True, 1: False}.get(status)
-    return Proof("the files have no error", holds, f"{reasons[status]}: {robot.export}")
+    holds, reason = {0: True, 1: False}.get(status), reasons[status]
+    if holds and robot.keystore.exists():  # an export from before a revocation has no error
+        try:
+            _, value = robot.shell.read_json((*robot.export_words(), "--dry-run", "--json"))
+            changes = [change["path"] for change in value["changes"]]
+        except SrosError as error:
+            holds, reason = None, f"they cannot be compared with the keystore: {error}"
+        else:
+            if changes:
+                number = counted(len(changes), "file")
+                reason = f"{number} of '{robot.keystore}' would change there, such as {changes[0]}"
+                holds, reason = False, f"{reason}; `{robot.close_command}` exports them"
+    return Proof("the files have no error", holds, f"{reason}: {robot.export}")
 
 
 def _proof_of_requirements(robot: LocalRobot) -> Iterator[Proof]:

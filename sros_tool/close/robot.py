@@ -202,6 +202,14 @@ class LocalRobot:
         """Return the names of the enclaves in the keystore; none without a keystore."""
         return {*(list_enclaves(self.keystore) if self.keystore.exists() else ())}
 
+    def export_words(self) -> Sequence[str]:
+        """Return the verb, with its arguments, that exports the enclaves of this machine."""
+        enclaves = ["--all"]
+        if self.not_here:
+            names = {OBSERVER} | self.keystore_enclaves() | self.policy_enclaves()
+            enclaves = sorted(names - self.not_here)
+        return ("distribute_key", str(self.keystore), *enclaves, str(self.export), "--force")
+
     def remember(self, observed: ObservedProcesses) -> None:
         """Write the observed processes into the folder."""
         self.observed = observed
