@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+from sros_tool.files import policies_dir
 from tests.support.children import python
+from tests.support.harness import sros
 from tests.support.long_form import some
 
 READERS = (
@@ -17,6 +21,7 @@ READERS = (
     "sros_tool.keystore.ledger",
     "sros_tool.keystore.rights",
     "sros_tool.keystore.zenoh_files",
+    "sros_tool.explain.earlier",
 )
 WRITERS = ("transaction", "issuing", "lifecycle", "delivery")
 
@@ -28,10 +33,37 @@ def loaded_by(module: str) -> list[str]:
     return python("-c", _LIST.format(module)).stdout.split()
 
 
-@pytest.mark.parametrize("module", some(READERS, 2))
+@pytest.mark.parametrize("module", some(READERS, 1))
 def test_reading_imports_nothing_that_writes(module: str) -> None:
     rooms = tuple(f"sros_tool.keystore.{room}" for room in WRITERS)
     assert not [name for name in loaded_by(module) if name.startswith(rooms)]
+
+
+VERBS = {
+    "check": ("sros_tool.checks.policies", "sros_tool.keystore.expiry", "ctypes", "tarfile"),
+    "explain": ("sros_tool.keystore.expiry", "ctypes", "logging", "tarfile", "pickle"),
+}
+"""Verbs that are often run, and modules that they load only in rare cases."""
+_VERB = """
+import sys
+from sros_tool.cli import main
+try:
+    main(sys.argv[1:])
+finally:
+    print(*sys.modules, file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize("verb", some(tuple(VERBS), 1))
+def test_a_verb_loads_what_it_needs(verb: str, tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    policy = policies_dir() / "talker_listener.xml"
+    sros("generate_artifacts", "-k", root, "-p", policy).ok()
+    question = ("/talker_listener/talker", "publish", "/x") if verb == "explain" else ()
+    done = python("-c", _VERB, verb, root, *question, status=None)
+    loaded = done.stderr.splitlines()[-1].split()
+    assert "sros_tool.keystore.reader" in loaded
+    assert not {*VERBS[verb]} & {*loaded}
 
 
 def test_what_writes_is_seen_by_this_search() -> None:
