@@ -122,7 +122,11 @@ class Round(NamedTuple):
     """The result of a round of the agent."""
 
     release: int
-    """The number of the release that is installed."""
+    """Number of the release that is installed with all its enclaves; 0 for none."""
+    accepted: int
+    """Highest number of a release that was verified; if it is higher than ``release``, some
+    enclaves wait for it.
+    """
     fetched: bool
     """Whether the source was reached and could be trusted."""
     changed: Sequence[str]
@@ -247,6 +251,7 @@ class _Round:
         self._save()
         return Round(
             self._state.release,
+            self._state.accepted,
             fetched,
             installation.changed,
             installation.removed,

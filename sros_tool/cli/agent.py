@@ -305,7 +305,9 @@ def _show(folder: Path, finished_round: Round, *, restarted: bool = False, as_js
 
 
 def _round_lines(folder: Path, finished_round: Round, *, restarted: bool) -> Iterator[str]:
-    release = f"release {finished_round.release}" if finished_round.release else "no release"
+    number = finished_round.accepted
+    release = f"release {number}" if number else "no release"
+    release += ", not yet complete" * (number > finished_round.release)
     changes = (
         [f"changed {counted(len(finished_round.changed), 'enclave')}"]
         if finished_round.changed
@@ -376,9 +378,9 @@ def _status(folder: Path, max_age: str, as_json: bool) -> int:
 
 
 def _status_lines(status: AgentStatus, moment: datetime) -> Iterator[str]:
-    release = f"release {status.release}" if status.release else "no release"
-    newer = f", not yet complete: {status.accepted}" if status.accepted > status.release else ""
-    yield f"robot {status.robot}: {release}{newer}"
+    release = f"release {status.accepted}" if status.accepted else "no release"
+    release += ", not yet complete" * (status.accepted > status.release)
+    yield f"robot {status.robot}: {release}"
     yield f"fetched {_ago(status.fetched, moment)} from {status.source}"
     yield f"confirmed {_ago(status.sent, moment)} to {status.inbox}"
     yield from _due_lines(status.folder, status.restart, status.unseen)

@@ -1071,6 +1071,8 @@ def _expiry_clauses(robot: RobotStatus, moment: datetime) -> Iterator[str]:
 
 def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
     """Yield clauses on how a robot's files differ from the keystore's, the worst first."""
+    from sros_tool.keystore.confirmation import enclave_of
+
     if robot.state == "never":
         yield counted(robot.enclaves, "enclave")
     if robot.revoked:
@@ -1093,11 +1095,13 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
         yield f"{state} {', '.join(named)}{f' of {since}' if since else ''}"
     if len(groups) > _MOST_GROUPS:
         yield f"more, see --robot {robot.robot}"
-    if robot.fetches and (robot.published or 0) != (robot.release or 0):
+    waits_for = {enclave_of(file.path) for file in robot.pending}
+    has_the_rest = waits_for and waits_for <= {*robot.lacks_key}
+    if robot.fetches and (robot.published or 0) != (robot.release or 0) and not has_the_rest:
         yield (
             f"release {robot.release or 'none'}; the published one is {robot.published or 'none'}"
         )
-    elif robot.fetches and robot.pending:
+    elif robot.fetches and robot.pending and not has_the_rest:
         other = f"its files are not those of the published release {robot.release}"
         yield other if robot.is_published else "not published yet"
     if robot.fetches and robot.lacks_key:

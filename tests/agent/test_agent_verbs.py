@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -209,6 +211,16 @@ def test_what_was_reached_before_is_nothing_of_another_source(world: World) -> N
     assert lines[1] == f"fetched never from {world.folder / 'moved'}" and len(lines) == 3
     world.agent().ok()
     assert "ago from" in world.run("agent", "status", "robot").out
+
+
+def test_a_release_of_which_an_enclave_lacks_its_key(world: World) -> None:
+    world.run(*INIT).ok()
+    shutil.rmtree(world.folder / "robot/enclaves/r1/b")
+    said = world.agent().out.splitlines()[0]
+    assert re.fullmatch("release [0-9]+, not yet complete: nothing changed", said)
+    assert re.search(
+        "^robot r1: release [0-9]+, not yet", world.run("agent", "status", "robot").out
+    )
 
 
 def test_a_keystore_with_its_cas_gets_no_release(world: World) -> None:

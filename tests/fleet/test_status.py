@@ -938,6 +938,7 @@ def test_what_is_to_be_done_for_robots_that_do_not_fetch_what_is_published(field
     field.run("fleet", "publish", "ks", "pub")
     rows = said()
     assert rows["r1"][0] == "deliver" and "lacks the key of /r1/base, which no" in rows["r1"][1]
+    assert "the published one" not in rows["r1"][1], "no other enclave waits for it"
     refused = "all its certificates are revoked: a web server with the current list refuses it"
     assert rows["r3"][0] == "wait, else deliver" and refused in rows["r3"][1]
     assert rows["r2"][0] == "wait: it fetches"
