@@ -45,12 +45,14 @@ VERBS = {
 }
 """Verbs that are often run, and modules that they load only in rare cases."""
 _VERB = """
-import sys
+import gc, sys
 from sros_tool.cli import main
+begun = []
+gc.callbacks.append(lambda phase, _about: begun.append(phase))
 try:
     main(sys.argv[1:])
 finally:
-    print(*sys.modules, file=sys.stderr)
+    print(len(begun) // 2, *sys.modules, file=sys.stderr)
 """
 
 
@@ -61,9 +63,10 @@ def test_a_verb_loads_what_it_needs(verb: str, tmp_path: Path) -> None:
     sros("generate_artifacts", "-k", root, "-p", policy).ok()
     question = ("/talker_listener/talker", "publish", "/x") if verb == "explain" else ()
     done = python("-c", _VERB, verb, root, *question, status=None)
-    loaded = done.stderr.splitlines()[-1].split()
+    collections, *loaded = done.stderr.splitlines()[-1].split()
     assert "sros_tool.keystore.reader" in loaded
     assert not {*VERBS[verb]} & {*loaded}
+    assert int(collections) < 10, "nearly all objects stay, and are searched for garbage"
 
 
 def test_what_writes_is_seen_by_this_search() -> None:
