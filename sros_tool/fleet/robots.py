@@ -543,8 +543,6 @@ def _with_placeholders(text: str, enclave: str, robot: Robot) -> str:
 
 
 def _with_other(text: str, robot: Robot) -> str:
-    if robot.namespace != "/":
-        text = _whole_name_expression(robot.namespace).sub("/{other}", text)
     return _whole_name_expression(robot.name).sub("{other}", text)
 
 

@@ -68,11 +68,12 @@ def test_an_enclave_of_no_robot_has_the_only_robot_that_its_line_names() -> None
 def test_an_enclave_of_a_robot_is_folded_by_the_only_other_robot_of_its_lines() -> None:
     one = [("/x/base", f"/x/base may publish {names}/go") for names in ("/hall/r1", "/hall/r10")]
     assert list(folded(FLEET, one)) == [
-        "/x/base may publish /{other}/go  (the 2 robots of carriers)"
+        "/x/base may publish /hall/{other}/go  (the 2 robots of carriers)"
     ]
     every = [*one, ("/x/base", "/x/base may publish /r2/go"), ("/x/base", "/x/base may join")]
     assert list(folded(FLEET, every)) == [
-        "/x/base may publish /{other}/go  (all 3 other robots)", "/x/base may join",
+        "/x/base may publish /hall/{other}/go  (the 2 robots of carriers)",
+        "/x/base may publish /r2/go", "/x/base may join",
     ]  # fmt: skip
     both = [*one, ("/r2/base", "/r2/base may publish /hall/r1/go")]
     assert list(folded(FLEET, both)) == [
