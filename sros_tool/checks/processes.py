@@ -991,8 +991,10 @@ def _unseen_process_findings(running: RunningProcesses) -> Iterator[Finding]:
     reasons = [running.hidden] if running.hidden else []
     if doubtful:
         why = ", ".join(sorted({process.why for process in doubtful})[:3])
-        count = f"{len(doubtful)} processes" if len(doubtful) > 1 else doubtful[0].label
-        reasons.append(f"{count} that may or may not be nodes ({why})")
+        may_be = f"{doubtful[0].label} may be a node"
+        if len(doubtful) > 1:
+            may_be = f"{len(doubtful)} processes may be nodes"
+        reasons.append(f"{may_be}, and cannot be looked at ({why})")
     if running.container:
         text = f"{len(running.processes)} of them speak ROS 2"
         yield CONTAINER_ALONE.found("processes", text)

@@ -266,7 +266,8 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
     if stopped := sorted(idle.intersection(closed.pending)):
         ask += "; what does not always run: " + " ".join(f"--without {name}" for name in stopped)
     for proof in closed.proofs:
-        echo(f"{_ANSWERS[proof.holds]}: {proof.claim}: {proof.reason}")
+        accept = " (--partial accepts this)" if proof.is_accepted_by_partial else ""
+        echo(f"{_ANSWERS[proof.holds]}: {proof.claim}: {proof.reason}{accept}")
     if closed.problems:
         echo(f"{_state(closed, apply=apply)}; fix this first:")
         for problem in closed.problems:

@@ -1093,15 +1093,26 @@ def _show_log(
     return 1 if explained.findings else 0
 
 
+_SILENT_ON_ZENOH = (
+    "on Zenoh, a denied node logs nothing: start it and the router with RUST_LOG=zenoh=trace for "
+    "another log, or ask about each of its names: `sros explain KEYSTORE ENCLAVE "
+    "publish|subscribe|call|serve NAME --vendor zenoh`"
+)
+
+
 def _text_without_findings(log: str) -> str:
     """Return what a log without a message of security shows, and what to do next."""
+    from sros_tool.checks.environment import is_zenoh
     from sros_tool.runtime.vendor_log import SECURITY_DIRECTORY
 
+    if is_zenoh(os.environ):
+        return _SILENT_ON_ZENOH
     match = SECURITY_DIRECTORY.search(log)
     if match is None:
         return (
             "no line says 'Found security directory': on DDS, its nodes ran open, or it is not the "
-            "whole log. `sros check runtime` on that machine says how its processes run"
+            "whole log. `sros check runtime` on that machine says how its processes run; "
+            f"{_SILENT_ON_ZENOH}"
         )
     return (
         f"a node ran in '{match['folder']}'. Where its peers refuse it, it often logs nothing: "
@@ -1109,7 +1120,8 @@ def _text_without_findings(log: str) -> str:
         "list, the governance or the domains of both ends do not fit: `sros check FOLDER OTHER` "
         "finds this in their keystores or exports. Both can also be empty if a clock is wrong: "
         "`sros check runtime` on both machines finds a clock that is behind, `date -u` shows one "
-        "that is ahead. `sros explain KEYSTORE --who publish NAME` says whether anybody may send"
+        "that is ahead. `sros explain KEYSTORE --who publish NAME` says whether anybody may send; "
+        f"{_SILENT_ON_ZENOH}"
     )
 
 

@@ -32,12 +32,14 @@ from sros_tool.proof.requirements import (
     AtMost,
     Must,
     NotBoth,
+    Only,
     Protected,
     Requirement,
     demand,
 )
 from sros_tool.proof.system import Place, System
 from sros_tool.proof.worlds import ANYBODY, World
+from sros_tool.wording import first_few
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,8 +284,31 @@ def _violation_finding(violation: Violation) -> Finding:
         _text(violation),
         first.file,
         first.line,
-        _CLOSE_GOVERNANCE if ANYBODY in violation.witness.enclaves else "",
+        _CLOSE_GOVERNANCE if ANYBODY in violation.witness.enclaves else _edit_text(violation),
         related=tuple(dict.fromkeys(related)),
+    )
+
+
+def _edit_text(violation: Violation) -> str:
+    """Return the edit of a requirement that would accept what breaks it, as a sentence, or ""."""
+    requirement = violation.requirement
+    match requirement:
+        case Only():
+            differing = [steps[0].use.enclave for steps in violation.differing]
+            key, enclaves = (
+                "enclaves",
+                [violation.steps[0].use.enclave, *violation.alike, *differing],
+            )
+        case Apart():
+            key, enclaves = "through", [violation.steps[-2].use.enclave]
+        case _:
+            return ""
+    if requirement.robot:  # its enclaves stand for those of all robots
+        return ""
+    place, quoted = requirement.source, [f'"{name}"' for name in sorted({*enclaves})]
+    return (
+        "Change the policy at the named lines; or, if this is wanted, add "
+        f"{first_few(quoted, _SHOWN)} to `{key}` of the requirement at {place.file}:{place.line}."
     )
 
 

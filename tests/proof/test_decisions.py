@@ -96,6 +96,36 @@ def test_whoever_has_a_part_of_an_action_holds_the_right_to_it(case: str) -> Non
     assert texts(rights, required) == ([text] if text else [])
 
 
+@pytest.mark.parametrize(
+    ("rights", "required", "edit", "kept"),
+    [
+        (
+            {"/a": may("publish", "/x"), "/b": may("publish", "/x"), "/c": may("publish", "/*")},
+            '[[only]]\npublish = ["/x"]\nenclaves = ["/a"]\n',
+            'add "/b", "/c" to `enclaves` of the requirement at r.toml:1.',
+            '"/a"',
+        ),
+        (
+            {
+                "/a": may("publish", "/x"),
+                "/b": may("subscribe", "/x") + may("publish", "/y"),
+                "/c": may("subscribe", "/y"),
+            },
+            '[[apart]]\nfrom = ["*"]\nto = ["/c"]\nthrough = ["/d"]\n',
+            'add "/b" to `through` of the requirement at r.toml:1.',
+            '"/d"',
+        ),
+    ],
+)
+def test_after_the_edit_that_a_finding_names_the_requirement_holds(
+    rights: dict[str, str], required: str, edit: str, kept: str
+) -> None:
+    findings = requirement_findings(parse_requirements(required.encode(), "r.toml"), robot(rights))
+    assert findings[0].remedy.endswith(f"; or, if this is wanted, {edit}")
+    added = edit.removeprefix("add ").partition(" to ")[0]
+    assert not decided(rights, required.replace(kept, f"{kept}, {added}")).violations
+
+
 def test_of_each_enclave_the_finding_says_what_it_may() -> None:
     """An enclave that breaks a requirement by another name is not said to use the first one."""
     rights = {
