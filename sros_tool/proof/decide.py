@@ -280,6 +280,19 @@ def _matching_enclaves(patterns: Sequence[str], enclaves: Collection[str]) -> se
     return matching - excepted
 
 
+def restricted_enclaves(
+    requirement: Requirement, enclaves: Collection[str]
+) -> tuple[set[str], ...]:
+    """Return the sets of enclaves that a requirement lists to restrict them; () for all others."""
+    match requirement:
+        case Widest(enclaves=listed) | NothingBut(enclaves=listed):
+            return (_matching_enclaves(listed, enclaves),)
+        case Apart(sources=sources, targets=targets, through=through):
+            free = _matching_enclaves(through, enclaves)
+            return tuple(_matching_enclaves(ends, enclaves) - free for ends in (sources, targets))
+    return ()
+
+
 def _use(enclave: str, right: str, part: _Part, topics: Topics, topic: str) -> Use:
     return Use(enclave, right, topics.ros_name(topic), topic, part.writes)
 

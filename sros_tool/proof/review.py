@@ -29,7 +29,7 @@ from sros_tool.checks.keystores.issued import (
 )
 from sros_tool.checks.kind import WARNING, ChosenFindings, Finding, FindingFilter
 from sros_tool.checks.policies import is_mended_by
-from sros_tool.checks.requirements import VACUOUS
+from sros_tool.checks.requirements import DROPPED, VACUOUS
 from sros_tool.checks.targets import Circumstances, path_findings, policy_findings
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
@@ -52,12 +52,15 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import RightsSource, SourcesDifference, compare_sources
 from sros_tool.keystore.template import Template, load_template, read_template, template_names
+from sros_tool.names import expand
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Policy, Profile
 from sros_tool.policy.rights import (
+    NodeName,
     PlacedRight,
     Right,
     Rules,
+    nodes_of,
     parts,
     placed_rights,
     policy_rights,
@@ -75,6 +78,7 @@ from sros_tool.proof.commit_files import (
     used_whole,
     users_of,
 )
+from sros_tool.proof.decide import restricted_enclaves
 from sros_tool.proof.findings import requirement_findings
 from sros_tool.proof.growth import DroppedDenial, Growth, compare_access, undenied_name
 from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
@@ -400,9 +404,10 @@ class _Review:
         }
         if of_base:
             earlier[named] = before
-        yield from self._requirements(of_head, head_fleet, base_fleet, keystores, earlier)
+        after = cache(partial(load_policies, of_head, _HEAD, head_fleet))
+        both = {named: lambda: (before(), after())} if of_base else {}
+        yield from self._requirements(of_head, head_fleet, base_fleet, keystores, earlier, both)
         if self.base:
-            after = cache(partial(load_policies, of_head, _HEAD, head_fleet))
             moving = cache(lambda: [*_fixed_or_moving_names(before(), after())])
             yield from self._step_result(
                 "new-access",
@@ -951,6 +956,7 @@ class _Review:
         base_fleet: Fleet | None,
         keystores: Mapping[str, Path],
         earlier_sources: Mapping[str, Callable[[], AccessSource]],
+        moved: Mapping[str, Callable[[], tuple[AccessSource, AccessSource]]],
     ) -> Iterator[ReviewStep]:
         if not self.request.requirements:
             return
@@ -998,9 +1004,8 @@ class _Review:
                 partial(_decided_requirements, wanted, system, rights),
                 only_with_result=bool(files),
             )
-            if dropped_requirements(earlier, wanted):
-                decide = partial(self._dropped_step, earlier, wanted, system)
-                yield from self._step_result("requirements-before", subject, decide)
+            decide = partial(self._dropped_step, earlier, wanted, system, moved.get(subject))
+            yield from self._step_result("requirements-before", subject, decide)
 
     def _template(self) -> Template | None:
         """Return the named keystore template, as HEAD has it; None without one.
@@ -1033,11 +1038,18 @@ class _Review:
         earlier: Sequence[Requirement],
         wanted_requirements: Sequence[Requirement],
         system: System,
-    ) -> tuple[int, Content]:
+        moved: Callable[[], tuple[AccessSource, AccessSource]] | None,
+    ) -> tuple[int, Content] | None:
         dropped = [
             requirement.requirement
             for requirement in dropped_requirements(earlier, wanted_requirements)
         ]
+        left: list[Finding] = []
+        if moved:
+            with suppress(SrosError, OSError):  # said by the comparison
+                left = list(_requirements_left(wanted_requirements, *moved()))
+        if not (dropped or left):
+            return None
         assert self.base
         findings = [
             finding._replace(
@@ -1047,8 +1059,8 @@ class _Review:
             for place in finding.related
         ]
         broken = requirement_findings(dropped, system)
-        chosen = FindingFilter(exclude=(VACUOUS.id,)).choose([*findings, *broken])
-        return _FOUND, DroppedRequirements(len(dropped), chosen)
+        chosen = FindingFilter(exclude=(VACUOUS.id,)).choose([*findings, *left, *broken])
+        return _FOUND, DroppedRequirements(len(dropped) + len(left), chosen)
 
     # ── keystores ──────────────────────────────────────────────────────────────────────────
 
@@ -1186,6 +1198,42 @@ def _decided_requirements(
 ) -> tuple[int, ChosenFindings]:
     chosen = FindingFilter().choose(requirement_findings(requirements, system, before))
     return _status(chosen), chosen
+
+
+def _requirements_left(
+    requirements: Sequence[Requirement], before: AccessSource, after: AccessSource
+) -> Iterator[Finding]:
+    """Yield a finding for each requirement on enclaves that a node leaves by a move to another."""
+    old_enclaves, new_enclaves = (
+        _enclaves_by_node(source.enclaves.values()) for source in (before, after)
+    )
+    moves = [
+        (node, old - new_enclaves[node], new_enclaves[node] - old)
+        for node, old in old_enclaves.items()
+        if new_enclaves.get(node, old) - old
+    ]
+    for requirement in requirements if moves else ():
+        restricted = zip(
+            restricted_enclaves(requirement, before.enclaves),
+            restricted_enclaves(requirement, after.enclaves),
+            strict=True,
+        )
+        for was, now in restricted:
+            for node, old, new in moves:
+                if old & was and new - now:
+                    place = requirement.source
+                    name, to = expand("~", *node), first_few(sorted(new - now), 3)
+                    text = f"node {name} moves to enclave {to}, which it does not restrict"
+                    remedy = "Add the enclave to the requirement, or approve this in the review."
+                    yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
+
+
+def _enclaves_by_node(enclaves: Iterable[Enclave]) -> dict[NodeName, set[str]]:
+    nodes: dict[NodeName, set[str]] = {}
+    for enclave in enclaves:
+        for node in nodes_of(enclave):
+            nodes.setdefault(node, set()).add(enclave.path)
+    return nodes
 
 
 def _without_left_robots(before: Fleet | None, after: FleetSource) -> Fleet | None:

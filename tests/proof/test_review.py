@@ -889,6 +889,31 @@ def test_a_change_renames_nothing_out_of_a_requirement(change: Change) -> None:
     assert "any more" not in change.review(*words).out
 
 
+def test_a_node_moves_out_of_no_requirement(change: Change) -> None:
+    """Of the enclaves that a pattern stands for, one stays, so that the pattern is not empty."""
+    inside = {"/third/lidar": publish("/scan"), "/third/cam": publish("/image")}
+
+    def policy(enclaves: dict[str, str]) -> str:
+        text = policy_text(enclaves)
+        for path in enclaves:
+            node = path.rpartition("/")[2]
+            text = text.replace('node="n"', f'node="{node}"', 1)
+        return text
+
+    required = '[[nothing_but]]\nenclaves = ["/third/*"]\npublish = ["/scan", "/image"]\n'
+    required += 'subscribe = ["/clock"]\nreply = ["*"]\n'
+    change.base = change.commit({"robot.xml": policy(inside), "robot.toml": required})
+    words = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
+    outside = {"/lidar": publish("/scan", "/cmd_vel"), "/third/cam": publish("/image")}
+    change.commit({"robot.xml": policy(outside)})
+    ended = change.review(*words)
+    assert "node /lidar moves to enclave /lidar, which it does not restrict" in ended.out, ended
+    assert ended.status == 1
+    assert change.review(*words, "--dropped-requirements", "allow").status == 0
+    change.commit({"robot.xml": policy({"/third/cam": publish("/image")})})
+    assert "moves to" not in change.review(*words).ok().out
+
+
 def test_requirements_get_the_protection_of_a_template(change: Change) -> None:
     protected = '[[protected]]\ntopics = ["/x"]\nlevel = "encrypt"\n'
     template = (templates_dir() / "production.toml").read_text()
