@@ -132,6 +132,14 @@ def unlisted_revocations(keystore: OpenedKeystore, now: datetime) -> Sequence[st
     return keystore.once(("unlisted", now), read)
 
 
+def unknown_authorities(keystore: OpenedKeystore, role: str) -> Sequence[x509.Certificate]:
+    """Return the CAs in the file of a role that the keystore does not know; none if it has none."""
+    known = known_authorities(keystore, role)
+    return (
+        () if known is None else [ca for ca in keystore.authority(role) if digest(ca) not in known]
+    )
+
+
 def known_authorities(keystore: OpenedKeystore, role: str) -> frozenset[str] | None:
     """Return the SHA-256 of the certificates in a CA file that the keystore knows.
 

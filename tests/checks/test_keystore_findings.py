@@ -258,6 +258,16 @@ def test_a_ca_that_was_added_is_found_and_not_exported(
     assert not (tmp_path / "robot").exists()
 
 
+def test_a_ca_that_was_added_is_noted_by_changes_and_replaced(bench: Bench) -> None:
+    also_trusted(bench, "public/identity_ca.cert.pem")
+    secret = {"SROS_CA_PASSPHRASE": SECRET}
+    assert "note [keystore.unknown-authority]" in sros("renew", bench.root, "/base", env=secret).err
+    refused = sros("rotate_ca", bench.root, "--next", env=secret)
+    assert refused.status == 2 and "which the keystore does not know" in refused.err
+    done = sros("rotate_ca", bench.root, "--finish", env=secret).ok()
+    assert "unknown-authority" not in done.err and "keystore.unknown-authority" not in ids(bench)
+
+
 @pytest.mark.parametrize("file", ["enclaves/base/permissions.p7s", "enclaves/governance.p7s"])
 def test_an_earlier_document_is_not_exported(file: str, bench: Bench, tmp_path: Path) -> None:
     earlier, secret = bench.path(file).read_bytes(), {"SROS_CA_PASSPHRASE": SECRET}

@@ -9,6 +9,7 @@ from contextlib import suppress
 from functools import lru_cache
 from typing import NamedTuple, TypeVar
 
+from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 
 from sros_tool.checks.keystores.documents import DIFFERS as GOVERNANCE_DIFFERS
@@ -20,7 +21,7 @@ from sros_tool.dds.governance import parse_governance
 from sros_tool.dds.permissions import Grant, mistaken_names, pairs_text
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import robot_of
-from sros_tool.keystore.known_keys import known_authorities, removed_enclaves
+from sros_tool.keystore.known_keys import removed_enclaves, unknown_authorities
 from sros_tool.keystore.layout import (
     CLOSED_OBSERVER,
     CRL_FILE,
@@ -36,7 +37,6 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.protection import less_protected
 from sros_tool.pki.certificates import (
     authority_text,
-    digest,
     fingerprints,
     load_certificates,
 )
@@ -344,11 +344,10 @@ def _trust_findings(
     In an export, the CAs of most enclaves count instead.  During a rotation an enclave trusts the
     old and the new CA, so one common CA is enough.
     """
-    for role, authorities in keystore.authorities.items():
-        known = None
+    for role in keystore.authorities:
+        strangers: Sequence[x509.Certificate] = ()
         with suppress(SrosError):  # a ledger that cannot be read is unread
-            known = known_authorities(keystore.opened, role)
-        strangers = () if known is None else [ca for ca in authorities if digest(ca) not in known]
+            strangers = unknown_authorities(keystore.opened, role)
         for authority in strangers:
             text = f"{authority_text(authority)} is not in the ledger"
             path = keystore.shown(ca_certificate(role))

@@ -37,12 +37,13 @@ from sros_tool.keystore.issuing.authority import Authorities, Authority, load_au
 from sros_tool.keystore.issuing.enclave import EnclaveWriter
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.issuing.tokens import EnclaveTokens
-from sros_tool.keystore.known_keys import KnownKeys
+from sros_tool.keystore.known_keys import KnownKeys, unknown_authorities
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
     IDENTITY,
     PERMISSIONS,
     PERMISSIONS_FILE,
+    PUBLIC,
     ROLES,
     check_keystore,
 )
@@ -76,7 +77,7 @@ from sros_tool.keystore.zenoh_files import (
     stale_files,
     zenoh_documents,
 )
-from sros_tool.pki.certificates import validity_of
+from sros_tool.pki.certificates import authority_text, validity_of
 from sros_tool.pki.keys import PublicKey
 from sros_tool.pki.token import TokenUri
 from sros_tool.policy.model import Enclave
@@ -545,7 +546,22 @@ class KeystoreChange:
                 revoked_before=revoked_before,
                 remedy=lambda: self._another_ca(command) if command else "",
             )
+        self._note_strangers()
         self.transaction.commit()
+
+    def _note_strangers(self) -> None:
+        """Add a note if a file of CAs keeps a CA that a sound ledger does not know."""
+        written = (change.path for change in self.transaction.changes)
+        replaced = any(path.startswith(f"{PUBLIC}/") and "_ca.cert" in path for path in written)
+        if replaced or self.keystore.ledger_with("what", "ca").gaps:
+            return
+        strangers = [ca for role in ROLES for ca in unknown_authorities(self.keystore, role)]
+        if strangers:
+            text = (
+                f"every process trusts {authority_text(strangers[0])}, too, which the keystore "
+                f"does not know: find out who added it, with `sros check {quote(str(self.root))}`."
+            )
+            self.notes.append(Note("keystore.unknown-authority", text))
 
     def _another_ca(self, command: str) -> str:
         from sros_tool.keystore.lifecycle.revocation_list import another_ca_remedy

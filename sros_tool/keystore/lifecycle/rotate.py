@@ -38,6 +38,7 @@ from sros_tool.keystore.issuing.enclave import (
     NewIdentity,
 )
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring, check_places
+from sros_tool.keystore.known_keys import unknown_authorities
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL,
@@ -53,6 +54,7 @@ from sros_tool.keystore.layout import (
     ROLES,
     ROTATION,
     SETTINGS,
+    ca_certificate,
     ca_key,
     enclave_folder,
     enclave_path,
@@ -80,6 +82,7 @@ from sros_tool.keystore.settings import edit_remedy, found_edits, write_settings
 from sros_tool.keystore.template import Template
 from sros_tool.parallel import Progress
 from sros_tool.pki.certificates import (
+    authority_text,
     common_name,
     digest,
     issue_ca,
@@ -548,6 +551,16 @@ class _Rotator:
     def _begin_rotation(
         self, roles: Sequence[str], new_keys: Keyring, validity: Span | None, *, next_to: bool
     ) -> list[_Successor]:
+        for role in ROLES:
+            strangers = unknown_authorities(self._keystore, role)
+            if strangers and not self._keystore.ledger_with("what", "ca").gaps and next_to:
+                raise KeystoreError(
+                    f"the file of the {role} CA has {authority_text(strangers[0])}, which the "
+                    "keystore does not know",
+                    "Every process trusts it, and would go on to trust it during the rotation.",
+                    f"Restore '{self._root}/{ca_certificate(role)}' from a backup; or, if all "
+                    "processes may be restarted together, replace the CAs at once with --finish.",
+                )
         successors = _make_successors(
             self._change,
             roles,
