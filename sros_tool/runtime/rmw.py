@@ -11,8 +11,9 @@ import re
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.distributions import ROS_DISTRO, Distribution, sourced_distribution
@@ -33,8 +34,7 @@ def denial_trace_variables(stream: str) -> dict[str, str]:
     }
 
 
-@dataclass(frozen=True, slots=True)
-class Middleware:
+class Middleware(NamedTuple):
     """A middleware that ROS 2 can use, and how to recognize it.
 
     ``rmw`` is a part of the names of its RMWs, and the names of its shared libraries begin with one
@@ -47,7 +47,7 @@ class Middleware:
     rmw: str
     libraries: tuple[str, ...] = ()
     vendor: Vendor | None = None
-    trace_variables: Mapping[str, str] = field(default_factory=dict)
+    trace_variables: Mapping[str, str] = MappingProxyType({})
     rmw_library: str = ""
     open_build: bytes = b""
 
