@@ -83,6 +83,18 @@ def enclave_lines(names: Sequence[str], text: str) -> Iterator[str]:
         yield f"{several}: {shown_names(names)} (-v lists all)"
 
 
+def first_lines(lines: Sequence[str]) -> Iterator[str]:
+    """Yield the lines about enclaves, or the first 20 of them, unless steps are logged."""
+    import logging
+
+    if logging.getLogger("sros_tool").isEnabledFor(logging.INFO):
+        yield from lines
+        return
+    yield from lines[:MAX_NAMES]
+    if more := len(lines[MAX_NAMES:]):
+        yield f"and {counted(more, 'more enclave')} (-v lists all)"
+
+
 def print_follow_up(
     result: Changed,
     after: Iterable[str] = (),

@@ -18,6 +18,7 @@ import click
 from click.core import ParameterSource
 
 from sros_tool import __version__
+from sros_tool.cli.changed import first_lines
 from sros_tool.cli.common import (
     KEYSTORE_VARIABLE,
     PATH,
@@ -205,9 +206,10 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
 @click.option("--sarif", "as_sarif", is_flag=True, help="The same as --format sarif.")
 @click.option(
     "--needs-renewal",
-    metavar="DURATION|PERCENT",
-    help="List only the enclaves that expire within DURATION (30d), or have used PERCENT of their "
-    "validity (66%).",
+    metavar="DURATION|PERCENT|soon",
+    help="List only the enclaves that expire within DURATION (30d), have used PERCENT of their "
+    "validity (66%), or expire within 30 days or, if that is shorter, a third of the validity "
+    "that the keystore gives (soon).",
 )
 @advisories_option
 def check(
@@ -681,8 +683,8 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
     )
     from sros_tool.keystore.reader import OpenedKeystore
 
-    threshold = parse_threshold(text)
     keystore = OpenedKeystore(root)
+    threshold = parse_threshold(text, keystore)
     expiring = due_enclaves(keystore, threshold, moment, keystore.template)
     if form == "json":
         print_json(expiring_enclaves(expiring))
@@ -700,7 +702,7 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
         if form == "markdown":
             echo_lines(renewal_markdown(lines, "; ".join(filter(None, (none_due, left_out))), text))
         else:
-            for line in lines:
+            for line in first_lines(lines):
                 echo(line)
             for remark in filter(None, ("" if lines else none_due, left_out)):
                 echo(remark, err=True)

@@ -1111,8 +1111,11 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
         yield "does not trust the CA that seals releases, so fetching cannot help"
     elif robot.is_locked_out and robot.enclaves:
         yield "all its certificates are revoked: a web server with the current list refuses it"
-    if robot.restart:
-        yield f"processes of {first_few(robot.restart, _MOST_GROUPS)} may run with earlier files"
+    seen = [name for name in robot.restart or () if (robot.running or {}).get(name) == "earlier"]
+    if seen:
+        yield f"processes of {first_few(seen, _MOST_GROUPS)} have not loaded the installed files"
+    if unseen := [name for name in robot.restart or () if name not in seen]:
+        yield f"processes of {first_few(unseen, _MOST_GROUPS)} may run with earlier files"
     if robot.enclaves and robot.stage not in ("", "unknown", stage):
         yield f"CA files of the stage {robot.stage}"
     yield from robot.notes

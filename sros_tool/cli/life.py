@@ -59,10 +59,11 @@ _crl_option = click.option(
 @several_enclaves
 @click.option(
     "--all-expiring",
-    metavar="DURATION|PERCENT",
-    help="Renew the enclaves that expire within DURATION (30d), or have used PERCENT of their "
-    "validity (66%), in addition to those that are named. Short-lived enclaves are renewed only if "
-    "named.",
+    metavar="DURATION|PERCENT|soon",
+    help="Renew the enclaves that expire within DURATION (30d), have used PERCENT of their "
+    "validity (66%), or expire within 30 days or, if that is shorter, a third of the validity "
+    "that the keystore gives (soon), in addition to those that are named. Short-lived enclaves are "
+    "renewed only if named.",
 )
 @click.option("--new-key", is_flag=True, help="Also create new private keys.")
 @key_option
@@ -109,10 +110,10 @@ def renew(
     from sros_tool.keystore.reader import OpenedKeystore
 
     root, names = split_root(arguments)
+    keystore = OpenedKeystore(root)
     if names or patterns or robots or all_enclaves or all_expiring is None:
-        keystore = OpenedKeystore(root)
         names = chosen_enclaves(keystore, names, patterns, robots, all_enclaves=all_enclaves)
-    threshold = parse_threshold(all_expiring) if all_expiring is not None else None
+    threshold = parse_threshold(all_expiring, keystore) if all_expiring is not None else None
     with progress("renewing") as step:
         result = work(
             root,

@@ -45,12 +45,11 @@ from sros_tool.enclave_environment import (
     other_node_notes,
     target_path,
 )
-from sros_tool.errors import KeystoreError, Note, SrosError, UnavailableError, UsageError
+from sros_tool.errors import KeystoreError, Note, UnavailableError, UsageError
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.runtime.environment import COMPOSE, CONTAINER_FORMS, KUBERNETES, SECRET
 from sros_tool.runtime.units import Job
 from sros_tool.terminal import echo, echo_document, echo_lines
-from sros_tool.validity import SOON
 from sros_tool.values import FileChange
 
 if TYPE_CHECKING:
@@ -431,7 +430,7 @@ class _WithCommandAfterDashes(_WithCommand):
     "jobs",
     multiple=True,
     type=click.Choice([job.value for job in Job]),
-    help="renew: renew enclaves that expire within 30 days. check: check the keystore "
+    help="renew: renew enclaves that expire soon, daily. check: check the keystore "
     "daily. metrics: write the keystore's metrics every 15 minutes. fleet: write the metrics of "
     "`sros fleet status` every 15 minutes. collect: run `sros fleet collect KEYSTORE INBOX "
     "--publish PUB` every 5 minutes. guard: watch all ROS processes of the machine "
@@ -578,9 +577,6 @@ def units(
         raise UsageError("COMMAND is for nodes, and no enclave is named")
     if passphrase:
         notes = [*notes, *passphrase_file_notes(Path(passphrase))]
-    limit = SOON
-    with suppress(SrosError, OSError):  # a robot's folder has no settings
-        limit = OpenedKeystore(root).template.renewal_limit
     for job in jobs:
         files |= job_units(
             Job(job),
@@ -592,7 +588,6 @@ def units(
             writable=_inbox(root) if job == Job.AGENT else (),
             inbox=str(inbox.absolute()) if inbox else "",
             publishing=str(publishing.absolute()) if publishing else "",
-            renewal_limit=limit,
         )
     changes = unit_changes(folder, files, force=force)
     if not dry_run:

@@ -146,12 +146,16 @@ def expiring_enclaves(renewals: ExpiryCheck) -> ExpiringEnclaves:
     )
 
 
-def parse_threshold(text: str) -> Threshold:
+def parse_threshold(text: str, keystore: OpenedKeystore | None = None) -> Threshold:
     """Parse a threshold: ``30d`` of remaining time, or ``66%`` of elapsed validity.
+
+    For a ``keystore``, it may also be ``soon``: the `Template.renewal_limit` that it has now.
 
     Raises:
         UsageError: ``text`` is neither a duration nor a percentage up to 100.
     """
+    if keystore and text.strip() == "soon":
+        return Threshold(remaining=keystore.template.renewal_limit)
     match = re.fullmatch(r"(\d{1,3})%", text.strip(), re.ASCII)
     if not match:
         return Threshold(remaining=parse_duration(text))

@@ -11,7 +11,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import timedelta
 from enum import StrEnum
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +20,6 @@ from sros_tool.files import new_files, replace_file, write_new_folder
 from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.runtime.environment import render_environment
 from sros_tool.runtime.variables import DOMAIN, ENABLE, KEYSTORE, STRATEGY
-from sros_tool.validity import SOON, duration_text
 from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes
 from sros_tool.xml import read_bytes
 
@@ -247,7 +245,6 @@ def job_units(
     writable: Sequence[str] = (),
     inbox: str = "",
     publishing: str = "",
-    renewal_limit: timedelta = SOON,
 ) -> dict[str, str]:
     """Return the service and the timer of a job by their names; the guard has no timer.
 
@@ -261,7 +258,6 @@ def job_units(
         writable: folders besides the keystore in which the agent writes.
         inbox: the path of the folder with the messages of robots, for `Job.COLLECT`.
         publishing: the path of the folder in which `Job.COLLECT` publishes releases.
-        renewal_limit: how long before they expire `Job.RENEW` renews enclaves.
 
     Raises:
         UsageError: a path cannot be written in a unit.
@@ -275,11 +271,10 @@ def job_units(
         _check_path(keystore, "the keystore"),
         _check_program(sros),
     )
-    within = duration_text(renewal_limit)
     description, words, own_lines = {
         Job.RENEW: (
-            f"Renew the enclaves of {root} that expire within {within}",
-            ("renew", root, "--all-expiring", within),
+            f"Renew the enclaves of {root} that expire soon",
+            ("renew", root, "--all-expiring", "soon"),
             [f"ReadWritePaths={root}", "UMask=0077"],
         ),
         Job.CHECK: (

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import re
 from pathlib import Path
 
 import pytest
 
 from sros_tool.agent.settings import AgentSettings, make_agent_folder, write_settings
 from sros_tool.runtime.units import FLEET_FILE
-from tests.support.harness import copy_of, policy_text, publish, snapshot, sros
+from tests.support.harness import policy_text, publish, snapshot, sros
 
 THERE = "/etc/sros/keystore"
 
@@ -83,27 +82,12 @@ def test_jobs_are_of_this_keystore_and_its_owner(made: Path, tmp_path: Path) -> 
     names = {each.name for each in (tmp_path / "units").iterdir()}
     assert names == {f"sros-{job}.{end}" for job in jobs[1::2] for end in ("service", "timer")}
     renew = (tmp_path / "units/sros-renew.service").read_text()
-    assert f"ExecStart=/usr/bin/sros renew {made} --all-expiring 30d\n" in renew
+    assert f"ExecStart=/usr/bin/sros renew {made} --all-expiring soon\n" in renew
     assert f"User={made.owner()}\n" in renew
     assert "ca-passphrase:/etc/sros/pass\n" in renew
     fleet = (tmp_path / "units/sros-fleet.service").read_text()
     assert f"ExecStart=/usr/bin/sros fleet status {made} --prometheus -o {FLEET_FILE}\n" in fleet
     assert "\nSuccessExitStatus=1\n" in fleet
-
-
-def test_enclaves_are_renewed_before_they_expire_but_not_each_night(
-    made: Path, tmp_path: Path
-) -> None:
-    root, program = copy_of(made, tmp_path / "ks"), ("--sros", "/usr/bin/sros")
-    settings_file = root / "sros.toml"
-    text = settings_file.read_text()
-    for validity, limit in (("21d", "7d"), ("2d", "57600s")):
-        short = re.sub(r'(\[permissions\]\nvalidity = )"[^"]*"', rf'\1"{validity}"', text)
-        assert short != text
-        settings_file.write_text(short)
-        sros("units", root, "--job", "renew", tmp_path / "units", "--force", *program).ok()
-        renew = (tmp_path / "units/sros-renew.service").read_text()
-        assert f" renew {root} --all-expiring {limit}\n" in renew
 
 
 def test_messages_are_collected_and_releases_published(made: Path, tmp_path: Path) -> None:

@@ -910,13 +910,13 @@ def test_robots_that_differ_in_their_names_share_a_line(field: Field) -> None:
         field.send(robot, running={f"/{robot}/base": RunningFiles.EARLIER})
     rows = field.run("fleet", "status", "ks", status=1).out.splitlines()[3:]
     columns = [re.split("  +", row) for row in rows]
-    text = "processes of /{robot}/base may run with earlier files"
+    text = "processes of /{robot}/base have not loaded the installed files"
     assert [row[:2] + row[3:] for row in columns] == [
         ["r1, r2", "restart due", "restart", text],
         ["r3", "current"],
     ]
     field.send("r2", running={"/r2/base": RunningFiles.CURRENT})
-    assert "processes of /r1/base may run" in field.run("fleet", "status", "ks", status=1).out
+    assert text.format(robot="r1") in field.run("fleet", "status", "ks", status=1).out
 
 
 def test_what_is_to_be_done_for_robots_that_do_not_fetch_what_is_published(field: Field) -> None:

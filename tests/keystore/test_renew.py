@@ -188,6 +188,21 @@ def test_thresholds(text: str, expected: Threshold) -> None:
     assert parse_threshold(text) == expected
 
 
+def test_soon_goes_by_the_validity_that_the_keystore_gives_now(tmp_path: Path) -> None:
+    """So that a timer that was written before follows it."""
+    root, day = tmp_path / "ks", timedelta(days=1)
+    sros("create_keystore", root, "--template", "production").ok()
+    text = (root / "sros.toml").read_text()
+    for validity, limit in (("180d", 30 * day), ("21d", 7 * day), ("2d", day * 2 / 3)):
+        (root / "sros.toml").write_text(
+            text.replace('validity = "180d"', f'validity = "{validity}"')
+        )
+        assert parse_threshold("soon", OpenedKeystore(root)) == Threshold(remaining=limit)
+    with pytest.raises(UsageError):
+        parse_threshold("soon")
+    assert sros("renew", root, "--all-expiring", "soon").ok().out == ""
+
+
 @pytest.mark.parametrize("text", ["", "%", "101%", "-1%", "6.5%", "30", "d", "0d", "٣%", "1e1%"])
 def test_what_is_no_threshold(text: str) -> None:
     with pytest.raises(UsageError):
@@ -493,7 +508,7 @@ def test_the_program(tmp_path: Path) -> None:
     assert "the replaced" not in told.err
     assert sros("crl", root).ok().out.count("superseded") == 5
     assert sros("renew", root).status == 2
-    assert sros("renew", root, "--all-expiring", "soon").status == 2
+    assert sros("renew", root, "--all-expiring", "often").status == 2
     assert sros("renew", root, "/missing").status == 2
 
 
@@ -509,6 +524,10 @@ def test_the_check_answers_by_its_exit_status(tmp_path: Path) -> None:
     (entry,) = json.loads(sros(*check, "181d", "--json").out)["enclaves"]
     assert set(entry) == {"enclave", "certificate_until", "permissions_until"}
     assert json.loads(sros(*check, "30d", "--json").ok().out)["enclaves"] == []
+    sros("create_enclave", root, *(f"/b{number}" for number in range(21))).ok()
+    lines = sros(*check, "181d").out.splitlines()
+    assert len(lines) == 21 and lines[-1] == "and 2 more enclaves (-v lists all)"
+    assert len(sros(*check, "181d", "-v").out.splitlines()) == 22
     assert sros(*check, "often").status == 2
 
 

@@ -101,7 +101,7 @@ def test_systemd_finds_nothing_wrong_in_the_jobs(passphrase: str, tmp_path: Path
     lines = set(re.findall(r"Command Line: (/bin/true .*)", said))
     assert lines == {
         "/bin/true agent run /srv/ks --once",
-        "/bin/true renew /srv/ks --all-expiring 30d",
+        "/bin/true renew /srv/ks --all-expiring soon",
         "/bin/true check keystore /srv/ks",
         "/bin/true check runtime --watch",
         f"/bin/true metrics /srv/ks -o {METRICS_FILE}",
