@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import stat
@@ -13,6 +14,7 @@ import pytest
 
 from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
 from ansible_collections.sros.fleet.plugins.module_utils.places import Place
+from sros_tool.runtime.processes import boot_id
 
 OLD = {"enclaves/a/cert.pem": b"old", "enclaves/a/key.pem": b"key"}
 NEW = {"enclaves/a/cert.pem": b"new", "enclaves/b/c/cert.pem": b"other"}
@@ -343,3 +345,23 @@ def test_processes_that_may_lack_the_revocation_list_are_remembered(
     assert deliver(set(), crl_pem=b"equal") == [["/a"], ["/a"]], "as it may have restarted before"
     place.set_due([])
     assert not [name for name in beside(place) if "trusting" in name]
+
+
+def test_restarts_that_an_agent_noted_are_due(place: Place) -> None:
+    """It may have brought files since the last play, and its processes are not restarted yet."""
+    files, path = place.read(), Path(place.path, ".agent/state.json")
+    assert place.agent_due(files) == []
+    path.parent.mkdir()
+    for state, due in (
+        ({"due": ["/a", "/b"], "boot": boot_id()}, ["/a", "/b"]),
+        ({"due": ["/a"], "boot": ""}, ["/a"]),
+        ({"due": [], "boot": boot_id()}, []),
+        ({"due": ["/b"], "boot": "of an earlier start"}, []),
+        ({"due": ["b"], "boot": boot_id()}, ["/a"]),
+        ([], ["/a"]),
+    ):
+        path.write_text(json.dumps(state))
+        assert place.agent_due(files) == due, state
+    module = pytest.importorskip("ansible_collections.sros.fleet.plugins.modules.enclaves")
+    said = module._confirmation(place, {"robot": "r1"}, files, 0.0)
+    assert said["restart"] == said["crl_restart"] == ["/a"]

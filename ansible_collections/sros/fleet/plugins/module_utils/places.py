@@ -20,6 +20,7 @@ from ansible_collections.sros.fleet.plugins.module_utils.exports import (
     Files,
     RefusedError,
     check_enclave,
+    enclaves_in,
     is_enclave_path,
     trust_digest,
 )
@@ -29,7 +30,7 @@ _FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _OF_OTHERS = stat.S_IWGRP | stat.S_IWOTH
 _MOST_LINKS = 40
-_AGENT = ".agent"
+_AGENT, _AGENT_STATE = ".agent", "state.json"
 _LONGEST_WAIT = 60.0
 
 
@@ -352,6 +353,31 @@ class Place:
         loaded = set(self.trusting())
         return [enclave for enclave in self.due() if trust_digest(files, enclave) not in loaded]
 
+    def agent_due(self, files: Files) -> list[str]:
+        """Return the enclaves whose restart `sros agent` noted since the start of the machine.
+
+        The agent may have installed files since the last play.  All enclaves of ``files`` if what
+        it noted cannot be read.
+        """
+        try:
+            with _opened(self.path) as top, _opened(_AGENT, top) as agent:
+                content = _read_file(agent, _AGENT_STATE, os.path.join(self.path, _AGENT))
+            state = json.loads(content.decode())
+            due = sorted({check_enclave(enclave) for enclave in state["due"]})
+            return [] if state["boot"] not in ("", _boot_id()) else due
+        except FileNotFoundError:
+            return []
+        except (
+            RefusedError,
+            OSError,
+            ValueError,
+            TypeError,
+            KeyError,
+            AttributeError,
+            RecursionError,
+        ):
+            return enclaves_in(files)
+
     def _names(self, record: str, check: Callable[[str], str]) -> list[str]:
         try:
             handle = os.open(self._beside(record), _FILE)
@@ -381,6 +407,11 @@ class Place:
             os.fsync(file.fileno())
         os.replace(spare, path)
         _flush(self._parent)
+
+
+def _boot_id() -> str:
+    with open("/proc/sys/kernel/random/boot_id") as file:
+        return file.read().strip()
 
 
 def _mode(path: str) -> int:

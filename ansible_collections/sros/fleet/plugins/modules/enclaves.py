@@ -295,7 +295,9 @@ def _after(before: Files, sent: Files) -> Files:
 
 
 def _confirmation(place: Place, asked: dict, files: Files, now: float) -> dict:
-    return confirmation(asked["robot"], files, now, place.due(), place.crl_due(files))
+    by_agent = place.agent_due(files)
+    due, crl_due = ({*names, *by_agent} for names in (place.due(), place.crl_due(files)))
+    return confirmation(asked["robot"], files, now, sorted(due), sorted(crl_due))
 
 
 def _install(
