@@ -129,18 +129,23 @@ def _report(folder: Path, robot: str) -> None:
       $ ssh r7 sros fleet report /etc/sros/keystore --robot r7 |
             sros fleet confirm keystore --robot r7 -
     """
+    from sros_tool.agent.state import read_state
     from sros_tool.checks.keystores.installed import installed_sentences
     from sros_tool.keystore.confirmation import (
         make_confirmation,
         render_confirmation,
         shortened_problems,
     )
+    from sros_tool.runtime.processes import boot_id
 
     with progress("reading"):
         moment = now()
         confirmation = make_confirmation(folder, robot, now=moment, dds=_dds_here(moment))
         problems = shortened_problems(installed_sentences(folder, confirmation.enclaves(), moment))
-    echo_document(render_confirmation(replace(confirmation, problems=problems)))
+    confirmation, agent = replace(confirmation, problems=problems), read_state(folder)
+    if agent.due and agent.boot == boot_id():  # without an agent, nobody knows
+        confirmation = replace(confirmation, restart=agent.due, crl_restart=agent.list_due)
+    echo_document(render_confirmation(confirmation))
 
 
 def _dds_here(moment: datetime) -> RobotDds:

@@ -15,6 +15,7 @@ import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
+from sros_tool.agent.state import AgentState, write_state
 from sros_tool.cli import fleet as fleet_verbs
 from sros_tool.cli.fleet import ComparedFleet, _facts, _joined_durations, _lines, _robot_names
 from sros_tool.keystore.confirmation import (
@@ -30,6 +31,7 @@ from sros_tool.keystore.layout import ENCLAVES, REFUSED
 from sros_tool.keystore.reader import OpenedKeystore, read_certificate
 from sros_tool.keystore.template import Template
 from sros_tool.pki.certificates import digest, validity_of
+from sros_tool.runtime.processes import boot_id
 from sros_tool.validity import iso, parse_iso
 from tests.keystore.test_confirmation import DDS, LIBRARY, hostile
 from tests.support.harness import Ended, copy_of, policy_text, publish, sros
@@ -1125,6 +1127,11 @@ def test_the_module_on_the_robot_confirms_the_same(field: Field) -> None:
         for dds in (made["dds"], said["dds"])
     ]
     assert found[0] == found[1]
+    (robot / ".agent").mkdir()
+    for boot, due in ((boot_id(), ["/r1/base"]), ("of an earlier start", None)):
+        write_state(robot, AgentState(due=("/r1/base",), boot=boot))
+        said = json.loads(field.run("fleet", "report", "r1", "--robot", "r1").out)
+        assert said.get("restart") == due and said.get("crl_restart") == (due and [])
 
 
 OLD = {**LIBRARY, "product": "Fast DDS", "version": "2.14.5", "path": "/a/libfastrtps.so.2.14.5"}
