@@ -407,7 +407,14 @@ _DONE = {
 @click.option(
     "--identity-ca",
     type=PATH,
-    help="With --same-key: the later certificate (PEM) of the CA service.",
+    help="Certificate (PEM) of an existing CA that replaces the identity CA, such as one that a "
+    "restored backup lacks; needs --identity-key. With --same-key: the later certificate of the CA "
+    "service.",
+)
+@click.option(
+    "--permissions-ca",
+    type=PATH,
+    help="Like --identity-ca, for the permissions CA; needs --permissions-key.",
 )
 @click.option("--ca-validity", metavar="SPAN", help="How long the new CA is valid, such as 10y.")
 @click.option(
@@ -448,6 +455,7 @@ def rotate_ca(
     finish: bool,
     same_key: bool,
     identity_ca: Path | None,
+    permissions_ca: Path | None,
     ca_validity: str | None,
     identity_key: str | None,
     permissions_key: str | None,
@@ -487,6 +495,7 @@ def rotate_ca(
       $ sros rotate_ca keystore --finish   # or all at once; then restart all
     """
     from sros_tool.keystore.fleet import publish_command
+    from sros_tool.keystore.layout import IDENTITY, PERMISSIONS
     from sros_tool.keystore.lifecycle.rotate import renew_identity_ca
     from sros_tool.keystore.lifecycle.rotate import rotate_ca as work
     from sros_tool.keystore.lifecycle.rotation import RotationStage, rotation_status
@@ -501,11 +510,22 @@ def rotate_ca(
         status_now = rotation_status(keystore, now=now())
         _show_status(status_now, _unconfirmed_robots(keystore), as_json)
         return
-    if identity_ca and not same_key:
-        raise UsageError("--identity-ca has no effect without --same-key", "", "Add --same-key.")
+    existing = {}
+    for role, file, is_chosen, key in (
+        (IDENTITY, identity_ca, identity, identity_key or same_key),
+        (PERMISSIONS, permissions_ca, permissions, permissions_key),
+    ):
+        if file and not key:
+            raise UsageError(
+                f"--{role}-ca needs the key of this CA", "", f"Name it with --{role}-key."
+            )
+        if file and (identity or permissions) and not is_chosen:
+            raise UsageError(f"--{role}-ca has no effect without --{role}", "", "Leave one out.")
+        if file:
+            existing[role] = read_bytes(file, "CA certificate")
     validity = parse_span(ca_validity) if ca_validity is not None else None
     if same_key:
-        if permissions:
+        if permissions or permissions_ca:
             raise UsageError(
                 "the permissions CA cannot keep its key",
                 "DDS accepts signed documents only from exactly the same CA certificate.",
@@ -516,7 +536,7 @@ def rotate_ca(
             now=now(),
             keyring=keyring(),
             validity=validity,
-            issued=read_bytes(identity_ca, "CA certificate") if identity_ca else b"",
+            issued=existing.get(IDENTITY, b""),
             allow_refusal=allow_refusal,
             dry_run=dry_run,
         )
@@ -531,6 +551,7 @@ def rotate_ca(
                 finish=finish,
                 keyring=keyring(),
                 new_keys=_new_keys(identity_key, permissions_key, encrypt_ca_keys),
+                existing=existing,
                 validity=validity,
                 delete_old_key=delete_old_key,
                 allow_unconfirmed=allow_unconfirmed,

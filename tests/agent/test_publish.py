@@ -39,7 +39,9 @@ from sros_tool.keystore.delivery.release import (
 )
 from sros_tool.keystore.delivery.repository import Composer, Roots, load_signer, read_present
 from sros_tool.keystore.fleet_status import fleet_status
+from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.layout import ROLES as ROLES_OF_CAS
+from sros_tool.keystore.layout import ca_key
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
@@ -888,33 +890,41 @@ def test_restored_is_refused_where_nothing_shows_a_restore(publisher: Home) -> N
     assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
 
 
+@pytest.mark.parametrize("has_key", [False, True])
 @pytest.mark.parametrize("role", ROLES_OF_CAS)
 def test_a_restored_keystore_never_brings_back_a_ca_that_was_replaced(
-    publisher: Home, role: str
+    publisher: Home, role: str, has_key: bool
 ) -> None:
     """The CA may have been replaced because somebody has its key."""
 
-    def replace_ca() -> None:
+    def replace_ca(existing: bytes = b"") -> None:
         publisher.now += LATER
         rotate_ca(
             publisher.root,
             roles=[role],
             now=publisher.now,
             finish=True,
+            new_keys=Keyring(places={role: f"file:{key}"} if existing else {}),
+            existing={role: existing} if existing else {},
             allow_unconfirmed=True,
         )
 
     backup = copy_of(publisher.root, publisher.folder / "backup")
     replace_ca()
     publisher.publish()
+    key = publisher.folder / "later.key.pem"
+    shutil.copy(publisher.root / ca_key(role), key)
     shutil.rmtree(publisher.root)
     backup.rename(publisher.root)
+    later = read_release(archives(publisher)["r1"]).files[f"enclaves/r1/base/{role}_ca.cert.pem"]
     before = snapshot(publisher.folder)
     with pytest.raises(KeystoreError, match=f"the {role} CA was replaced after the backup") as said:
         publisher.publish(restored=True)
     assert f"--{role} --finish" in said.value.remedy and snapshot(publisher.folder) == before
-    replace_ca()
+    replace_ca(later if has_key else b"")
     assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
+    now = read_release(archives(publisher)["r1"]).files[f"enclaves/r1/base/{role}_ca.cert.pem"]
+    assert (now == later) is has_key
 
 
 def test_a_clock_that_was_set_back(publisher: Home) -> None:

@@ -277,6 +277,28 @@ def test_same_key(separate: Path) -> None:
     check(separate, later)
 
 
+def test_an_existing_ca_replaces_one_only_with_its_key(separate: Path, tmp_path: Path) -> None:
+    """And a permissions CA only one of its name: Fast DDS refuses peers with another."""
+    before, other = snapshot(separate), tmp_path / "other"
+    sros("create_keystore", other, "--template", "production").ok()
+    rotate = ("rotate_ca", separate, "--finish")
+    ca, key = "public/{}_ca.cert.pem", "private/{}_ca.key.pem"
+    for role, of_key, more, why in (
+        ("identity", "", (), "needs the key of this CA. Name it with --identity-key"),
+        ("identity", "permissions", (), "does not fit its key"),
+        ("identity", "identity", ("--permissions",), "no effect without --identity"),
+        ("permissions", "permissions", (), "cannot replace the permissions CA"),
+    ):
+        named = (f"--{role}-key", f"file:{other / key.format(of_key)}") if of_key else ()
+        ended = sros(*rotate, f"--{role}-ca", other / ca.format(role), *named, *more)
+        assert ended.status == 2 and why in ended.err, ended
+    assert snapshot(separate) == before
+    named = ("--identity-key", f"file:{other / key.format('identity')}")
+    sros(*rotate, "--identity", "--identity-ca", other / ca.format("identity"), *named).ok()
+    (now,) = OpenedKeystore(separate).certificates_of("identity_ca")
+    assert pem(now) == (other / ca.format("identity")).read_bytes()
+
+
 def test_same_key_is_not_for_a_ca_that_signs_permissions(tmp_path: Path) -> None:
     root = make(tmp_path, "sros2")
     before = snapshot(root)

@@ -787,9 +787,9 @@ class _Run:
             if lost or retired_authorities(published, own):
                 flag = f" --{role}" * (len(self.keystore.authority_files) > 1)
                 by_hand = (
-                    f", bring the files of each robot by hand (`sros distribute_key {where} "
-                    "--robot NAME FOLDER --force`), because robots accept releases only of the "
-                    "CA that they trust,"
+                    " Otherwise, also bring the files of each robot by hand (`sros distribute_key "
+                    f"{where} --robot NAME FOLDER --force`), because robots accept releases only "
+                    "of the CA that they trust."
                 ) * (role == PERMISSIONS or not flag)
                 raise KeystoreError(
                     f"the {role} CA was replaced after the backup of the keystore "
@@ -799,7 +799,9 @@ class _Run:
                     "have copied.",
                     "Restore a backup from after the rotation. If there is none, repeat later "
                     f"revocations, replace the CA again (`sros rotate_ca {where}{flag} --finish "
-                    f"--allow-unconfirmed`){by_hand} and repeat this command.",
+                    f"--allow-unconfirmed`), and repeat this command. If you have the key of the "
+                    f"later CA, add --{role}-ca FILE --{role}-key PLACE to replace it by this CA "
+                    f"(docs/howto/keystore_is_lost.md).{by_hand}",
                 )
 
     def _restore(self, forgotten_lists: Forgotten, keyring: Keyring) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import secrets
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -93,7 +93,7 @@ from sros_tool.pki.certificates import (
     subject_text,
     validity_of,
 )
-from sros_tool.pki.keys import PublicKey, algorithm, is_weak
+from sros_tool.pki.keys import PrivateKey, PublicKey, algorithm, is_weak
 from sros_tool.pki.token import is_token_uri
 from sros_tool.validity import Span, Window, span_text, window
 from sros_tool.wording import first_few
@@ -133,6 +133,7 @@ def rotate_ca(
     finish: bool = False,
     keyring: Keyring = IN_KEYSTORE,
     new_keys: Keyring = IN_KEYSTORE,
+    existing: Mapping[str, bytes] = {},
     validity: Span | None = None,
     delete_old_key: bool = False,
     allow_unconfirmed: bool = False,
@@ -145,9 +146,11 @@ def rotate_ca(
     If the keystore is already at the stage ``to``, nothing is changed.  ``roles`` ("identity",
     "permissions"; default: both) and the ``validity`` of the new CAs are only used when a rotation
     begins.  ``keyring`` opens the current keys; ``new_keys`` names the places of new keys outside
-    of the keystore.  ``delete_old_key`` deletes old keys that are in the keystore.  In a keystore
-    with a fleet, a stage that cuts off robots, because they have not confirmed the previous stage,
-    needs ``allow_unconfirmed``.  The nodes of the vendors in ``allow_refusal`` may stop working.
+    of the keystore.  ``existing`` has the certificates (PEM) of CAs that exist already, by role:
+    their keys are at these places.  ``delete_old_key`` deletes old keys that are in the keystore.
+    In a keystore with a fleet, a stage that cuts off robots, because they have not confirmed the
+    previous stage, needs ``allow_unconfirmed``.  The nodes of the vendors in ``allow_refusal`` may
+    stop working.
 
     Raises:
         KeystoreError: a key is missing, an enclave cannot be moved to the new CA, robots would be
@@ -169,7 +172,7 @@ def rotate_ca(
             cut_off = robots_cut_off(change.keystore, rotation, stage, now)
             if cut_off and not allow_unconfirmed:
                 raise _cut_off_error(change.keystore, rotation, stage, cut_off, roles)
-            stage = rotator.go_to(stage, roles, new_keys, validity, progress)
+            stage = rotator.go_to(stage, roles, new_keys, existing, validity, progress)
             if stage in (RotationStage.DISTRIBUTE, RotationStage.REISSUE):
                 change.notes += _no_robot_notes(change.keystore, change.names)
             change.finish()
@@ -460,6 +463,7 @@ class _Rotator:
         stage: RotationStage,
         roles: Sequence[str],
         new_keys: Keyring,
+        existing: Mapping[str, bytes],
         validity: Span | None,
         progress: Progress | None,
     ) -> RotationStage:
@@ -476,7 +480,7 @@ class _Rotator:
             return stage
         if self._rotation.stage is RotationStage.NONE:
             successors = self._begin_rotation(
-                roles, new_keys, validity, next_to=stage is RotationStage.DISTRIBUTE
+                roles, new_keys, existing, validity, next_to=stage is RotationStage.DISTRIBUTE
             )
             if stage is RotationStage.DISTRIBUTE:
                 self._distribute(successors)
@@ -549,7 +553,13 @@ class _Rotator:
     # ── the stages ─────────────────────────────────────────────────────────────────────────
 
     def _begin_rotation(
-        self, roles: Sequence[str], new_keys: Keyring, validity: Span | None, *, next_to: bool
+        self,
+        roles: Sequence[str],
+        new_keys: Keyring,
+        existing: Mapping[str, bytes],
+        validity: Span | None,
+        *,
+        next_to: bool,
     ) -> list[_Successor]:
         for role in ROLES:
             strangers = unknown_authorities(self._keystore, role)
@@ -565,6 +575,7 @@ class _Rotator:
             self._change,
             roles,
             new_keys,
+            existing,
             window(self._change.now, validity or self._template.authority_validity),
             next_to=next_to,
         )
@@ -885,6 +896,7 @@ def _make_successors(
     change: KeystoreChange,
     roles: Sequence[str],
     new_keys: Keyring,
+    existing: Mapping[str, bytes],
     validity: Window,
     *,
     next_to: bool,
@@ -918,7 +930,10 @@ def _make_successors(
         if wanted & set(serves):
             _check_place(change, file, serves[0], new_keys)
             at = f"{PRIVATE}/{'next_' if next_to else ''}{file}.key.pem"
-            successors.append(_make_successor(change, file, serves, at, new_keys, validity))
+            certificate = next((existing[role] for role in serves if role in existing), b"")
+            successors.append(
+                _make_successor(change, file, serves, at, new_keys, certificate, validity)
+            )
     return successors
 
 
@@ -944,6 +959,7 @@ def _make_successor(
     roles: tuple[str, ...],
     at: str,
     new_keys: Keyring,
+    existing: bytes,
     validity: Window,
 ) -> _Successor:
     transaction, template = change.transaction, change.template
@@ -975,8 +991,35 @@ def _make_successor(
     name = old[0].subject
     if PERMISSIONS not in roles:
         name = common_name(f"{template.authority_name} identity CA {secrets.token_hex(4)}")
-    certificate = issue_ca(key, name, validity)
+    if existing:
+        certificate = _existing_ca(change, roles, existing, key, name)
+    else:
+        certificate = issue_ca(key, name, validity)
     return _Successor(file, roles, old, Authority(certificate, key), place or at)
+
+
+def _existing_ca(
+    change: KeystoreChange, roles: Sequence[str], data: bytes, key: PrivateKey, name: x509.Name
+) -> x509.Certificate:
+    """Return the certificate of a CA that exists already, such as one that a backup lacks.
+
+    Raises:
+        PkiError: it cannot be a CA, or is not that of ``key``.
+        KeystoreError: it has a chain, or is a permissions CA with another name than ``name``.
+    """
+    imported = [check_imported(role, data, key, change.now) for role in roles]
+    certificate = imported[0].certificate
+    if imported[0].bundle != pem(certificate) or (
+        PERMISSIONS in roles and certificate.subject != name
+    ):
+        raise KeystoreError(
+            f"{subject_text(certificate.subject)} cannot replace the {_ca_name(roles)}",
+            f"It has to be self-signed, and a permissions CA has to be named {subject_text(name)}: "
+            "DDS would refuse enclaves of the other.",
+            "Make a new CA, or a new keystore for this CA.",
+        )
+    change.notes += (note for each in imported for note in each.notes)
+    return certificate
 
 
 def _distributed_successors(change: KeystoreChange, rotation: Rotation) -> list[_Successor]:
