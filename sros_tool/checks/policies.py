@@ -742,10 +742,16 @@ def _missing_common_part_cause(lacking: Sequence[_Lacking]) -> Cause:
     plural = len(nodes) > 1
     copied = (file.parent / COMMON / "node.xml").exists()
     target = quote(str(file.parent / COMMON))
-    first = "Put" if copied else f"Run `sros policies --copy {target}`, and put"
-    place = "the <profile> of every node" if plural else "its <profile>"
+    copy = "" if copied else f"Run `sros policies --copy {target}`, and "
     at = f"line{'s' * (len(lines) > 1)} {names_text([str(line) for line in lines])}"
-    remedy = f"{first} this line into {place} ({at}): {_INCLUDE}"
+    if plural:
+        addresses = "".join(f"{line}ba;" for line in lines)
+        edit = quote(f"{addresses}b;:a;s|<profile [^>]*[^/>]>|&{_INCLUDE}|")
+        put = f"put the line in this command into the <profile> of every node ({at}): "
+        remedy = f"{copy}{put}`sed -i {edit} {quote(str(file))}`"
+    else:
+        remedy = f"{copy}put this line into its <profile> ({at}): {_INCLUDE}"
+    remedy = f"{remedy[0].upper()}{remedy[1:]}"
     if any(_is_any_node(node) for node in nodes):
         remedy = f"{_NAME_FIRST} {remedy}"
     return Cause(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -95,8 +96,14 @@ def test_nodes_without_the_common_part_are_one_paragraph_with_one_mend(tmp_path:
     assert sorted(cause["findings"]) == list(range(24))
     markdown = sros("check", "robot.xml", "--format", "markdown", cwd=tmp_path).out
     assert markdown.count("**error**") == 1
+    before = policy.read_text()
     fixed(policy, ended.out)
     assert sros("check", "--strict", "robot.xml", cwd=tmp_path).ok().out == ""
+    by_hand = policy.read_text()
+    policy.write_text(before)
+    (command,) = re.findall("`(sed .+?)`", ended.out)
+    subprocess.run(shlex.split(command), cwd=tmp_path, check=True)
+    assert policy.read_text() == by_hand
 
 
 def test_an_older_common_part_that_is_included_is_replaced(tmp_path: Path) -> None:
