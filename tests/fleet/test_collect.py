@@ -260,7 +260,9 @@ def test_a_robot_cannot_answer_for_another_one(home: Home) -> None:
     assert home.of("r1").outcome == "kept"
 
 
-def test_a_stranger_with_a_long_name_is_refused_in_a_short_line(home: Home) -> None:
+def test_a_stranger_with_a_long_name_is_refused_in_a_short_line(
+    home: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whoever can write into the inbox chooses the subject of the certificate."""
     name = x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, "a\x1b[2J")
     key = generate_key()
@@ -276,6 +278,13 @@ def test_a_stranger_with_a_long_name_is_refused_in_a_short_line(home: Home) -> N
     said = sros("fleet", "collect", "ks", "inbox", cwd=home.folder).out
     assert "r1: refused: no identity CA of the keystore issued its certificate: " in said
     assert len(said) < 600 and "\x1b" not in said
+    assert "keystore_is_lost" not in said
+    monkeypatch.setattr("sros_tool.keystore.delivery.collect.restored_at", lambda _: iso(NOW))
+    home.put("r2", smime.sign(render_confirmation(home.said("r2", NOW)), stranger, key))
+    said = sros("fleet", "collect", "ks", "inbox", cwd=home.folder).out
+    assert (
+        "the CA was replaced after the backup of the keystore: see docs/howto/keystore_is" in said
+    )
 
 
 def test_an_older_message_in_a_second_inbox(home: Home) -> None:

@@ -563,11 +563,11 @@ class _Verifier:
         validity = validity_of(signer)
         moment = min(max(self._now, validity.not_before), validity.not_after)
         if fault := chain_fault(signer, self._authorities, moment=moment):
-            why = f"no identity CA of the keystore issued its certificate: {fault}"
-            if restored_at(self._keystore):
-                why += "; perhaps the CA was replaced after the backup of the keystore: see "
-                why += "docs/howto/keystore_is_lost.md"
-            raise _RefusedError(why)
+            why = "no identity CA of the keystore issued its certificate"
+            if restored_at(self._keystore):  # first: the sender chose the words of the fault
+                why += " (perhaps the CA was replaced after the backup of the keystore: see "
+                why += "docs/howto/keystore_is_lost.md)"
+            raise _RefusedError(f"{why}: {fault}")
         if signer.serial_number in self._revoked:
             raise _RefusedError(f"its certificate, {signer.serial_number:x}, was revoked")
         issued = self._issued(digest(signer))
