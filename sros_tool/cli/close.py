@@ -232,7 +232,7 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
     if closed.secured.get(process.enclave):
         restart = "closed"
     elif runs:
-        restart = f"closed {_EARLIER}: {restart}"
+        restart = f"runs {_NOT_CURRENT}: {restart}"
     if process.alike:
         state = f"{process.pids_text}, which sros cannot tell"
     elif process.enclave in closed.absent:
@@ -337,7 +337,7 @@ def _state(closed: CloseState, *, apply: bool) -> str:
         not_closed = "nothing was closed" if apply else "nothing is closed yet"
         return "no process of the robot runs" if closed.stopped >= {*closed.pending} else not_closed
     words = {
-        name: _EARLIER
+        name: _NOT_CURRENT
         if name in closed.secured
         else "not running"
         if name in closed.stopped
@@ -372,5 +372,5 @@ def _started_together(processes: Sequence[ClosedProcess]) -> str:
 
 _MOST_DENIED = 4
 _ANSWERS = {True: "yes", False: "no", None: "not checked"}
-_EARLIER = "with earlier files"
+_NOT_CURRENT = "with earlier files or other settings"
 _ACCEPT = "accept with --partial what could not be checked, "

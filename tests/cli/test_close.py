@@ -553,7 +553,9 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert "/opt/late" not in commands, "another user cannot propose what is run"
     robot.more = (replace(late, started=datetime.now(UTC) - timedelta(days=1)),)
-    assert "enclaves, except for /late (with earlier files); the files" in robot.close().err
+    ended = robot.close()
+    assert ": runs with earlier files or other settings: by hand\n" in ended.out
+    assert "except for /late (with earlier files or other settings); the files" in ended.err
     robot.more = (replace(late, started=datetime.now(UTC) + timedelta(days=1)),)
     assert "the processes run in their enclaves; the files are valid until" in robot.close().err
     watching = robot.close("--for", "1s", status=2).err
@@ -593,7 +595,8 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     )
     assert "the robot is closed, without a process of /listener; the files are" in ended.err
     robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
-    assert "; not seen: /listener\n" in robot.close(*without, "--partial").out
+    ended = robot.close(*without, "--partial")
+    assert "; not seen: /listener (--partial accepts this)\n" in ended.out
     robot.unseen = ()
     robot.absent, robot.by_hand = set(), {"/listener", "/talker"}  # it is compared, too
     assert "no: everything that talked can still t" in robot.close(*without, status=1).out
