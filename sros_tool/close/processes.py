@@ -115,8 +115,8 @@ class ClosedProcess(NamedTuple):
 
         The command may have the argument for the enclave that ``sros run`` adds.
         """
-        if self.is_router or process.is_router:
-            return self.is_router and process.is_router
+        if self.is_router and process.is_router:
+            return True
         rmws = {self.rmw, _rmw_to_start(process)}
         if len(rmws - {""}) > 1 or rmws == {"", RMW_ZENOH}:  # a process without any is on DDS
             return False

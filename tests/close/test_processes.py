@@ -130,6 +130,14 @@ def test_a_router_has_no_node_and_is_no_unknown_process() -> None:
     for router in (replace(demo, pid=8), process(8, "/opt/rmw_zenohd")):
         later = observed.with_current_pids(RunningProcesses((router,)), Path("/export"))
         assert ([known.pid for known in later.processes], later.unknown) == ([8], [])
+    open_script = replace(
+        process(9, "python3", "r.py"), environment={"RMW_IMPLEMENTATION": RMW_ZENOH}
+    )
+    uris = {"ZENOH_SESSION_CONFIG_URI": NO_CONFIGURATION, "ZENOH_ROUTER_CONFIG_URI": "/r.json5"}
+    script = replace(open_script, environment={**open_script.environment, **uris})
+    for enclave in ("/router", "/far_router"):
+        known = ClosedProcess.from_process(script, enclave, ProcessOrigin(), "enclave")
+        assert known.fits(script) and known.fits(open_script), "it is known by its command, too"
 
 
 def test_an_enclave_is_closed_only_if_all_its_processes_are(tmp_path: Path) -> None:
