@@ -57,7 +57,6 @@ from sros_tool.pki.certificates import load_certificates, subject_text, validity
 from sros_tool.pki.crl import SUPERSEDED, load_crl
 from sros_tool.prometheus import Metric, Sample
 from sros_tool.runtime.environment import (
-    NO_CONFIGURATION,
     OVERRIDE,
     ROUTER_URI,
     SESSION_URI,
@@ -711,8 +710,6 @@ def _zenoh_opening(process: Process) -> str:
     """
     variable = ROUTER_URI if process.is_router else SESSION_URI
     text = process.environment.get(variable, "")
-    if text == NO_CONFIGURATION:
-        return ""
     if process.configuration is None:
         return f"{variable} is not set"
     return open_because(
@@ -750,7 +747,7 @@ def _zenoh_changes(process: Process) -> Iterator[str]:
         variable = ROUTER_URI if process.is_router else SESSION_URI
         path = folder / (ROUTER_FILE if process.is_router else SESSION_FILE)
         uri = environment.get(variable, "")
-        if uri not in ("", NO_CONFIGURATION, str(path)):
+        if uri not in ("", str(path)):
             yield f"{variable} names '{_plain_path(uri)}', not '{_plain_path(str(path))}'"
     else:
         own = {key: overrides.get(key, "") for key in own}

@@ -639,13 +639,13 @@ def _configuration_of(process: Process) -> LoadedFile | None:
     is_of_zenoh = not _programs_in(process.command).isdisjoint((_ZENOHD, *_BRIDGES))
     if is_of_zenoh or not (by_rmw or process.is_router):
         return LoadedFile("", problem="its program or its arguments choose it")
-    session, router = (
-        "" if (uri := process.environment.get(name, "")) == NO_CONFIGURATION else uri
-        for name in (SESSION_URI, ROUTER_URI)
-    )
-    if session and router and not (process.is_router or "librcl" in process.libraries):
+    session, router = (process.environment.get(name, "") for name in (SESSION_URI, ROUTER_URI))
+    is_certain = process.is_router or "librcl" in process.libraries
+    if not is_certain and {session, router}.isdisjoint({"", NO_CONFIGURATION}):
         return LoadedFile("", problem=f"its program chooses {SESSION_URI} or {ROUTER_URI}")
     path = router if process.is_router else session
+    if path == NO_CONFIGURATION:  # nothing of rmw_zenoh would run
+        return LoadedFile("", problem="its program or its arguments choose it")
     return LoadedFile(path) if path else None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 from dataclasses import replace
@@ -26,6 +27,7 @@ from sros_tool.runtime.processes import (
     UnseenProcess,
 )
 from sros_tool.terminal import visible
+from tests.checks.zenoh_cases import sound
 from tests.close.test_assignment import process
 
 
@@ -149,10 +151,11 @@ def test_an_enclave_is_closed_only_if_all_its_processes_are(tmp_path: Path) -> N
     variables = {
         "RMW_IMPLEMENTATION": RMW_ZENOH,
         "ROS_SECURITY_STRATEGY": "Enforce",
-        "ZENOH_SESSION_CONFIG_URI": NO_CONFIGURATION,
+        "ZENOH_SESSION_CONFIG_URI": "/export/enclaves/router/session.json5",
     }
+    rules = LoadedFile("/s.json5", now - timedelta(2), json.dumps(sound()).encode())
     later, user = now + timedelta(1), os.geteuid()
-    fresh = Process(7, ("a",), variables, later, enclave=enclave, user=user)
+    fresh = Process(7, ("a",), variables, later, enclave=enclave, configuration=rules, user=user)
     old, unread = replace(fresh, started=now - timedelta(1)), LoadedFile("/s.json5", problem="odd")
     robot: Any = SimpleNamespace(export=tmp_path, domain=0)
     for processes, why in (

@@ -142,7 +142,7 @@ REFUSED = {**FOR_ROUTER, ROUTER_URI: NO_CONFIGURATION}
         ("rmw_zenohd", FOR_BOTH, "", "/r.json5"),
         ("python3 start_router.py", FOR_ROUTER, "zenoh", "/r.json5"),
         ("start_router", FOR_ROUTER, "", "/r.json5"),
-        ("start_router", REFUSED, "", None),
+        ("start_router", REFUSED, "", ""),
         ("start", FOR_BOTH, "", ""),
         ("start", FOR_BOTH, "librcl", "/s.json5"),
         ("zenohd -c /other.json5", FOR_ROUTER, "", ""),
