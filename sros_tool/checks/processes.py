@@ -473,8 +473,8 @@ PROCESS_RUNS_UNSECURED = FindingKind(
     ERROR,
     "a node that runs open although security is enabled",
     "The ROS_SECURITY_STRATEGY of the node is not exactly `Enforce`, so rcl starts the node "
-    "unsecured if its enclave, or a file of the enclave, is missing: everybody on the network "
-    "hears the node and can send to it.",
+    "unsecured if its enclave, or a file of the enclave, is missing. Then everybody on the "
+    "network hears the node and can send to it.",
     "rcl 9 (rcl/src/rcl/security.c), rmw_dds_common (security.cpp); tested with ROS 2 Jazzy.",
     "Stop it, and start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`.",
 )

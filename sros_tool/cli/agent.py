@@ -245,9 +245,10 @@ def _unit(text: str) -> Unit:
 def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool) -> int:
     """Install the robot's releases in FOLDER, and report which files and processes the robot has.
 
-    A round fetches the robot's release, verifies it, installs it whole or not at all, restarts
-    units or reports the restarts that are due, checks the running processes, asks for renewal in
-    the last third of a certificate's validity, and sends a signed report to the keystore machine.
+    A round fetches the robot's release, verifies it, and installs it whole or not at all. It
+    restarts units, or reports the restarts that are due, and checks the running processes. It asks
+    for renewal in the last third of a certificate's validity, and sends a signed report to the
+    keystore machine.
     If one step fails, the others still run, and the next round tries the failed step again.
 
     Example:

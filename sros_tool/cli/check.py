@@ -207,9 +207,9 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
 @click.option(
     "--needs-renewal",
     metavar="DURATION|PERCENT|soon",
-    help="List only the enclaves that expire within DURATION (30d), have used PERCENT of their "
-    "validity (66%), or expire within 30 days or, if that is shorter, a third of the validity "
-    "that the keystore gives (soon).",
+    help="List only the enclaves that expire within DURATION (30d) or have used PERCENT of their "
+    "validity (66%). `soon`: within 30 days, or within a third of the validity that the keystore "
+    "gives, if that is shorter.",
 )
 @advisories_option
 def check(

@@ -103,16 +103,17 @@ def close(
 ) -> int:
     """Close the robot that runs open on this machine, step by step.
 
-    Watches the robot on DDS or Zenoh, and writes into FOLDER its policy, requirements that hold
-    now, a production keystore with an enclave for each process, an export of the enclaves without
-    CA keys, and the files that start each process with security. Each step is a command, which is
-    printed. Existing files are kept: edit policy.xml and requirements.toml, and run the verb again.
+    Watches the robot on DDS or Zenoh, and writes its policy and the requirements that hold now
+    into FOLDER. Adds a production keystore with an enclave for each process, an export of the
+    enclaves without CA keys, and the files that start each process with security. Each step is a
+    command, which is printed. Existing files are kept: edit policy.xml and requirements.toml, and
+    run the verb again.
 
     Nothing is closed before --apply, which restarts the processes that are systemd units, and
     shows the commands for all others. --proof checks that every process was started in its enclave,
     that the files of the enclaves have no error, that everything that talked can still talk, and
-    that an open listener finds nothing; --apply does it too, if nothing is left to do by hand.
-    --undo goes back.
+    that an open listener finds nothing. --apply also proves this, if nothing is left to do by hand.
+    --undo makes the robot open again.
 
     Example:
       $ sros close robot --for 5m

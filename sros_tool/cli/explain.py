@@ -200,7 +200,8 @@ def _refuse_ignored(mode: str) -> None:
 @click.option(
     "--domain",
     metavar="ID",
-    help="The ROS domain. [default: $ROS_DOMAIN_ID, or the keystore's; with --who and --reach all]",
+    help="The ROS domain. [default: $ROS_DOMAIN_ID, or the keystore's; all domains with --who and "
+    "--reach]",
 )
 @click.option(
     "--time-zone",

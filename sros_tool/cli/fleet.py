@@ -264,8 +264,8 @@ def _collect(
     INBOX is a folder with ROBOT/confirmation.p7s of each robot that runs `sros agent`. sros reads
     only the messages of robots in the fleet of KEYSTORE. It accepts the message of a robot if an
     enclave of that robot signed it, with a certificate that this keystore issued and did not
-    revoke, and if the message is later than the robot's last one. It signs requests for renewal if
-    the fleet file has renewal = "allowed" for the robot; rights do not change. A refused message
+    revoke. The message must be later than the robot's last message. It signs requests for renewal
+    if the fleet file has renewal = "allowed" for the robot; rights do not change. A refused message
     does not stop the others.
 
     Example:
@@ -596,10 +596,10 @@ def _status(
     DDS has known vulnerabilities that a later release of the same major version fixes, by the
     advisories of sros; --robot and --advisories list them.
 
-    sros counts the revocation list as in force on a robot if the robot has the list, or an earlier
-    one that revokes the same, and its confirmation says that no process has to restart for it.
-    `sros agent` tells processes that lack the list from those that lack only new permissions,
-    governance or certificates of their own; in other confirmations, every due restart counts.
+    The revocation list is in force on a robot if the robot has the list, or an earlier list that
+    revokes the same certificates, and confirms that no process has to restart for it. `sros agent`
+    confirms for each process whether the process lacks the list. In other confirmations, every
+    restart that is due counts as one for the list.
 
     Example:
       $ sros fleet status keystore

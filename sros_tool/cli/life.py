@@ -60,10 +60,9 @@ _crl_option = click.option(
 @click.option(
     "--all-expiring",
     metavar="DURATION|PERCENT|soon",
-    help="Renew the enclaves that expire within DURATION (30d), have used PERCENT of their "
-    "validity (66%), or expire within 30 days or, if that is shorter, a third of the validity "
-    "that the keystore gives (soon), in addition to those that are named. Short-lived enclaves are "
-    "renewed only if named.",
+    help="Renew the named enclaves, and all that expire within DURATION (30d) or have used PERCENT "
+    "of their validity (66%). `soon`: within 30 days, or a third of the validity that the "
+    "keystore gives, if that is shorter. Short-lived enclaves are renewed only if named.",
 )
 @click.option("--new-key", is_flag=True, help="Also create new private keys.")
 @key_option

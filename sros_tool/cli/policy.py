@@ -291,7 +291,7 @@ def diff_policy(
     With --no-new-access, A and B can also be folders of policies, and policies at a git revision,
     as git:REVISION:PATH. The exit status is 0 only if B gives no enclave access that A does not
     give, for any vendor, domain or name, assigns no node to an enclave with more rights, and
-    protects nothing less; it is 2 if that cannot be decided. sros assumes that a policy is signed
+    protects nothing less. It is 2 if sros cannot decide this. sros assumes that a policy is signed
     with a governance that controls all access. If A is a policy, a keystore B that protects less
     than the template production counts as giving more access; a policy B never lowers the
     protection. The last line says what is assumed and what is left out, such as dates. "!" marks a

@@ -209,9 +209,9 @@ def review(
     hold, and those that HEAD drops, and compares all access with the commit BASE. PATHs are
     relative to the top of the repository.
 
-    Both commits are read from git itself: nothing is checked out, files of the work tree are read
-    only to report that they differ, no link in a commit is followed, and nothing that the
-    repository has or configures is run. The result names everything that was not reviewed.
+    Both commits are read from git itself: nothing is checked out, and files of the work tree are
+    read only to report that they differ. No link in a commit is followed, and no program of the
+    repository or its configuration is run. The result names everything that was not reviewed.
 
     Example:
       $ sros review --base refs/remotes/origin/main --policy robot/robot.xml

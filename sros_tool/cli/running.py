@@ -317,7 +317,7 @@ def run(
     The enclave is checked first, so that problems are reported here and not by an obscure message
     of the middleware. A COMMAND that is known to start a ROS node (`ros2 run`, or an executable of
     a ROS package) gets the arguments `--ros-args --enclave ENCLAVE`, so that the ROS graph shows
-    the enclave; with rmw_zenoh_cpp, other processes do not accept a node without these arguments
+    the enclave. With rmw_zenoh_cpp, other processes do not accept a node without these arguments
     into their graph.
 
     With --policy, COMMAND has to name its node: `--ros-args -r __node:=NAME -r __ns:=NAMESPACE`, as

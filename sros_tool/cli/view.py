@@ -159,8 +159,8 @@ def view(
     compares the rights in SOURCE with those that are used. --focus shows who may use a name, and
     who can influence those enclaves.
 
-    In a keystore with more than 1,000 enclaves, robots that differ only in names are not all read
-    in full: for most of them, only the text of the permissions is compared, and the page says so.
+    In a keystore with more than 1,000 enclaves, sros reads only some of the robots that differ only
+    in names. For the others, it compares the text of the permissions, and the page says so.
     --json, --focus, --requirements, --observed and comparisons read everything.
 
     The page is one file that needs no network. No format contains keys or paths of this machine.

@@ -204,7 +204,8 @@ def _do(robot: LocalRobot, step: CommandStep) -> tuple[str, list[str]]:
         remedy = "; nothing was signed" if step.guards else ""
         if VIOLATED.id in output:
             needed = shlex.quote(str(robot.requirements))
-            remedy += f"; if you want the change, edit {needed}, or remove it for new ones"
+            remedy += f"; if you want the change, edit {needed}, or remove this file to get "
+            remedy += "new requirements"
         return "findings", [f"findings of `{step.command}`{remedy}"]
     if step.into:
         replace_file(step.into, output.encode())
@@ -269,9 +270,9 @@ def _keystore_problems(robot: LocalRobot) -> Iterator[str]:
         if name not in known:
             revoke = f"sros revoke {shlex.quote(str(robot.keystore))} {name}"
             yield (
-                f"the policy does not have {name}, and the keystore does: if nothing needs it "
-                f"any more, {revoke}; if it belongs to another machine, such as a laptop, "
-                f"{robot.close_command} --elsewhere {name}; if it belongs to this machine, sros "
+                f"the keystore has {name}, and the policy does not. If nothing needs it any more: "
+                f"{revoke}. If it belongs to another machine, such as a laptop: "
+                f"{robot.close_command} --elsewhere {name}. If it belongs to this machine: sros "
                 f"merge_policy {shlex.quote(str(robot.policy))} ITS_POLICY --in-place"
             )
 
@@ -321,15 +322,15 @@ def _unknown_process_problems(robot: LocalRobot, state: CloseState) -> Iterator[
     if routers and not any(process.is_router for process in observed.processes):
         yield (
             f"{routers[0].label} is a Zenoh router that did not run when sros watched, or is not "
-            f"of the robot; watch again while it runs, or stop it: {close} --for 1m; otherwise "
-            "closed nodes do not reach each other by it (accept: --partial)"
+            f"of the robot. Watch again while it runs, or stop it: {close} --for 1m. Otherwise "
+            "closed nodes do not reach each other through this router (accept: --partial)"
         )
     pids = {process.enclave: process.pid for process in observed.processes}
     if twice := sorted(pids.keys() & {*observed.elsewhere}):
         yield (
-            f"nodes of {twice[0]} are in process {pids[twice[0]]} and in another one that "
-            "sros does not see: if another robot is in this ROS domain, switch it off, or "
-            "give it a domain of its own, remove the rights that it added to "
+            f"nodes of {twice[0]} are in process {pids[twice[0]]} and in another process "
+            "that sros does not see. If another robot is in this ROS domain, switch it off, or "
+            "give it a domain of its own. Then remove the rights that it added to "
             f"'{robot.policy}', and watch again: {close} --for 1m"
         )
     if only_there := [name for name in observed.elsewhere if name not in twice]:
@@ -353,9 +354,9 @@ def _shared_program_problems(robot: LocalRobot) -> Iterator[str]:
             yield (
                 f"{shlex.join(processes[0].command)} starts the processes of "
                 f"{enumerated(enclaves)}, and all of them would run in one enclave; nothing "
-                f"was signed; in '{robot.policy}', move their profiles into one of these "
+                f"was signed. In '{robot.policy}', move their profiles into one of these "
                 "enclaves, which then has the rights of all, and remove the other "
-                "enclaves; or let the program start each process with the method spawn after "
+                "enclaves. Or let the program start each process with the method spawn after "
                 f"setting {ENCLAVE} in os.environ, and watch again: "
                 f"{robot.close_command} --for 1m"
             )
@@ -381,9 +382,9 @@ def _shared_node_problems(robot: LocalRobot) -> Iterator[str]:
         if len(twins) > 1:
             yield (
                 f"{enumerated([*twins.values()])} call themselves {enclave}, and the enclave of "
-                "this name would have the rights of all; nothing was signed; if one is not of the "
-                f"robot, stop it, remove '{robot.policy}', and watch again: {robot.close_command} "
-                "--for 1m; if all are, accept it: --partial"
+                "this name would have the rights of all; nothing was signed. If one process is not "
+                f"of the robot, stop it, remove '{robot.policy}', and watch again: "
+                f"{robot.close_command} --for 1m. If all are of the robot: --partial"
             )
 
 

@@ -168,8 +168,8 @@ def _without_enclave_text(robot: LocalRobot, names: Sequence[str]) -> str:
     """Return, as a sentence, which nodes the graph shows without an enclave."""
     return (
         f"{first_few(names, MOST_NAMES)}: the identifier of the participant is that of a secured "
-        f"one, so '{robot.policy}' has no rights for this node; if it is of the robot, start it "
-        f"open, and watch again: {robot.close_command} --for 1m"
+        f"process, so '{robot.policy}' has no rights for this node. If the node is of the robot, "
+        f"start it open, and watch again: {robot.close_command} --for 1m"
     )
 
 

@@ -66,8 +66,8 @@ _DENY_RULE = "deny-rule"
 _USE = "use"
 ON_ZENOH = Note(
     "audit.on-zenoh",
-    "these nodes run on Zenoh, and sros decided by the rules of a DDS vendor; on Zenoh, the files "
-    "of `sros zenoh` decide, which state the same rights if `sros zenoh KEYSTORE --check` finds "
+    "these nodes run on Zenoh, and sros decided by the rules of a DDS vendor. On Zenoh, the files "
+    "of `sros zenoh` decide; they state the same rights if `sros zenoh KEYSTORE --check` finds "
     "them up to date",
 )
 

@@ -241,7 +241,7 @@ _ELSEWHERE = "not proposed, because the log names another enclave than --enclave
 _SEVERAL = Note(
     "log.several-enclaves",
     "the log names several enclaves, and each denial is assigned to the enclave that its process "
-    "named last; check that no two processes wrote to the log at the same time without a label, "
+    "named last. Check that no two processes wrote to the log at the same time without a label, "
     "such as the [talker-1] of ros2 launch",
 )
 

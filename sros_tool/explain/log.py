@@ -986,7 +986,7 @@ def _renaming_advice(nodes: Sequence[str], wrong: str) -> str:
     meant = likely_enclaves(wrong, nodes) or nodes
     ns, _, name = meant[0].rpartition("/")
     rules = f"`--ros-args -r __node:={quote(name)} -r __ns:={quote(ns or '/')}`"
-    start = f"Start it under that name ({rules})"
+    start = f"Start the node under that name ({rules})"
     if len(nodes) > 1:
         # rcl looks for the rule of the namespace under the new name.
         rules = f"`--ros-args -r {quote(wrong.rpartition('/')[2])}:__node:={quote(name)} "

@@ -502,7 +502,7 @@ _SHOWN = 5
 _TEXTS = {
     "ambiguous": "nodes with the same name run in several enclaves, and the graph does not show "
     "which node runs in which enclave, so each of these enclaves gets the rights of all these "
-    "nodes; to tell them apart, start one node at a time under --watch: {}",
+    "nodes. To tell them apart, start one node at a time under --watch: {}",
     "changing-name": "nodes whose name changes with every start have a profile with a wildcard: {}",
     "half-service": "left out, because only the request or the reply of these services was "
     "observed; observe again with a longer --spin-time: {}",
@@ -513,10 +513,10 @@ _TEXTS = {
     "partial-action": "only parts of an action are used, so they are listed as "
     "topics and services: {}",
     "root-enclave": "the ROS graph shows the enclave / for {}, so the policy gives all these "
-    "rights to /, and every process without an enclave has them; either the processes were started "
-    "without an enclave, or ROS_SECURITY_ENCLAVE_OVERRIDE (as by sros run and sros env) names one, "
-    "which the graph does not show; --enclave-per-node gives each process an enclave of its own, "
-    "with the name of its node",
+    "rights to /, and every process without an enclave has them. Either the processes were started "
+    "without an enclave, or ROS_SECURITY_ENCLAVE_OVERRIDE (as `sros run` and `sros env` set it) "
+    "names an enclave that the graph does not show. --enclave-per-node gives each process an "
+    "enclave of its own, with the name of its node",
     "service-event": "service introspection is on: every subscriber of these topics can read the "
     "requests; remove the topics from the policy if introspection is for debugging only: {}",
     "sets-clock": "these nodes may set the clock of every node that uses simulated time; only a "
@@ -665,7 +665,7 @@ def _notes(
         yield Note(
             "graph.shared-enclave",
             "several processes share an enclave, which gets the rights of all of them, because "
-            "their nodes have the same name; unless it is a single process that was restarted, "
+            "their nodes have the same name. Unless it is a single process that was restarted, "
             "give the nodes different names (-r __node:=NAME), or start each process with "
             "--ros-args --enclave: "
             f"{first_subjects(shared)}",

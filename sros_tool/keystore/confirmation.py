@@ -441,7 +441,7 @@ class Received:
             return ""
         if ahead > timedelta():
             return f"its clock is {elapsed(ahead)} ahead"
-        delay_clause = "or its confirmation was on its way that long"
+        delay_clause = "or its confirmation took that long to arrive"
         return f"its clock is {elapsed(-ahead)} behind, {delay_clause}"
 
 
@@ -508,10 +508,10 @@ def refuse_older(keystore: OpenedKeystore, received: Received) -> None:
 
 @contextmanager
 def locked_confirmations(root: Path) -> Iterator[None]:
-    """Lock the confirmations of a keystore: nobody else keeps one until the body ends.
+    """Lock the confirmations of a keystore: no other process stores any until the body ends.
 
     Raises:
-        KeystoreError: another process keeps confirmations, and does not end.
+        KeystoreError: another process holds the lock, and does not end.
     """
     with Folder(root, for_owner=True) as folder:
         if not folder.is_folder(CONFIRMED):

@@ -353,9 +353,9 @@ class LedgerFile:
         return self._reading(f'"{name}":{_quoted(value)}'.encode(), [(name, value)]).ledger
 
     def with_values(self, name: str, values: Collection[str]) -> Ledger:
-        """Return the ledger with at least the entries whose field ``name`` has one of ``values``.
+        """Return the ledger, at least the entries whose field ``name`` has one of ``values``.
 
-        Without an index, or for very many values, it is the whole ledger, if it is complete.
+        Without an index, or for very many values, a complete ledger is returned whole.
 
         Raises:
             KeystoreError: the file cannot be read at all.
@@ -952,10 +952,10 @@ def _too_large_error(path: Path) -> KeystoreError:
         f"the ledger '{path}' is too large",
         f"It has more than {_MOST_BYTES // 1024**2} MiB or {_MOST_LINES} lines.",
         f"If it belongs to this keystore, move {LEDGER}, its parts and {LEDGER_HEAD} to an "
-        f"archive, state all rights again with `sros generate_artifacts -k {quote(str(root))} -p "
-        f"POLICY_FILE`, and replace the CAs with `sros rotate_ca {quote(str(root))} --next`, so "
-        "that files that the new ledger lacks are no longer valid. Otherwise restore it from a "
-        "backup.",
+        f"archive, and state all rights again with `sros generate_artifacts -k {quote(str(root))} "
+        f"-p POLICY_FILE`. Then replace the CAs with `sros rotate_ca {quote(str(root))} --next`: "
+        "files that the new ledger lacks are then no longer valid. If the ledger does not belong "
+        "to this keystore, restore it from a backup.",
     )
 
 

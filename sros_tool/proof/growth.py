@@ -762,11 +762,11 @@ class AccessByVendors:
         domain: int,
         names: Collection[str],
     ) -> Iterator[Gain]:
-        """Yield the topics that an enclave may use by one of ``after``, and by none of ``before``.
+        """Yield the topics that an enclave may use by ``after``, but not by ``before``.
 
-        ``after`` has the permissions that fit the enclave's certificate as ``vendor`` decides,
-        ``before`` the same for another vendor.  ``names`` are the names that the permissions state
-        without wildcards.
+        ``after`` has the permissions that fit the enclave's certificate by the rules of
+        ``vendor``, ``before`` those that fit it by the rules of another vendor.  ``names`` are the
+        names that the permissions state without wildcards.
 
         Raises:
             DocumentError: there are too many wildcards to decide.

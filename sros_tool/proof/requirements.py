@@ -489,7 +489,7 @@ class _Table:
         for name in names:
             problem = expression_problem(name)
             if not problem and name[0] == "~":
-                problem = "It is a name of one node, which a requirement does not name."
+                problem = "It is relative to a node (~), and a requirement is about no single node."
             if not problem and name == "/":
                 problem = "It is a namespace."
             if problem:

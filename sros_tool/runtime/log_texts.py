@@ -157,7 +157,7 @@ _DENIED_ENDPOINT = (
 )
 _FIND_TOPIC = (
     "Look for an earlier line that names the topic, on standard output or in the file of "
-    "ROS_SECURITY_LOG_FILE; or run the node without security, and `sros audit KEYSTORE`, which "
+    "ROS_SECURITY_LOG_FILE. Or run the node without security, and `sros audit KEYSTORE`, which "
     "names everything that the node would be denied."
 )
 
@@ -204,8 +204,8 @@ _ROS_TEXTS = (
     _log_text(
         "files-missing", _ROS, r"could not find all security files",
         "a file of the enclave is missing, a broken link, or closed to the user of this process; "
-        "the message does not say which. rmw_cyclonedds starts no node then, but if "
-        "ROS_SECURITY_STRATEGY is not exactly Enforce, the node RUNS UNSECURED",
+        "the message does not say which. If ROS_SECURITY_STRATEGY is not exactly Enforce, the node "
+        "RUNS UNSECURED (except with rmw_cyclonedds, which then starts no node)",
         "`sros explain KEYSTORE ENCLAVE join` names the file and the command that restores it; on "
         "a robot, export the enclave again.", _FILE_FAULTS,
         refuses=RefusedObject.PARTICIPANT,
@@ -753,9 +753,9 @@ NO_ENCLAVE = _log_text(
 """The meaning of `files-missing` in a process that named no enclave."""
 RUNS_OPEN = _log_text(
     "runs-open", _ROS, "",
-    "no enclave is named for this process: unless the keystore has an enclave /, it RUNS UNSECURED "
-    "if ROS_SECURITY_STRATEGY is not exactly Enforce, without any further message; with Enforce it "
-    "does not start",
+    "no enclave is named for this process, so it gets the enclave /. If the keystore has no "
+    "enclave /, the process does not start with ROS_SECURITY_STRATEGY=Enforce; with any other "
+    "value, it RUNS UNSECURED without a further message",
     f"If it runs, stop it. Then {_NAME_ENCLAVE}", vagueness=4,
 )  # fmt: skip
 """The meaning of rcl's line about the enclave /, in a log without an error after it."""

@@ -296,9 +296,9 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     mine = robot.folder / "robot/start/mine.env"
     mine.write_text("A=1\n")
     first = robot.close("--apply", status=1)
-    assert "the policy does not have /listener, and the keystore does: if nothing" in first.out
+    assert "the keystore has /listener, and the policy does not. If nothing needs" in first.out
     assert (
-        f"{revoke}; if it belongs to another machine, such as a laptop, sros close r" in first.out
+        f"{revoke}. If it belongs to another machine, such as a laptop: sros close r" in first.out
     )
     assert (
         "removed robot/start/listener.env: it was for an enclave without a " in first.err
@@ -814,7 +814,7 @@ def test_a_node_of_another_robot_is_not_proposed_for_another_machine(robot: Robo
     """Its enclave is that of a process of this machine, whose key would leave the export."""
     robot.nodes += (ros_node("talker", "010f7f02671200000000", "publish rt/chatter"),)
     ended = robot.close(status=1)
-    assert "nodes of /talker are in process 4711 and in another one" in ended.out
+    assert "nodes of /talker are in process 4711 and in another process" in ended.out
     assert "--elsewhere" not in ended.out
 
 
@@ -913,7 +913,7 @@ def test_a_node_whose_enclave_the_graph_does_not_show_is_named(robot: Robot) -> 
     """Any participant can have an identifier that looks like that of a secured one."""
     robot.nodes += (ros_node("ghost", "8f0f0000681200000000", "publish rt/cmd_vel"),)
     said = robot.close(status=1).out
-    assert "/ghost: the identifier of the participant is that of a secured one, so 'rob" in said
+    assert "/ghost: the identifier of the participant is that of a secured process, so 'rob" in said
     robot.by_hand = set(PID)
     robot.nodes = (TALKER, LISTENER)
     assert (

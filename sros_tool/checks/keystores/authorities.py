@@ -347,7 +347,8 @@ CRL_LACKS = FindingKind(
     "An earlier list was put back, or the list was removed: every process that loads it accepts "
     "these certificates.",
     "RFC 5280, 5; sros: ledger.jsonl has all revocations.",
-    "Find out who changed it, and run `sros crl KEYSTORE --refresh`, which revokes them again.",
+    "Find out who changed the list, and run `sros crl KEYSTORE --refresh`, which revokes the "
+    "certificates again.",
 )
 CRL_ISSUER = FindingKind(
     "keystore.revocation-list-issuer",

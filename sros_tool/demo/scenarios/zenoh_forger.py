@@ -114,7 +114,7 @@ def _give_rights_to_everybody(router: str) -> _Change:
 
 
 def subject_for_everybody(copy: KeystoreCopy) -> None:
-    """Let another enclave play the router, and believe everybody who does."""
+    """Let another enclave be the router, and let the sessions accept every enclave as router."""
     another_router(copy)
     for name, path in _files(copy).items():
         if name not in (copy.router, copy.enclave("guest")):

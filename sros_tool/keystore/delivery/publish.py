@@ -607,14 +607,15 @@ class _Run:
         """Refuse a folder that has, or may have had, later releases than the keystore knows.
 
         With ``restored`` (the keystore comes from a backup), later releases are not refused, and
-        what they revoke is revoked again.  A folder without any release is refused unless the user
-        says ``new_folder``.  In both cases, numbers and versions go on from the seconds since
-        1970: nobody knows which were given before.
+        the enclaves that they revoke are revoked again.  A folder without any release is refused
+        without ``new_folder``.  In both cases, numbers and versions go on from the seconds since
+        1970, because the numbers that the earlier keystore gave are not known.
 
         Raises:
-            DocumentError: the list of what is published has numbers that were never given.
-            KeystoreError: the keystore was restored from a backup, or nothing shows that, although
-                ``restored`` says so, or it cannot be told what the later releases revoke.
+            DocumentError: the list of published releases has numbers that were never given.
+            KeystoreError: the keystore was restored from a backup, but ``restored`` is false; or
+                ``restored`` is true, but nothing shows a restore; or the enclaves that the later
+                releases revoke cannot be read.
         """
         is_lost = self._published_before and not self._present.timestamp
         if is_lost and not new_folder:

@@ -95,9 +95,9 @@ _NAME_ROOT = (
 
 
 class Roots:
-    """The versions of the root metadata, oldest first, each signed by the keys of the one before.
+    """The versions of the root metadata, oldest first; the keys of each version sign the next.
 
-    A robot that knows any of them gets to the last one.
+    A robot that has any version can verify the last version.
     """
 
     def __init__(self, documents: Sequence[Mapping[str, object]] = ()) -> None:

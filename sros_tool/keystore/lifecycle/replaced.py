@@ -65,7 +65,7 @@ class ReplacedRights:
     permissions that the ledger lacks may work longer."""
 
     def revoked(self) -> ReplacedRights:
-        """Return a copy for an enclave whose earlier certificate is revoked."""
+        """Return these rights as they are once the enclave's earlier certificate is revoked."""
         return replace(self, works_until=None)
 
     def lost_text(self, fleet: Fleet | None = None) -> str:
