@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from sros_tool.automata import SearchLimit
@@ -24,13 +24,14 @@ from sros_tool.names import (
     is_expression,
     service_of,
 )
-from sros_tool.policy.model import Source
+from sros_tool.policy.model import ALLOW, Source
 from sros_tool.policy.rights import KIND_OF, Right
 from sros_tool.proof.decide import MOST_STEPS, KeptUse, Use, Verdict, Witness, Worlds
 from sros_tool.proof.requirements import (
     Apart,
     AtMost,
     Must,
+    Nobody,
     NotBoth,
     Only,
     Protected,
@@ -230,8 +231,8 @@ def decided_findings(
     findings = [_violation_finding(violation) for violation in decided.violations]
     findings += [_vacuous_finding(requirement, why) for requirement, why in decided.vacuous]
     if decided.unnamed:
-        known = {f"{right.kind.removesuffix('s')} {right.name}" for right in before}
-        findings += [_unnamed_finding(*unnamed, known) for unnamed in decided.unnamed]
+        allowed = [right for right in before if right.qualifier is ALLOW]
+        findings += [_unnamed_finding(*unnamed, allowed) for unnamed in decided.unnamed]
     findings += [_assumption_finding(*assumption) for assumption in decided.assumed]
     findings += [_not_crossing_finding(*kept_use) for kept_use in decided.kept]
     if system.is_export:
@@ -375,18 +376,34 @@ def _listed_names(names: Sequence[str]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
-def _vacuous_finding(requirement: Requirement, why: Sequence[str]) -> Finding:
+def _vacuous_finding(requirement: Requirement, why: Sequence[str], remedy: str = "") -> Finding:
     place = requirement.source
     text = f"{'; '.join(why)}: {demand(requirement)}"
-    return VACUOUS.found(place.file, text, place.file, place.line)
+    return VACUOUS.found(place.file, text, place.file, place.line, remedy)
+
+
+_GONE = (
+    "If the name is another one now, write this in the requirement, too. If nobody uses the name "
+    "any more, approve this in the review."
+)
 
 
 def _unnamed_finding(
-    requirement: Requirement, names: Sequence[str], known_before: Container[str]
+    requirement: Requirement, names: Sequence[str], allowed_before: Iterable[Right]
 ) -> Finding:
     place = requirement.source
+    # A right that the requirement forbids had to go.
+    forbidden = (
+        {right for right, _ in requirement.rights} if isinstance(requirement, Nobody) else ()
+    )
+    known_before = {
+        f"{right.kind.removesuffix('s')} {right.name}"
+        for right in allowed_before
+        if right.right not in forbidden
+    }
     if gone := [name for name in names if name in known_before]:
-        return _vacuous_finding(requirement, [f"no right names {_listed_names(gone)} any more"])
+        why = f"no right names {_listed_names(gone)} any more"
+        return _vacuous_finding(requirement, [why], _GONE)
     text = f"no right names {_listed_names(names)}: {demand(requirement)}"
     return UNNAMED.found(place.file, text, place.file, place.line)
 

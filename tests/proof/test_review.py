@@ -889,6 +889,18 @@ def test_a_change_renames_nothing_out_of_a_requirement(change: Change) -> None:
     assert "any more" not in change.review(*words).out
 
 
+def test_a_name_that_nobody_may_use_may_lose_its_denial_and_its_right(change: Change) -> None:
+    required = '[[nobody]]\npublish = ["/q"]\n'
+    denied = policy_text({"/a": publish("/x") + DENIES})
+    change.base = change.commit({"robot.xml": denied, "robot.toml": required})
+    words = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
+    change.commit({"README": "x"})
+    assert "no right names topic /q" not in change.review(*words).ok().out
+    change.base = change.commit({"robot.xml": policy_text({"/a": publish("/x", "/q")})})
+    change.commit({"robot.xml": policy_text({"/a": publish("/x")})})
+    change.review(*words).ok()
+
+
 def test_a_node_moves_out_of_no_requirement(change: Change) -> None:
     """Of the enclaves that a pattern stands for, one stays, so that the pattern is not empty."""
     inside = {"/third/lidar": publish("/scan"), "/third/cam": publish("/image")}
