@@ -258,8 +258,9 @@ _ANNOTATIONS = {"error": "error", "warning": "warning", "note": "notice"}
 def github_annotations(findings: Iterable[Finding]) -> str:
     """Return workflow commands of GitHub Actions, which show each finding at its line.
 
-    The worst come first, because GitHub shows ten of each severity.  No text of a finding begins a
-    line or a property (GitHub, actions/toolkit, command.ts).
+    The worst findings come first, because GitHub shows ten of each severity.  The text of a finding
+    is escaped, so that it cannot begin a command or a property (GitHub, actions/toolkit,
+    command.ts).
     """
 
     lines = []

@@ -67,8 +67,8 @@ SESSION_WITHOUT_RULES = FindingKind(
     ERROR,
     "a session without access control",
     "Anyone who impersonates the router, or in mode peer connects to the session directly, can "
-    "read everything that it publishes and send it anything. The rules of the real router do not "
-    "apply.",
+    "read everything that the session publishes and send it anything. The rules of the real router "
+    "do not apply.",
     _TESTED,
     _BY_SROS,
 )

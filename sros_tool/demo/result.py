@@ -636,7 +636,7 @@ class DemoResult:
 
     @property
     def exit_status(self) -> int:
-        """Exit status: 0 all as expected, 1 a row was not, `NOT_DONE` a keystore was not proved."""
+        """The exit status: 0 if all rows are as expected, 1 if one is not, else `NOT_DONE`."""
         if any(scenario.wrong for scenario in self.scenarios):
             return 1
         return 0 if self.as_expected else NOT_DONE

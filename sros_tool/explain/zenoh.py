@@ -277,7 +277,7 @@ class WhoOnZenoh(NamedTuple):
     question: str
     """The question."""
     vendor: Literal["zenoh"]
-    """Zenoh."""
+    """Always ``"zenoh"``."""
     vendor_why: str
     """Why Zenoh was chosen."""
     domain: int | None
@@ -1026,7 +1026,7 @@ class ZenohExplanation(NamedTuple):
 
     @property
     def vendor(self) -> Literal["zenoh"]:
-        """Zenoh."""
+        """Always ``"zenoh"``."""
         return "zenoh"
 
     @property

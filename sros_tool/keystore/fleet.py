@@ -63,9 +63,9 @@ def load_fleet(keystore: OpenedKeystore) -> Fleet | None:
 
 
 def stated_distributions(keystore: OpenedKeystore, enclave: str) -> tuple[str, ...]:
-    """Return the ROS 2 distributions that an enclave is for; () if nothing states any.
+    """Return the ROS 2 distributions that an enclave is for; () if they are not stated.
 
-    They are the distribution of its robot in the fleet, or else those in the keystore's settings.
+    The fleet file can state the distribution of a robot; otherwise the keystore's settings count.
 
     Raises:
         SrosError: the fleet or the settings cannot be read.

@@ -573,7 +573,11 @@ def check_keystore(root: Path) -> None:
         if not root.exists():
             parent = next((path for path in root.parents[-2::-1] if not path.exists()), None)
             why = "It does not exist."
-            why += f" Nor does '{parent}': its disk may not be mounted." if parent else ""
+            why += (
+                f" The folder '{parent}' does not exist either: its disk may not be mounted."
+                if parent
+                else ""
+            )
         raise KeystoreError(f"'{root}' is not a valid keystore", why, _wrong_path_remedy(root))
 
 

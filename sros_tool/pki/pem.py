@@ -70,7 +70,7 @@ def blocks(data: bytes) -> Iterator[Block]:
 def read_as_text(data: bytes) -> bytes:
     """Return a PEM file as OpenSSL sees it when it reads lines from a FILE pointer (bss_file.c).
 
-    A zero byte ends its line, and a line that begins with a zero byte the whole file.
+    A zero byte ends its line.  A line that begins with a zero byte ends the whole file.
     """
     if b"\0" not in data:
         return data

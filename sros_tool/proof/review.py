@@ -202,7 +202,7 @@ class Facts:
 
     @property
     def lines(self) -> tuple[tuple[str, str], ...]:
-        """All facts."""
+        """The failing facts, and then the facts that are only named."""
         return self.failing + self.named
 
 

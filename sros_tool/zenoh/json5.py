@@ -236,7 +236,7 @@ def _unescaped(text: str, line: int) -> str:
     try:  # two escapes may be the halves of one character
         return text.encode("utf-16", "surrogatepass").decode("utf-16")
     except UnicodeDecodeError:
-        raise Json5Error("a text with half a character", line) from None
+        raise Json5Error("a text with half a character (a lone surrogate)", line) from None
 
 
 def _number_of(token: _Token) -> float:

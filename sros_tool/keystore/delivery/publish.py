@@ -331,7 +331,7 @@ class _Keys:
         return self.roots.has_key("root", signer)
 
     def open(self, rotate: Collection[str], now: datetime, expiry: MetadataExpiry) -> None:
-        """Open or make the key of each role, and add a version of the root if they change.
+        """Open or make the key of each role, and add a version of the root if a key changes.
 
         Raises:
             KeystoreError: a key is missing, or is not the one that the root metadata names.
