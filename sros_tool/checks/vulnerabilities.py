@@ -196,7 +196,7 @@ def vulnerability_metrics(
         Metric(
             "sros_dds_known_vulnerabilities",
             "Number of known vulnerabilities of a DDS that processes have loaded, without regard "
-            "to fixes of a package; of several releases, the largest.",
+            "to fixes of a package. If several releases are loaded: that of the most vulnerable.",
             tuple(Sample(number, {"product": name}) for name, number in sorted(most.items())),
         ),
         Metric(

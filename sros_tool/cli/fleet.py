@@ -400,7 +400,7 @@ _VALIDITIES = {
     "--root-key",
     type=PATH,
     metavar="FILE",
-    help="The root key, if it is not in the keystore; it is created there the first time.",
+    help="File of the root key, to keep the key outside of the keystore; created the first time.",
 )
 @click.option(
     "--rotate-key",

@@ -335,7 +335,7 @@ class StatedProtection:
 def stated_protections(enclaves: Iterable[Enclave]) -> tuple[StatedProtection, ...]:
     """Return the protection levels that enclaves require for names, in order, without duplicates.
 
-    What an enclave says several times is returned once, with the first place.
+    A level that an enclave states several times is returned once, with the first place.
     """
     protections: dict[StatedProtection, None] = {}
     for enclave in enclaves:

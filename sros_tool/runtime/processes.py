@@ -207,7 +207,7 @@ _RMW_OF = {
 class UnseenProcess(NamedTuple):
     """A process that could not be examined; ``why`` is a clause.
 
-    ``speaks`` says whether its command shows that it uses ROS 2; if not, that is unknown.
+    ``speaks`` is true if its command shows that it uses ROS 2; false means unknown.
     """
 
     pid: int
