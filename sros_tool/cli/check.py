@@ -151,8 +151,8 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
     metavar="NS",
     multiple=True,
     help="With --requirements: put the enclaves of the file, and its names without '/' at the "
-    "beginning, into this namespace, such as /left.  Can be repeated: the requirements have to hold "
-    "in each namespace.",
+    "beginning, into this namespace, such as /left.  Can be repeated: the requirements "
+    "have to hold in each namespace.",
 )
 @click.option(
     "--template",

@@ -287,7 +287,7 @@ class _System:
             yield kind, word
 
     def focus(self, kind: str, name: str) -> Focus:
-        """Return the users of a name and their influencers, or the influences on and of an enclave."""
+        """Return who may use a name and influence its users, or the influences of an enclave."""
         if kind == _ENCLAVE:
             influencing = self._influences(self._network.influencers_of({name}))
             influenced = self._influences(self._network.influenced_by({name}), 0)
