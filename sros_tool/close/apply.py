@@ -62,7 +62,11 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
         return state
     running = current_state(robot, robot.read_policy())
     return state._replace(
-        proofs=proofs, observed=running.observed, secured=running.secured, new=running.new
+        proofs=proofs,
+        observed=running.observed,
+        secured=running.secured,
+        new=running.new,
+        absent=running.absent,
     )
 
 

@@ -2,7 +2,8 @@
 
 A rule is that of ``--ros-args -r`` (ROS 2 design, "Static Remapping"): ``[NODE:]FROM:=TO``, where
 ``__node`` and ``__ns`` stand for name and namespace of a node.  Both names are relative to the node
-unless they are absolute, and the first rule that fits a name counts.
+unless they are absolute, and the first rule that fits a name counts.  A rule with NODE, other than
+one of ``__node``, is for the node that has this name after ``__node`` (rcl, node.c).
 """
 
 from __future__ import annotations
@@ -68,12 +69,13 @@ def remapped_policy(policy: Policy, rules: Sequence[Remapping]) -> tuple[Policy,
     used: set[Remapping] = set()
 
     def remapped(profile: Profile) -> Profile:
-        of_node = [rule for rule in rules if rule.node in ("", profile.node)]
-        own = {rule.old: rule for rule in reversed(of_node) if rule.old in (_NODE, _NAMESPACE)}
-        used.update(own.values())
-        node = own[_NODE].new if _NODE in own else profile.node
-        ns = own[_NAMESPACE].new if _NAMESPACE in own else profile.ns
-        of_names = [rule for rule in of_node if rule.old not in own]
+        renamed = [rule for rule in rules if rule.old == _NODE and rule.node in ("", profile.node)]
+        node = renamed[0].new if renamed else profile.node
+        of_node = [rule for rule in rules if rule.old != _NODE and rule.node in ("", node)]
+        moved = [rule for rule in of_node if rule.old == _NAMESPACE]
+        ns = moved[0].new if moved else profile.ns
+        used.update(renamed[:1] + moved[:1])
+        of_names = [rule for rule in of_node if rule.old != _NAMESPACE]
         groups = tuple(_remapped_group(group, of_names, ns, node, used) for group in profile.groups)
         return replace(profile, ns=ns, node=node, groups=groups)
 

@@ -784,19 +784,28 @@ def test_applying_that_is_interrupted_goes_on_or_back(
 
 
 @sometimes("a_unit_that_does_not_run_is_not_called_open", 1 / 2)
-def test_a_unit_that_does_not_run_is_not_called_open(robot: Robot) -> None:
+def test_a_unit_that_does_not_run_is_not_called_open(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its process failed, as after a start with a missing file; its earlier id means nothing."""
     robot.units = UNITS
     robot.close()
     robot.close("--apply")
     robot.absent = {"/listener"}
     unit = robot.units["/listener"]
-    proof = robot.close("--proof", status=1).out
-    assert f"of /listener ({unit} does not run it: systemctl status {unit}); start it" in proof
-    assert "--without" not in proof
+    said = robot.close("--proof", status=1).out
+    assert f"of /listener ({unit} does not run it: systemctl status {unit}); start it" in said
+    assert "--without" not in said
     ended = robot.close()
     assert "  /listener: not running: --apply restarts" in ended.out
     assert "in their enclaves, except for /listener (not running); the files" in ended.err
+
+    def proofs_of(*arguments: Any) -> Any:
+        robot.absent = set()
+        return proof.proofs_of(*arguments)
+
+    monkeypatch.setattr(apply, "proofs_of", proofs_of)
+    assert json.loads(robot.close("--apply", "--json").out)["absent"] == []
 
 
 @sometimes("units_that_do_not_restart_are_named", 1 / 2)

@@ -85,6 +85,7 @@ def test_a_policy_in_a_namespace(namespace: str, path: str, relative: str) -> No
         (["n:~/y:=~/q"], {"/x", "/n/q", "/z", "/w/*"}),
         (["other:x:=/front/x"], None),
         (["__node:=m", "__ns:=/left", "x:=a"], {"/left/a", "/left/m/y", "/z", "/w/*"}),
+        (["n:__node:=m", "n:x:=/old", "m:x:=/b"], {"/b", "/m/y", "/z", "/w/*"}),
         (["/w/a:=/b"], {"/x", "/n/y", "/z", "/w/*", "/b"}),
         (["/gone:=/b"], None),
     ],
