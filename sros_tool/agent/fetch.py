@@ -224,8 +224,8 @@ def _updater(state: Path, transport: HttpTransport | FolderTransport, now: datet
         raise FetchError(
             FetchProblem.NOT_SIGNED,
             f"'{state}' has no {_PINNED_ROOT}",
-            "Without it, the agent knows no key for the published files.",
-            "Give it to `sros agent init` with --root.",
+            "Without this file, the agent knows no key for the published files.",
+            "Give the file to `sros agent init` with --root.",
         )
     with Folder(state) as folder:
         if not folder.is_folder(_METADATA):

@@ -85,7 +85,7 @@ def agent() -> None:
     help="CA certificates of the servers. [default: the system's]",
 )  # fmt: skip
 @click.option(
-    "--new-key", is_flag=True, help="Make a new key for each renewal, instead of keeping it."
+    "--new-key", is_flag=True, help="Make a new key for each renewal. [default: the key stays]"
 )
 @click.option(
     "--restart", is_flag=True,

@@ -227,7 +227,7 @@ class _RemainingProcesses:
         if running.processes.hidden or any(not unseen.speaks for unseen in unseen_processes):
             why = "some processes cannot be looked at"
             by_root = running.processes.by_root
-            remedy = f". {ROOT_IS_NOT_ENOUGH}" if by_root else ": to be sure of them, ask as root"
+            remedy = f". {ROOT_IS_NOT_ENOUGH}" if by_root else ": ask as root, to see all processes"
             self._robot.shell.say(f"{why}{remedy}")
 
 

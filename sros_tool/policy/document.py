@@ -262,7 +262,7 @@ class Includer:
             selected = f'xpointer="xpointer(/{tag_of(target)}/*)"'
             raise PolicyError(
                 f"{where}: the include of {_short(href)} lacks {selected}",
-                f"Without it, a <{tag_of(target)}> would be in a <{tag_of(target)}>.",
+                f"Without xpointer, a <{tag_of(target)}> would be in a <{tag_of(target)}>.",
                 f'Write <{include} href="{href}" {selected}/>.',
             )
         linked = bool(href) and Path(os.path.normpath(place.file.parent / unquote(href))) != file

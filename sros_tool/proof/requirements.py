@@ -641,7 +641,7 @@ def _group_members(
             raise table.error(
                 key,
                 f"{placeholder} stands for no robot",
-                "With it, the requirement would demand nothing.",
+                "A requirement about no robot would demand nothing.",
                 "Name a robot of this group in the fleet file, or remove the requirement.",
             )
         members[placeholder.group] = robots

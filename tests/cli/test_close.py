@@ -502,7 +502,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
         "start it open, under its old name /listener: cd /opt && /opt/run listener\n"
         "/talker does not run; start it open: cd /opt "
     )
-    assert "\nsome processes cannot be looked at: to be sure of them, ask as " in undone.err
+    assert "\nsome processes cannot be looked at: ask as root, to see all " in undone.err
     assert "the robot is open: " in undone.err
     looked = replace(robot.look(None, datetime.now(UTC)), by_root=True)
     monkeypatch.setattr(ProcessTable, "look", lambda _table, _now: looked)

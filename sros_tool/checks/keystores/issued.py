@@ -147,7 +147,7 @@ UNKNOWN_AUTHORITY = FindingKind(
     "keystore.unknown-authority",
     ERROR,
     "a file of CAs with a CA that the keystore does not know",
-    "Fast DDS trusts every CA in the file, and Cyclone DDS the first one. Whoever has the key of "
+    "Fast DDS trusts every CA in the file, Cyclone DDS only the first CA. Whoever has the key of "
     "an identity CA can make any enclave, and with the key of a permissions CA give any rights.",
     "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; sros: ledger.jsonl has the CAs.",
     "Find out who added it, and restore the file from a backup.",

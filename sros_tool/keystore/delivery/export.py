@@ -385,8 +385,10 @@ def _check_list(keystore: OpenedKeystore, now: datetime) -> None:
         raise KeystoreError(
             f"the revocation list of keystore '{keystore.root}' lacks revoked certificates of "
             f"{first_few(names, 3)}",
-            "An earlier list was put back, or the list was removed, and robots would trust them.",
-            f"Find out who changed it, and run `sros crl {quote(str(keystore.root))} --refresh`.",
+            "An earlier list was put back, or the list was removed: robots would accept the "
+            "certificates.",
+            "Find out who changed the list, and run "
+            f"`sros crl {quote(str(keystore.root))} --refresh`.",
         )
 
 

@@ -1015,7 +1015,7 @@ def _existing_ca(
         raise KeystoreError(
             f"{subject_text(certificate.subject)} cannot replace the {_ca_name(roles)}",
             f"It has to be self-signed, and a permissions CA has to be named {subject_text(name)}: "
-            "DDS would refuse enclaves of the other.",
+            "otherwise DDS would refuse the enclaves of the other CA.",
             "Make a new CA, or a new keystore for this CA.",
         )
     change.notes += (note for each in imported for note in each.notes)
