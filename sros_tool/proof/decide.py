@@ -23,8 +23,8 @@ from collections.abc import (
 )
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from itertools import product, takewhile
-from operator import eq
+from itertools import product
+from string import ascii_letters
 
 from sros_tool.automata import NameSet, SearchLimit
 from sros_tool.names import (
@@ -53,7 +53,6 @@ from sros_tool.proof.requirements import (
 )
 from sros_tool.proof.worlds import (
     ANYBODY,
-    Side,
     Topics,
     TopicUser,
     World,
@@ -650,7 +649,7 @@ def _missing_enclaves_clauses(requirement: Requirement, world: World) -> Iterato
     for pattern in dict.fromkeys(patterns):
         name = pattern.removeprefix(EXCEPT)
         if not fnmatch.filter(world.enclaves, name):
-            yield f"there is no enclave {pattern}{_meant(name, world.enclaves)}"
+            yield f"there is no enclave {pattern}{_meant(name, {*world.enclaves}.__contains__)}"
 
 
 def _unused_names(
@@ -666,10 +665,9 @@ def _unused_names(
     for right, name, parts in _restricted_names(requirement):
         verb = "use" if isinstance(requirement, Nobody | Protected) else right
         named = _named_right(right, name)
-        known = is_expression(name) or any(
-            part.topics(name).expression in side.exact for part, side in _sides(world, right)
-        )
-        meant = "" if known else _meant(name, _stated_names(world, right))
+        stated = partial(_is_stated, [*_sides(world, right)])
+        known = is_expression(name) or stated(name)
+        meant = "" if known else _meant(name, stated)
         if not _is_used_by_anybody(world, parts, name, limit):
             other = _OF_OTHER_KIND.get(right, "")
             if other and _is_used_by_anybody(world, _sufficient_parts(other), name, limit):
@@ -705,48 +703,42 @@ def _restricted_names(requirement: Requirement) -> Iterator[tuple[str, str, tupl
         yield from ((right, name, parts) for name in names)
 
 
-def _sides(world: World, right: str) -> Iterator[tuple[_Part, Side]]:
-    """Yield the DDS topics of a right, each with its writers and with its readers."""
+def _sides(world: World, right: str) -> Iterator[tuple[str, str, Container[str]]]:
+    """Yield the text before and after a name in each topic of a right, and the stated topics."""
     for part in _parts_of(right):
         for writes in (True, False):
-            yield part, world.side(writes)
+            yield part.begin, part.end, world.side(writes).exact
 
 
-def _stated_names(world: World, right: str) -> Iterator[str]:
-    """Yield the names that rights of this kind state without a wildcard."""
-    for part, side in _sides(world, right):
-        for topic in side.exact:
-            if topic.startswith(part.begin) and topic.endswith(part.end):
-                yield part.topics("").ros_name(topic)
+def _is_stated(sides: Iterable[tuple[str, str, Container[str]]], name: str) -> bool:
+    return any(f"{begin}{name}{end}" in exact for begin, end, exact in sides)
 
 
-def _meant(name: str, known: Iterable[str]) -> str:
-    """Return a clause with a known name that differs by one slip, or ""."""
-    similar = shortest(other for other in known if _is_one_slip_from(name, other))
+def _meant(name: str, stated: Callable[[str], bool]) -> str:
+    """Return a clause with a stated name that differs by one slip, or ""."""
+    similar = shortest(filter(stated, _with_one_slip(name)))
     return f" (perhaps {similar} is meant)" if similar else ""
 
 
-def _is_one_slip_from(name: str, other: str) -> bool:
-    """Return whether names differ by a letter within a word: wrong, missing, or in wrong order.
+def _with_one_slip(name: str) -> Iterator[str]:
+    """Yield the names that differ by a letter within a word: wrong, missing, or in wrong order.
 
     Digits, and letters that are a word of their own, tell things apart (``/arm_l``, ``/arm_r``).
     """
-    if name == other or abs(len(name) - len(other)) > 1:
-        return False
-    begin = _equal_letters(name, other)
-    end = _equal_letters(name[begin:][::-1], other[begin:][::-1])
-    wrong, right = name[begin : len(name) - end], other[begin : len(other) - end]
-    around = name[begin - 1 : begin] + name[len(name) - end :][:1]
-    return (
-        (max(len(wrong), len(right)) == 1 or (len(wrong) == 2 and wrong == right[::-1]))
-        and not any(map(str.isdigit, wrong + right))
-        and any(map(str.isalpha, around))
-    )
+    for at in range(len(name) + 1):
+        begin, end = name[:at], name[at:]
+        for length in (0, 1, 2):
+            wrong, rest = end[:length], end[length:]
+            if len(wrong) < length or not any(map(str.isalpha, begin[-1:] + rest[:1])):
+                continue
+            if any(map(str.isdigit, wrong)):
+                continue
+            rights = ("", *_LETTERS) if length == 1 else (wrong[::-1],) if wrong else _LETTERS
+            yield from (f"{begin}{right}{rest}" for right in rights if right != wrong)
 
 
-def _equal_letters(name: str, other: str) -> int:
-    """Return with how many equal letters two texts begin."""
-    return sum(takewhile(bool, map(eq, name, other)))
+_LETTERS = tuple(f"{ascii_letters}_/")
+"""The characters in names of ROS, without digits."""
 
 
 def _why_never_fails(requirement: Requirement, world: World) -> str:
