@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from sros_tool.agent.settings import AgentSettings
+from sros_tool.checks.kind import WARNING
 from sros_tool.checks.processes import (
     PROCESS_OUTDATED,
     may_lack_list,
@@ -69,7 +70,7 @@ class EnclaveProcesses(NamedTuple):
     complete: bool
     """Whether every process of the machine could be looked at."""
     problems: tuple[str, ...]
-    """The findings of `sros check runtime` on these processes, except due restarts."""
+    """The findings of `sros check runtime` on these processes, except notes and due restarts."""
     dds: RobotDds
     """The DDS of the robot."""
 
@@ -134,7 +135,9 @@ def look_at_processes(
     problems = tuple(
         f"{finding.subject}: {finding.kind.title}: {finding.text}"
         for finding in findings
-        if finding.kind is not PROCESS_OUTDATED and finding.subject != "processes"
+        if finding.severity >= WARNING
+        and finding.kind is not PROCESS_OUTDATED
+        and finding.subject != "processes"
     )
     complete = not (running.unseen or running.hidden or running.container) and all(
         process.enclave and not process.enclave.problem

@@ -779,7 +779,8 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
             robot.has_list and robot.crl_in_force is False for robot in status.robots
         ):
             have = "have" if waiting > 1 else "has"
-            text += f"; {waiting} more {have} it, but may run processes that started before it"
+            text += f"; {waiting} more {have} it, but may run processes that loaded an earlier list"
+            text += " or earlier CAs"
         if (until := status.revoked_until) and until > compared_fleet.at:
             text += f"; robots need it until {until:%Y-%m-%d}, when "
             text += "the revoked certificates have expired"
@@ -1002,6 +1003,17 @@ def _natural_sort_key(name: str) -> list[tuple[int, str]]:
     return [(int(part or 0), "") if part.isdigit() else (0, part) for part in _DIGITS.split(name)]
 
 
+def _is_next_number(before: str, name: str) -> bool:
+    """Return whether two names differ only in one number, by 1: a robot may have left a gap."""
+    pairs = zip(_natural_sort_key(before), _natural_sort_key(name), strict=False)
+    differing = [(first, second) for first, second in pairs if first != second]
+    return (
+        _DIGITS.sub("", before) == _DIGITS.sub("", name)
+        and len(differing) == 1
+        and differing[0][1][0] == differing[0][0][0] + 1
+    )
+
+
 def _robot_positions(robots: Iterable[str]) -> dict[str, int]:
     """Map the robots of a fleet to their positions, r2 before r10."""
     return {name: place for place, name in enumerate(sorted(robots, key=_natural_sort_key))}
@@ -1015,7 +1027,7 @@ def _robot_names(
 ) -> str:
     """Return at most ``maximum`` names of robots; a whole group becomes "pickers (all 40)".
 
-    Many neighbors in the fleet, with names that differ in a number, become "r4 to r50".
+    Many neighbors in the fleet, whose numbers follow one another, become "r4 to r50".
     """
     places, remaining_names, words = _robot_positions(everybody), set(names), []
     number = len(remaining_names)
@@ -1026,8 +1038,7 @@ def _robot_names(
     runs: list[list[str]] = []
     for name in sorted(remaining_names, key=places.__getitem__):
         last = runs[-1][-1] if runs else ""
-        is_next = runs and places[name] == places[last] + 1
-        if is_next and _DIGITS.sub("", name) == _DIGITS.sub("", last):
+        if runs and places[name] == places[last] + 1 and _is_next_number(last, name):
             runs[-1].append(name)
         else:
             runs.append([name])
@@ -1115,7 +1126,10 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
     elif robot.lacks_ca:
         yield "does not trust the CA that seals releases, so fetching cannot help"
     elif robot.is_locked_out and robot.enclaves:
-        yield "all its certificates are revoked: a web server with the current list refuses it"
+        revoked = robot.files.get("certificate", {}).keys() == {"revoked"}
+        fault = "revoked" if revoked else "of an identity CA that was replaced"
+        server = f"a web server with the current {'list' if revoked else 'CA'} refuses it"
+        yield f"all its certificates are {fault}: {server}"
     seen = [name for name in robot.restart or () if (robot.running or {}).get(name) == "earlier"]
     if seen:
         yield f"processes of {first_few(seen, _MOST_GROUPS)} have not loaded the installed files"

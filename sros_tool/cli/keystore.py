@@ -366,17 +366,23 @@ def _next_step_hints(result: Creation, as_json: bool) -> Iterator[str]:
     from sros_tool.keystore.layout import FLEET
     from sros_tool.keystore.reader import OpenedKeystore
 
-    if len(result.created) > MAX_NAMES and not (as_json or result.dry_run):
-        selection = "--robot NAME" if (result.root / FLEET).exists() else "ENCLAVE..."
-        yield f"to send them: `sros distribute_key {quote(str(result.root))} {selection} FOLDER`"
     published = "" if as_json or result.dry_run else publish_command(result.root)
 
     def has_robot(names: Iterable[str]) -> bool:
         fleet = load_fleet(OpenedKeystore(result.root))
         return fleet is not None and any(robot_of(fleet, name) for name in names)
 
+    if published and has_robot(result.created):
+        yield (
+            "no release brings the keys of new enclaves, also to robots that fetch: "
+            f"`sros distribute_key {quote(str(result.root))} --robot NAME FOLDER --force`, and "
+            "bring FOLDER to the robot"
+        )
+    elif len(result.created) > MAX_NAMES and not (as_json or result.dry_run):
+        selection = "--robot NAME" if (result.root / FLEET).exists() else "ENCLAVE..."
+        yield f"to send them: `sros distribute_key {quote(str(result.root))} {selection} FOLDER`"
     if published and has_robot((*result.changed, *result.completed)):
-        yield f"robots that fetch get the change by {published}"
+        yield f"robots that fetch get the changed files by {published}"
     elif result.changed and not (as_json or result.dry_run):
         yield (
             "running processes keep the earlier files: restart them, after a new export if they "

@@ -575,7 +575,14 @@ def rotate_ca(
         f"cut off: {', '.join(step.cut_off)} {cannot} talk to robots with the files of this stage "
         "before getting these files, too"
     )
-    if step.cut_off and publish_command(root) and step.replaces_seals:
+    is_published = bool(publish_command(root))
+    if is_published and step.stage == "retire" and step.replaces_identity:
+        cut_off += (
+            ". A web server that has only the new identity CA refuses robots with certificates of "
+            "the old one: until these robots have their new files, give it both CAs with their "
+            "lists (docs/fetching.md, The last stage of a rotation)"
+        )
+    if is_published and step.replaces_seals:
         cut_off += (
             ". A robot that fetches and does not trust the new permissions CA yet refuses all "
             "later releases: "

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
@@ -209,11 +209,11 @@ class RobotStatus:
     ``lacks_key`` are enclaves whose key the keystore has and the robot does not, which no release
     brings.  ``is_ahead`` says that, by its message, its files are newer than the backup of the
     keystore. ``reads_copy`` says that it fetched after the publication and got an earlier release,
-    and ``is_locked_out`` that all its certificates are revoked.  ``lacks_ca`` says that it refuses
-    releases, because it does not trust the CA that seals them.  ``is_doubtful`` says that what it
-    has is not known, whatever it confirmed: its last message was refused, its release was never
-    published, or two computers have its keys.  The first ``reported`` problems
-    are in the words of the robot.
+    and ``is_locked_out`` that all its certificates are revoked, or of a CA that was replaced.
+    ``lacks_ca`` says that it refuses releases, because it does not trust the CA that seals them.
+    ``is_doubtful`` says that what it has is not known, whatever it confirmed: its last message was
+    refused, its release was never published, or two computers have its keys. The first ``reported``
+    problems are in the words of the robot.
     """
 
     robot: str
@@ -545,7 +545,7 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
     robots = [fleet.robot(name) for name in names] or list(fleet.robots.values())
     compared = _compare_robots(keystore, fleet, robots)
     stages = _Stages(keystore)
-    records = _KeystoreRecords(keystore, fleet, compared, stages.sealing_ca)
+    records = _KeystoreRecords(keystore, fleet, compared, stages)
     existing = keystore.names
     unassigned = 0 if names else len(existing) - sum(len(robot.enclaves) for robot in compared)
     unrecorded = unrecorded_enclaves(fleet, existing, {robot.name for robot in robots})
@@ -813,11 +813,10 @@ class _KeystoreRecords:
         keystore: OpenedKeystore,
         fleet: Fleet,
         compared_robots: Sequence[_ComparedRobot],
-        sealing_ca: str,
+        stages: _Stages,
     ) -> None:
-        """``sealing_ca`` is the SHA-256 of the permissions CA that seals releases now."""
         self._keystore = keystore
-        self._sealing_ca = sealing_ca
+        self._stages = stages
         self._root = keystore.root
         self.has_list = keystore.has(CRL)
         """Whether the keystore has a revocation list."""
@@ -854,7 +853,7 @@ class _KeystoreRecords:
         for robot in compared_robots:
             wanted_digests.update(*robot.expiring.values())
             if robot.different:
-                wanted_digests.add(sealing_ca)
+                wanted_digests.update((stages.sealing_ca, stages.identity_ca))
         wanted_digests.discard("")  # of a file that the robot does not have
         ledger = keystore.ledger if wanted_digests else keystore.ledger_with("what", "revocation")
         for entry in ledger.entries:
@@ -975,13 +974,27 @@ class _KeystoreRecords:
         """
         confirmed = compared_robot.confirmed
         trusted = {*chain.from_iterable(compared_robot.authorities.get("permissions_ca", ()))}
-        if not (confirmed and trusted) or self._sealing_ca in trusted:
+        if not (confirmed and trusted) or self._stages.sealing_ca in trusted:
             return False
         last = self.published.get(compared_robot.robot.name, 0)
         is_refused = any(OF_OTHER_CA in problem for problem in confirmed.problems or ())
-        authority = self._issued.get(self._sealing_ca)
+        authority = self._issued.get(self._stages.sealing_ca)
         has_all = is_published or is_refused or (confirmed.release or 0) == last
         return has_all and not (authority and authority.reason == SAME_KEY)
+
+    def is_locked_out(self, compared_robot: _ComparedRobot, states: Collection[State]) -> bool:
+        """Return whether a web server with the current CA and list refuses a robot.
+
+        ``states`` are those of its certificates, which are then all revoked, or of identity CAs
+        that were replaced.
+        """
+        if not compared_robot.enclaves:
+            return False
+        authority = self._issued.get(self._stages.identity_ca)
+        has_same_key = authority and authority.reason == SAME_KEY
+        return {*states} == {State.REVOKED} or (
+            self._stages.is_of_replaced_ca(compared_robot) and not has_same_key
+        )
 
     def reads_copy(self, compared_robot: _ComparedRobot, last_heard: datetime | None) -> bool:
         """Return whether a robot fetched long after the publication, and got an earlier release.
@@ -1188,7 +1201,7 @@ def _status(
     fetches = bool(received and received.message)
     has_release = bool(different) and records.has_release(compared_robot)
     validity = records.validity(compared_robot)
-    certificates = {*counts.get("certificate", ())}
+    certificates = counts.get("certificate", {}).keys()
     status = RobotStatus(
         compared_robot.robot.name,
         state,
@@ -1223,7 +1236,7 @@ def _status(
         lacks_key=records.lacks_key(compared_robot) if different or state is State.UNUSABLE else (),
         is_ahead=is_ahead,
         reported=len((confirmed and confirmed.problems) or ()),
-        is_locked_out=bool(compared_robot.enclaves) and certificates == {State.REVOKED},
+        is_locked_out=records.is_locked_out(compared_robot, certificates),
     )
     if not (status.fetches and records.reads_copy(compared_robot, status.last_heard)):
         return status
@@ -1271,6 +1284,27 @@ class _Stages:
     def sealing_ca(self) -> str:
         """The SHA-256 of the permissions CA that seals releases now."""
         return self._of_kind["permissions_ca"][0][0]
+
+    @property
+    def identity_ca(self) -> str:
+        """The SHA-256 of the identity CA that issues certificates after the rotation, or now."""
+        return self._new["identity_ca"]
+
+    def is_of_replaced_ca(self, compared_robot: _ComparedRobot) -> bool:
+        """Return whether all certificates of a robot are of identity CAs that are trusted no more.
+
+        Files of the stage ``distribute`` are those of the old CA, which trust the new one, too.
+        """
+        files = compared_robot.authorities.get("identity_ca", ())
+        is_over = self._of_kind["identity_ca"][1] == self.COMPLETE
+        return (
+            is_over
+            and bool(files)
+            and all(
+                self._stage("identity_ca", certificates) in (self.BEFORE, "distribute")
+                for certificates in files
+            )
+        )
 
     def of(self, compared_robot: _ComparedRobot) -> str:
         """Return the stage of the robot's least advanced CA file; "" if it confirmed no CA file."""

@@ -772,6 +772,16 @@ def test_what_is_wrong_with_processes_is_confirmed(r1: Robot) -> None:
     assert problem.startswith("process 1 (node):") and r1.message().problems == (problem,)
 
 
+def test_a_secured_node_in_another_network_namespace_is_no_problem(r1: Robot) -> None:
+    """As in a container without the network of the host, which `sros check runtime` notes."""
+    r1.started = {"/r1/a": moment() + timedelta(seconds=1)}
+    node = replace(r1.process("/r1/a"), network="net:[1]")
+    r1.running = lambda now: RunningProcesses((node,))  # type: ignore[method-assign]
+    assert r1.round().problems == ()
+    node = replace(node, environment={**node.environment, "ROS_SECURITY_STRATEGY": "Permissive"})
+    assert len(r1.round().problems) == 1
+
+
 def test_a_process_from_another_folder_never_has_the_present_files(
     r1: Robot, tmp_path: Path
 ) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import http.client
-import shutil
 import socket
 import ssl
 import subprocess
@@ -76,10 +75,12 @@ class Server:
         said = said_by(folder, robot, datetime.now(UTC))
         return signed_message(folder, f"/{robot}/base", said)
 
-    def reload(self) -> None:
-        """Copy CAs and list, and let nginx read them, as the page says."""
+    def reload(self, *, adds: bool = False) -> None:
+        """Copy CAs and list, or add them to the copies, and let nginx read them, as the page
+        says."""
         for file in ("identity_ca.cert.pem", "identity_ca.crl.pem"):
-            shutil.copy(self.folder / "ks/public" / file, self.folder / "etc")
+            with (self.folder / "etc" / file).open("ab" if adds else "wb") as copy:
+                copy.write((self.folder / "ks/public" / file).read_bytes())
         subprocess.run([*self.command, "-s", "reload"], check=True, capture_output=True)
 
     def answers(self, robot: str, status: int) -> bool:
@@ -196,5 +197,24 @@ def test_robots_of_both_cas_are_served_while_the_ca_is_replaced(server: Server) 
         server.reload()
         assert server.answers("r1", 200) and server.answers("r2", 200) and server.answers("r3", 400)
     sros("rotate_ca", "ks", "--next", "--allow-unconfirmed", cwd=server.folder).ok()
+    server.reload(adds=True)
+    assert server.answers("r3", 400) and server.answers("r2", 200) and server.answers("r1", 200)
     server.reload()
     assert server.answers("r2", 400) and server.answers("r1", 200)
+
+
+def test_robots_fetch_after_all_stages_at_once_and_revoked_ones_do_not(server: Server) -> None:
+    """The server keeps the CA and the list of before until the robots have fetched."""
+    sros("distribute_key", "ks", "--robot", "r2", "r2", "--force", cwd=server.folder).ok()
+    sros("revoke", "ks", "--robot", "r2", cwd=server.folder).ok()
+    server.reload()
+    assert server.answers("r2", 400) and server.answers("r1", 200)
+    words = ("rotate_ca", "ks", "--identity", "--finish", "--allow-unconfirmed")
+    ended = sros(*words, cwd=server.folder).ok()
+    assert "A web server that has only the new identity CA refuses" in ended.err
+    server.reload(adds=True)
+    assert server.answers("r1", 200) and server.answers("r2", 400)
+    sros("distribute_key", "ks", "--robot", "r1", "r1", "--force", cwd=server.folder).ok()
+    assert server.answers("r1", 200) and server.answers("r2", 400)
+    server.reload()
+    assert server.answers("r1", 200)

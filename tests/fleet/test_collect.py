@@ -444,8 +444,15 @@ def test_a_certificate_of_the_ca_that_a_rotation_replaces(home: Home) -> None:
     home.send("r1")
     assert home.of("r1").outcome == "kept", "the old CA is still trusted"
     home.run("rotate_ca", "ks", "--next", "--allow-unconfirmed")
+    known = home.of("r1")
+    assert (known.outcome, known.enclave, known.sequence) == ("unchanged", "/r1/base", 1)
+    assert "it missed the rotation" in known.remarks[0]
     home.send("r1")
-    assert "no identity CA of the keystore" in home.of("r1").why
+    assert home.of("r1").outcome == "refused" and "it missed the rotation" in home.of("r1").why
+    home.put("r1", home.message("r1", NOW, "/r1/base").replace(b"r1", b"r2", 1))
+    assert "it missed" not in home.of("r1").why
+    home.put("r2", home.message("r1", NOW))
+    assert home.of("r2").why.startswith("no identity CA of the keystore"), "of another robot"
 
 
 @pytest.mark.parametrize(

@@ -439,7 +439,8 @@ def test_a_rotation_goes_on_without_robots_if_that_is_chosen(field: Field) -> No
     refused = field.run(*alone, status=2).err
     assert "several stages" in refused and "published" not in refused, "releases are sealed as ever"
     field.run("fleet", "publish", "ks", "pub")
-    assert "refuses" not in field.run(*alone, "--allow-unconfirmed", "--dry-run").err
+    said = field.run(*alone, "--allow-unconfirmed", "--dry-run").err
+    assert "refuses all later releases" not in said and "give it both CAs with their lists" in said
     field.run("rotate_ca", "ks", "--next", "--identity")
     field.deliver("r1", "r3")
     words = ("rotate_ca", "ks", "--to", "reissue", "--allow-unconfirmed")
@@ -487,6 +488,37 @@ def test_a_robot_that_missed_a_stage_gets_its_files_by_hand(field: Field) -> Non
     field.run("fleet", "publish", "ks", "pub")
     field.send("r2", release=1)
     assert field.states()["r2"] == "refused" and to_do() == "deliver"
+
+
+def test_new_enclaves_of_a_fleet_that_fetches_need_their_keys(field: Field) -> None:
+    field.run("fleet", "publish", "ks", "pub")
+    with (field.folder / "fleet.toml").open("a") as file:
+        file.write("[robots.r4]\n")
+    said = field.run("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    assert "\ncreated enclave /r4/base\n" in f"\n{said.out}"
+    assert "no release brings the keys of new enclaves, also to robots that fetch" in said.err
+
+
+def test_a_robot_that_was_off_during_a_rotation_has_missed_it(field: Field) -> None:
+    """It sent nothing new, and a web server may refuse it: its last message counts on."""
+    field.run("fleet", "publish", "ks", "pub")
+    field.send("r2", release=1)
+    for _ in range(3):
+        field.run("rotate_ca", "ks", "--identity", "--next", "--allow-unconfirmed")
+        field.run("fleet", "publish", "ks", "pub")
+        field.run("fleet", "collect", "ks", "inbox")
+
+    def shown() -> tuple[str, str]:
+        found = field.status()["robots"]["r2"]
+        return found["state"], found["to_do"]
+
+    assert shown() == ("earlier", "wait, else deliver")
+    field.age("r2", timedelta(hours=1))
+    assert shown() == ("earlier", "deliver")
+    said = field.run("fleet", "status", "ks", "--robot", "r2", status=1).out
+    assert "all its certificates are of an identity CA that was replaced" in said
+    field.deliver("r2")
+    assert field.states()["r2"] == "current"
 
 
 def test_a_restart_that_is_due(field: Field) -> None:
@@ -655,7 +687,7 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     field.send("r2", running={"/r2/base": RunningFiles.EARLIER, "/r9/base": RunningFiles.EARLIER})
     assert in_force() == [False, False, False], "r1 does not say which processes it has"
     said = field.run("fleet", "status", "ks", status=1).out
-    assert "on 0 of 3 robots; 2 more have it, but may run processes that started" in said
+    assert "on 0 of 3 robots; 2 more have it, but may run processes that loaded an earlier" in said
     field.confirm("r1", restart=[])
     assert in_force() == [True, False, False]
     found = field.status()["robots"]["r2"]
@@ -897,6 +929,8 @@ def test_robots_are_named_by_group_and_by_neighbors_of_one_name() -> None:
     assert _robot_names(everybody, everybody, groups) == "pickers (all 40), dispatcher (41 robots)"
     some = _robot_names(everybody[:6], everybody, groups)
     assert some == "dispatcher, p1 to p5 (6 robots)"
+    left = [name for name in pickers[:12] if name != "p5"]
+    assert _robot_names(left, left) == "p1 to p4, p6 to p12 (11 robots)"
 
 
 def test_texts_that_differ_in_durations_are_one() -> None:

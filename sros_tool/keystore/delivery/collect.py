@@ -68,6 +68,7 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     SigningRequest,
     digest,
+    issued_by,
     key_digest,
     load_request,
     validity_of,
@@ -335,6 +336,10 @@ class _RefusedError(SrosError):
     """A message that proves nothing, or a request that must not be signed."""
 
 
+class _ReplacedCaError(_RefusedError):
+    """A message of the robot itself, with a certificate of an identity CA that was replaced."""
+
+
 def _shortened(reason: str) -> str:
     """Return a reason that is not too long: it may have names that the robot chose."""
     return reason if len(reason) <= LONGEST_REASON else f"{reason[: LONGEST_REASON - 3]}..."
@@ -468,7 +473,19 @@ class _Verifier:
             remarks.append(f"its last confirmation cannot be used: {error.what}")
         before = last.message if last else None
         sha256 = hashlib.sha256(file.data).hexdigest()
-        verified = self._verify(robot, file.data)
+        try:
+            verified = self._verify(robot, file.data)
+        except _ReplacedCaError as error:
+            if not (before and before.sha256 == sha256):
+                raise
+            remarks.append(error.what)  # the message was verified before the CA was replaced
+            return _ReceivedMessage(
+                robot,
+                "unchanged",
+                enclave=before.enclave,
+                sequence=before.sequence,
+                remarks=remarks,
+            )
         remarks += self._expiry_clauses(verified.certificate)
         sequence = verified.confirmation.sequence
         assert sequence
@@ -563,6 +580,10 @@ class _Verifier:
         validity = validity_of(signer)
         moment = min(max(self._now, validity.not_before), validity.not_after)
         if fault := chain_fault(signer, self._authorities, moment=moment):
+            if self._was_of_replaced_ca(robot, signer):
+                raise _ReplacedCaError(
+                    "its certificate is of an identity CA that was replaced: it missed the rotation"
+                )
             why = "no identity CA of the keystore issued its certificate"
             if restored_at(self._keystore):  # first: the sender chose the words of the fault
                 why += " (perhaps the CA was replaced after the backup of the keystore: see "
@@ -586,6 +607,21 @@ class _Verifier:
                 f"its certificate expired {age} ago, and {issued.enclave} has another key now"
             )
         return issued.enclave
+
+    def _was_of_replaced_ca(self, robot: Robot, signer: x509.Certificate) -> bool:
+        """Return whether a CA that was replaced issued the certificate to an enclave of the robot.
+
+        The certificate was not revoked, and its digest is in the ledger: whoever has a copy of the
+        replaced CA's key cannot make another one.
+        """
+        if any(issued_by(signer, authority) for authority in self._authorities):
+            return False
+        issued = self._issued(digest(signer))
+        return bool(
+            issued
+            and robot_of(self._fleet, issued.enclave) == robot
+            and signer.serial_number not in self._revoked
+        )
 
     def _has_key_of(self, enclave: str, signer: x509.Certificate) -> bool:
         """Return whether a certificate is for the key that an enclave has now.

@@ -119,6 +119,11 @@ class RotationStep(Changed):
     cut_off: tuple[str, ...] = ()
 
     @property
+    def replaces_identity(self) -> bool:
+        """Whether the CA that issues the certificates of robots is replaced, the identity CA."""
+        return any(file != "permissions_ca" for file in self.files)
+
+    @property
     def replaces_seals(self) -> bool:
         """Whether the CA that seals releases is replaced, the permissions CA."""
         return any(file != "identity_ca" for file in self.files)
