@@ -137,6 +137,7 @@ def _page_data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> d
         "differences": as_plain(picture.differences),
         "validities": as_plain(picture.validities),
         "findings": as_plain(picture.findings),
+        "unread": sum(units.enclaves for units in picture.unread),
     }
 
 

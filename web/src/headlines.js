@@ -82,7 +82,7 @@ function widestLine(model, act) {
 }
 
 // What looks wrong: the worst finding, how many others there are, and what expired since the page was made.
-function wrongLine({ findings, validities }, showTab) {
+function wrongLine({ findings, validities, unread }, showTab) {
   const of = (severity) => findings.filter((finding) => finding.severity === severity);
   const [errors, warnings, notes] = ["error", "warning", "note"].map(of);
   const expired = validities.filter((validity) => daysLeft(validity) < 0);
@@ -95,7 +95,8 @@ function wrongLine({ findings, validities }, showTab) {
   if (parts.length) return el("p", { class: "lack" }, "Looks wrong: ", parts.flatMap((part, at) => (at ? [", ", ...part] : part)));
   const unchecked = findings.find(({ id }) => id === "view.not-checked");
   if (unchecked) return el("p", { class: "lack" }, "Not all was checked: ", button(counted(notes.length, "note"), () => showTab("findings")));
-  return el("p", {}, "No error or warning was found", notes.length ? [", but ", button(counted(notes.length, "note"), () => showTab("findings"))] : "", ".");
+  const read = unread ? " in the enclaves that were read" : "";
+  return el("p", {}, `No error or warning was found${read}`, notes.length ? [", but ", button(counted(notes.length, "note"), () => showTab("findings"))] : "", ".");
 }
 
 // What may be used without a right.  Only a keystore's governance says it, and only of DDS.
