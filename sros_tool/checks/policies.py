@@ -566,7 +566,7 @@ OTHER_NODES_PARAMETERS = FindingKind(
     "A process in the enclave could pose as that node: it reads and answers requests that set its "
     "parameters.",
     "rcl_interfaces; rclcpp and rclpy (parameter services of a node).",
-    "Remove the right. If the node runs in this enclave, give it a profile of its own.",
+    "Remove the right. If the node runs in this enclave, add a profile for the node.",
 )
 _GLOBAL = ("rosout", "parameter_events", "clock")
 _BASICS = (

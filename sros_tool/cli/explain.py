@@ -1116,7 +1116,7 @@ def _text_without_findings(log: str) -> str:
             f"{_SILENT_ON_ZENOH}"
         )
     return (
-        f"a node ran in '{match['folder']}'. Where its peers refuse it, it often logs nothing: "
+        f"a node ran in '{match['folder']}'. A node that its peers refuse often logs nothing: "
         "explain the log of the other node, too. Both logs can be empty if the CAs, a revocation "
         "list, the governance or the domains of both ends do not fit: `sros check FOLDER OTHER` "
         "finds this in their keystores or exports. Both can also be empty if a clock is wrong: "

@@ -788,7 +788,7 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     yield from _expiry_facts(compared_fleet)
     if status.unassigned:
         number = counted(status.unassigned, "enclave")
-        yield f"{number} of no robot, whose state no confirmation shows"
+        yield f"{number} of no robot: not covered by the confirmations of robots"
 
 
 def _list_in_force(status: FleetStatus) -> tuple[int, int] | None:

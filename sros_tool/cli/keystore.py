@@ -241,11 +241,11 @@ def generate_artifacts(
 ) -> None:
     r"""Create enclaves, with the permissions that policies state for them: all or nothing.
 
-    The permissions in a policy replace the current permissions of an enclave, unless these state
-    the same and more than a third of their validity is left. To sign them again in any case, name
-    them in `sros create_permission` or `sros renew`. `sros create_permission --help` explains
-    --revoke-old. If a policy demands more protection for a name than the keystore gives, the
-    governance of all enclaves is signed again.
+    The permissions in a policy replace the current permissions of an enclave, unless the current
+    permissions state the same and have more than a third of their validity left. To sign them again
+    in any case, name the enclave in `sros create_permission` or `sros renew`. `sros
+    create_permission --help` explains --revoke-old. If a policy demands more protection for a name
+    than the keystore gives, the governance of all enclaves is signed again.
 
     Example:
       $ sros generate_artifacts -k keystore -e /spare \

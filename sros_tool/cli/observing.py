@@ -631,7 +631,7 @@ def _propose(
 
 def _show_lines(lines: Sequence[AskingLine], *, err: bool = False) -> None:
     if lines:
-        echo("these lines of logs ask for it; a process can print any line:", err=err)
+        echo("these log lines ask for the rights; a process can print any line:", err=err)
     for line in lines:
         by = line.process or "a process without a label"
         denial = f"{line.direction} {line.topic} in {line.enclave}"

@@ -366,7 +366,7 @@ def _renamed_text(nodes: ObservedNodes, current: Observation | None, *, fails: b
         if moved := [f"{old} as {new}" for old, new in topics if not old.startswith(private)]:
             text += f", with {enumerated(moved)} (a name that does not move: write it absolute)"
         if fails:
-            text += " (if it is another node, remove what it does not use from its profile)"
+            text += " (if the new name is another node: remove the unused rights from its profile)"
     _, without_profile = nodes.divide_by_profile(nodes.as_observed)
     not_compared = {
         node_name(node) for node in without_profile if not is_tool(node)

@@ -481,7 +481,7 @@ class Answer(NamedTuple):
             case Outcome.ALLOWED:
                 return ""
             case Outcome.PEER_DENIES:
-                return "the peers: the node starts, and none of them talks to it"
+                return "the peers: the node starts, and no peer talks to it"
             case Outcome.CRASHES if self.decision.hits_peers:
                 return "nobody: the node starts, and the processes of its peers crash"
             case Outcome.CRASHES:

@@ -431,7 +431,7 @@ class Received:
             return ""
         return (
             f"Its messages come in turn from two computers that have its keys, such as by a copied "
-            f"disk, last at {iso(alternated)}: what the other one has is not known."
+            f"disk, last at {iso(alternated)}. The files of the other computer are not known."
         )
 
     def clock_note(self) -> str:
@@ -482,7 +482,7 @@ def receive(data: bytes, robot: str, label: str, *, now: datetime) -> Received:
         raise DocumentError(
             f"{label} is the confirmation of {confirmation.robot}, not of {robot}",
             "A robot can confirm only its own files.",
-            f"If it comes from {confirmation.robot}, name it with --robot {confirmation.robot}.",
+            f"If the report comes from {confirmation.robot}, add --robot {confirmation.robot}.",
         )
     return Received(confirmation, now.replace(microsecond=0))
 

@@ -634,6 +634,6 @@ def locate_enclave(folder: Path) -> tuple[Path, str]:
         f"'{folder}' is not below a folder named {ENCLAVES}",
         "rcl finds an enclave by its path below that folder.",
         "Name the keystore, or the enclave's folder in it. If you have only this folder, "
-        f"put it where rcl looks for it, and check it: `mkdir -p robot/{ENCLAVES} && cp -a "
+        f"move it to a place where rcl looks: `mkdir -p robot/{ENCLAVES} && cp -a "
         f"{quote(str(absolute))} robot/{ENCLAVES}/ && sros check robot`.",
     )

@@ -283,7 +283,7 @@ def read_requirements(
 ) -> tuple[Requirement, ...]:
     """Return the requirements in a TOML file, in their order, for the robots of a fleet.
 
-    Each requirement is there for each of the ``namespaces``.
+    With ``namespaces``, each requirement is returned once for each namespace.
 
     Raises:
         DocumentError: the file cannot be read, or a part of it is not valid; the error has file and

@@ -1223,7 +1223,7 @@ def _requirements_left(
                 if old & was and new - now:
                     place = requirement.source
                     name, to = expand("~", *node), first_few(sorted(new - now), 3)
-                    text = f"node {name} moves to enclave {to}, which it does not restrict"
+                    text = f"node {name} moves to enclave {to}, outside of the requirement"
                     remedy = "Add the enclave to the requirement, or approve this in the review."
                     yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
 

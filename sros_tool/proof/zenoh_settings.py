@@ -115,8 +115,8 @@ _HARMLESS = re.compile(
 )
 """Paths of settings that give nobody access: times, sizes, names, order of connecting."""
 _GIVING = (
-    (re.compile(r"plugins(?:/.*)?"), "a plugin answers others by its own rules"),
-    (re.compile(r"plugins_loading(?:/.*)?"), "it loads plugins, which answer others"),
+    (re.compile(r"plugins(?:/.*)?"), "a plugin answers other processes by its own rules"),
+    (re.compile(r"plugins_loading(?:/.*)?"), "it loads plugins, which answer other processes"),
     (
         re.compile(r"transport/auth(?:/.*)?"),
         "anyone with the password or key that it now asks for gets a connection",

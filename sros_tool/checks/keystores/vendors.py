@@ -50,8 +50,8 @@ REFUSED = FindingKind(
     "enclave.refused",
     ERROR,
     "an enclave that no DDS vendor accepts",
-    "Every vendor refuses it, or peers refuse its nodes, so no node can run in it. With --vendor, "
-    "only that vendor counts.",
+    "Every vendor refuses the enclave, or peers refuse its nodes, so no node can run in it. With "
+    "--vendor, only that vendor counts.",
     _ENGINE,
     f"Replace the files that the vendors refuse. {_SEE}",
 )

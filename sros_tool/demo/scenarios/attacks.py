@@ -952,7 +952,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
                 (Condition.OPEN_JOIN, Condition.UNCONTROLLED),
                 RowStatus.HEARD,
                 "the template controls neither who joins nor who uses the topic",
-                "keep join_access_control and the access control of topics on",
+                "leave join_access_control and the access control of topics switched on",
             ),
             Variant(
                 (Condition.FAST,),
