@@ -1355,8 +1355,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_complete",
-            "Whether `sros fleet status` has nothing to say of robots, of the keystore and of the "
-            "clock of its machine (1), or has (0); known vulnerabilities do not count.",
+            "1 if `sros fleet status` reports no problem of the robots, the keystore or the clock of "
+            "its machine, otherwise 0. Known vulnerabilities do not count.",
             (Sample(int(status.complete), place),),
         ),
         Metric(

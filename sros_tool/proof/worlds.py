@@ -587,7 +587,7 @@ def is_enforced(
 def domains_of(
     enforcers: Iterable[Enforcement], other_domains: Collection[DomainSet] = ()
 ) -> tuple[int, ...]:
-    """Return the ROS domains of the keys in rules; of domains with the same rules, the first.
+    """Return the ROS domains of the keys in rules, only the first of domains with the same rules.
 
     If keys have a wildcard in place of the domain, a domain is added that no key names.  Domains in
     ``other_domains`` are added, too; domains in different sets count as having different rules.

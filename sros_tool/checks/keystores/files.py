@@ -200,8 +200,8 @@ HIDDEN_ENCLAVE = FindingKind(
     "keystore.hidden-enclave",
     ERROR,
     "an enclave in a hidden folder",
-    "DDS loads the enclave, and a node that names it has its rights. No verb of sros lists, renews, "
-    "revokes or exports the enclave, and the check of enclaves leaves it out.",
+    "DDS loads the enclave, and a node that names it has its rights. No verb of sros lists, "
+    "renews, revokes or exports the enclave, and the check of enclaves leaves it out.",
     "rcl 9 (rcl/src/rcl/security.c) takes a folder of any name; sros keystore layout.",
     "Remove the folder. If you need the enclave, create one without a dot in its name (`sros "
     "create_enclave`). If others had the folder, replace the CA (`sros rotate_ca`), because the "

@@ -111,8 +111,8 @@ NOT_IN_POLICY = FindingKind(
     "an enclave that no policy names",
     "Its permissions stay valid, also if its node was renamed or removed from the policy.",
     "sros: --policy.",
-    "Name the policy of this enclave, too; or, if nobody needs the enclave, revoke it: `sros revoke "
-    "KEYSTORE ENCLAVE`.",
+    "Name the policy of this enclave, too; or, if nobody needs the enclave, revoke it: `sros "
+    "revoke KEYSTORE ENCLAVE`.",
     prominent=True,
 )
 NOT_IN_KEYSTORE = FindingKind(

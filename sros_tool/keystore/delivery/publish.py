@@ -926,8 +926,8 @@ class _Run:
         def work(part: Sequence[_Changed]) -> list[_ReleaseOutcome]:
             return list(self._release_all(part, number, authority))
 
-        alone = authority is not None and authority.on_token
-        made = [(changed, work(changed))] if alone else map_slices(changed, work)
+        on_token = authority is not None and authority.on_token
+        made = [(changed, work(changed))] if on_token else map_slices(changed, work)
         self._made = [robot for _, part in made for robot in part]
         if self._damaged:
             text = f"missing or damaged in '{self._folder}', so that robots refused them: the "
