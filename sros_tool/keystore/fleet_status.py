@@ -1355,8 +1355,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_complete",
-            "1 if `sros fleet status` reports no problem of the robots, the keystore or the clock of "
-            "its machine, otherwise 0. Known vulnerabilities do not count.",
+            "1 if `sros fleet status` reports no problem of the robots, the keystore or the clock "
+            "of its machine, otherwise 0. Known vulnerabilities do not count.",
             (Sample(int(status.complete), place),),
         ),
         Metric(

@@ -320,7 +320,7 @@ class RevokedEnclaves(NamedTuple):
 
 
 class TemplateChange(NamedTuple):
-    """The name of the template."""
+    """The name of the keystore's template, before and after an update."""
 
     before: str
     """Name of the template before the update."""
