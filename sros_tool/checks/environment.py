@@ -76,7 +76,7 @@ NOT_ENABLED = FindingKind(
 MISSPELT = FindingKind(
     "runtime.variable-misspelt",
     ERROR,
-    "a misspelt or obsolete variable, which ROS 2 ignores",
+    "a misspelled or obsolete variable, which ROS 2 ignores",
     "The name looks like a misspelled or old name of a variable that rcl reads. rcl ignores it "
     "without a message.",
     _RCL,

@@ -300,7 +300,7 @@ class _TalkComparison:
         self._denied = nodes.denied_rights(nodes.expected(self.current))
 
     def differences(self) -> Mapping[str, Sequence[str]]:
-        """Return what differs from the open robot, by what happened to it."""
+        """Return the differences from the open robot, by kind, such as "not seen"."""
         ended, nodes = _ended_since(self._running), self._nodes
         unseen = [node for node in self._audited["unseen"] if node["enclave"] not in self._away]
         before, expected = nodes.compared(self._away, self.current), nodes.expected(self.current)

@@ -362,7 +362,8 @@ def _foreign_stage_error(folder: Folder, why: str) -> KeystoreError:
     return KeystoreError(
         f"'{folder.path / STAGE}' is not an interrupted change of yours",
         f"{why} Somebody else may have put it there, to make sros move files with your rights.",
-        "Find out who can write to the keystore, look at its content, and remove it.",
+        "Find out who can write to the keystore, look at the content of this folder, and remove "
+        "the folder.",
     )
 
 

@@ -673,8 +673,7 @@ class _Reader:
             raise PolicyError(
                 f"{where}: the processing instructions of a name are not valid",
                 "Only one <?sros ...?> is allowed, directly between the name and its end tag. A "
-                "misspelt "
-                "one would leave the name without protection.",
+                "misspelled instruction would leave the name without protection.",
                 _EXAMPLE,
             )
         stated = _PROTECT.match((instruction.text or "")[:_MAX_LENGTH].lstrip())

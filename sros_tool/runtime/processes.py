@@ -552,8 +552,8 @@ class ProcessOrigin(NamedTuple):
     """How a process was started: each part is empty if the process lacks or hides it, or ended.
 
     ``unit`` is its systemd system service, ``folder`` its working directory, ``launch`` the
-    command of the ``ros2 launch`` that started it, or that it is, and ``container`` the id of its
-    container of Docker or Podman.
+    command of the ``ros2 launch`` that started it (its own, for a launch), and ``container`` the
+    id of its container of Docker or Podman.
     """
 
     unit: str = ""

@@ -313,7 +313,7 @@ def test_an_export_that_looks_like_home_is_found_with_its_ca_key(
     verified = {each.id for each in verify_arrival(robot, now=NOW).findings}
     checked = {each.id: each.remedy for each in keystore_findings(OpenedKeystore(robot), now=NOW)}
     assert "keystore.home-or-robot" in verified & set(checked)
-    assert "keep them" in checked["keystore.home-or-robot"]
+    assert "keep the CA keys" in checked["keystore.home-or-robot"]
 
 
 def test_no_remedy_for_a_ca_key_may_lose_it(fleet: Path, tmp_path: Path) -> None:

@@ -185,8 +185,8 @@ HOME_OR_ROBOT = FindingKind(
     "robot.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
     "On the keystore machine, keep the CA keys, and run `sros check KEYSTORE`. On a robot, "
-    "replace the folder by an export (made with `sros distribute_key KEYSTORE ENCLAVE TARGET`); if others had "
-    "access, replace the CAs (`sros rotate_ca`).",
+    "replace the folder by an export (made with `sros distribute_key KEYSTORE ENCLAVE TARGET`); if "
+    "others had access, replace the CAs (`sros rotate_ca`).",
 )
 UNREADABLE = FindingKind(
     "keystore.file-unreadable",
