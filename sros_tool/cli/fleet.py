@@ -779,8 +779,8 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
             robot.has_list and robot.crl_in_force is False for robot in status.robots
         ):
             have = "have" if waiting > 1 else "has"
-            text += f"; {waiting} more {have} it, but may run processes that loaded an earlier list"
-            text += " or earlier CAs"
+            text += f"; {waiting} more {have} it, but it is not known that all processes there "
+            text += "have loaded it and the current CAs"
         if (until := status.revoked_until) and until > compared_fleet.at:
             text += f"; robots need it until {until:%Y-%m-%d}, when "
             text += "the revoked certificates have expired"
@@ -1134,7 +1134,8 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
     if seen:
         yield f"processes of {first_few(seen, _MOST_GROUPS)} have not loaded the installed files"
     if unseen := [name for name in robot.restart or () if name not in seen]:
-        yield f"processes of {first_few(unseen, _MOST_GROUPS)} may run with earlier files"
+        names = first_few(unseen, _MOST_GROUPS)
+        yield f"not known whether processes of {names} have loaded the installed files"
     if robot.enclaves and robot.stage not in ("", "unknown", stage):
         yield f"CA files of the stage {robot.stage}"
     yield from robot.notes

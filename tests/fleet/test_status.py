@@ -531,9 +531,9 @@ def test_a_restart_that_is_due(field: Field) -> None:
     assert [robots[name]["restart"] for name in ROBOTS] == [["/r1/base"], [], None]
     told = field.run("fleet", "status", "ks", status=1).out
     assert "3 robots: 2 current, 1 restart due" in told
-    assert "processes of /r1/base may run with earlier files" in told
+    assert "not known whether processes of /r1/base have loaded the" in told
     page = field.run("fleet", "status", "ks", "--html", status=1).out
-    assert "processes of /r1/base may run with earlier files" in page
+    assert "not known whether processes of /r1/base have loaded the" in page
 
 
 def test_other_permissions_leave_the_list_in_force(field: Field) -> None:
@@ -687,7 +687,7 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     field.send("r2", running={"/r2/base": RunningFiles.EARLIER, "/r9/base": RunningFiles.EARLIER})
     assert in_force() == [False, False, False], "r1 does not say which processes it has"
     said = field.run("fleet", "status", "ks", status=1).out
-    assert "on 0 of 3 robots; 2 more have it, but may run processes that loaded an earlier" in said
+    assert "on 0 of 3 robots; 2 more have it, but it is not known that all processes" in said
     field.confirm("r1", restart=[])
     assert in_force() == [True, False, False]
     found = field.status()["robots"]["r2"]
