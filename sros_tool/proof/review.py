@@ -41,12 +41,17 @@ from sros_tool.folders import Folder
 from sros_tool.keystore.expiry import ExpiryCheck, Threshold, due_enclaves
 from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.layout import (
+    CRL,
     ENCLAVES,
     FLEET,
-    GOVERNANCE_FILE,
     KEY_FILE,
-    PERMISSIONS_FILE,
+    OPTIONAL_FILES,
+    PUBLIC,
+    REQUIRED_FILES,
+    ROLES,
     SETTINGS,
+    ZENOH_FILES,
+    ca_certificate,
     is_keystore,
 )
 from sros_tool.keystore.reader import OpenedKeystore
@@ -651,8 +656,8 @@ class _Review:
             text = (
                 "is a keystore that changes and is not reviewed: name it with --keystore, or leave"
             )
-            place = ENCLAVES if path == "." else path
-            lines.append((f"{text} it out with --leave-out {quote(place)}", path))
+            place = f"{ENCLAVES} --leave-out {PUBLIC}" if path == "." else quote(path)
+            lines.append((f"{text} it out with --leave-out {place}", path))
         for path in self._used_in_part(changed, reviewed, fleet):
             lines.append(("changes and is used only in part: the rest is not reviewed", path))
         for path in self._not_reviewed_users(changed):
@@ -827,9 +832,11 @@ class _Review:
             yield f"policies in '{path}'{but} are not reviewed, as the options say"
         if asked.keystores:
             yield "private keys of keystores are not reviewed"
-        with suppress(SrosError):  # said by the step on changed files
+        try:
             for path in self._unreviewed_keystores(self._changed_files(self.head, None)):
                 yield f"'{path}' is a keystore and is not reviewed"
+        except SrosError as error:
+            yield f"keystores that did not change were not looked for: {error.what}"
         if self._template_changes():
             yield f"new access by the changes of '{asked.template}'"
         for path in self._changed_settings():
@@ -853,14 +860,8 @@ class _Review:
     def _unreviewed_keystores(self, entries: Iterable[tuple[str, TreeEntry]]) -> list[str]:
         """Return the keystores and exports with entries, which are not reviewed or left out."""
         known = (*self.request.keystores, *self.request.left_out)
-        folders = {
-            f"/{path}".partition(f"/{ENCLAVES}/")[0][1:]
-            for path, _ in entries
-            if f"/{ENCLAVES}/" in f"/{path}"
-            and path.endswith((f"/{GOVERNANCE_FILE}", f"/{PERMISSIONS_FILE}"))
-            and not _is_below(path, known)
-        }
-        return sorted(folder or "." for folder in folders)
+        folders = {_keystore_with(path) for path, _ in entries if not _is_below(path, known)}
+        return sorted(folder or "." for folder in folders if folder is not None)
 
     def _changed_settings(self) -> list[str]:
         """Return changed TOML files that look like templates or requirements, and are not read."""
@@ -1135,6 +1136,20 @@ def _holders(files: Iterable[Path], fleet: Fleet | None) -> dict[str, Robot | No
         return {enclave.path: None for file in files for enclave in read_policy(file).enclaves}
     policies = (FleetPolicy(read_policy(file, placeholders=True), fleet) for file in files)
     return {path: policy.stated(path)[1] for policy in policies for path in policy}
+
+
+_FILES_OF_ENCLAVES = (*REQUIRED_FILES, *OPTIONAL_FILES, *ZENOH_FILES)
+_TRUSTED = (CRL, *map(ca_certificate, ROLES))
+"""The files of a keystore that all enclaves trust."""
+
+
+def _keystore_with(path: str) -> str | None:
+    """Return the keystore or export of which a file is, by its name; None for other files."""
+    keystore, enclaves, file = f"/{path}".partition(f"/{ENCLAVES}/")
+    if enclaves and Path(file).name in _FILES_OF_ENCLAVES:
+        return keystore[1:]
+    trusted = next((name for name in _TRUSTED if f"/{path}".endswith(f"/{name}")), "")
+    return f"/{path}".removesuffix(f"/{trusted}")[1:] if trusted else None
 
 
 def _is_below(path: str, folders: Iterable[str]) -> bool:

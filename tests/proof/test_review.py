@@ -19,6 +19,7 @@ from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.files import templates_dir
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, renamed_enclaves
+from sros_tool.proof import review
 from sros_tool.proof.commit_files import CommitFiles
 from sros_tool.proof.repository import Repository
 from tests.support.code_host import PROJECT
@@ -947,7 +948,7 @@ def test_requirements_get_the_protection_of_a_template(change: Change) -> None:
 
 
 def test_whether_a_keystore_is_signed_for_the_policies(
-    change: Change, made_keystores: Path
+    change: Change, made_keystores: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It never fails: who changes a policy seldom has the keys of the CAs."""
     copy_of(made_keystores / "before", change.folder / "ks")
@@ -970,6 +971,14 @@ def test_whether_a_keystore_is_signed_for_the_policies(
     assert changed.status == 1
     assert "'r1/export' is a keystore that changes and is not reviewed: name it" in changed.out
     assert "'ks' is a keystore" not in changed.out
+    for file in ("public/identity_ca.cert.pem", "enclaves/a/cert.pem"):
+        change.base = change.commit({})
+        change.commit({f"ks/{file}": "another"})
+        assert "'ks' is a keystore that ch" in change.review("--policy", "robot.xml").out, file
+    with monkeypatch.context() as patched:
+        patched.setattr(review, "_MOST_ENTRIES", 20)
+        change.commit({"README": "y"})
+        assert "keystores that did not ch" in change.review("--policy", "robot.xml").out
     left = ("--leave-out", "enclaves", "--leave-out", "r1/export", "--leave-out", "ks")
     change.base = change.commit({})
     change.commit({"ks/enclaves/a/permissions.p7s": "x", "enclaves/governance.p7s": "y"})
