@@ -302,6 +302,8 @@ def _edit_text(violation: Violation) -> str:
             )
         case Apart():
             key, enclaves = "through", [violation.steps[-2].use.enclave]
+            if enclaves[0] in requirement.sources:  # it would be kept apart from nothing any more
+                return ""
         case _:
             return ""
     if requirement.robot:  # its enclaves stand for those of all robots

@@ -126,6 +126,13 @@ def test_after_the_edit_that_a_finding_names_the_requirement_holds(
     assert not decided(rights, required.replace(kept, f"{kept}, {added}")).violations
 
 
+def test_no_edit_lets_an_enclave_through_that_a_requirement_names_as_its_source() -> None:
+    rights = {"/web": may("publish", "/cmd"), "/motor": may("subscribe", "/cmd")}
+    required = parse_requirements(b'[[apart]]\nfrom = ["/web"]\nto = ["/motor"]\n', "r.toml")
+    (finding,) = requirement_findings(required, robot(rights))
+    assert "if this is wanted" not in finding.remedy
+
+
 def test_of_each_enclave_the_finding_says_what_it_may() -> None:
     """An enclave that breaks a requirement by another name is not said to use the first one."""
     rights = {
