@@ -567,7 +567,7 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
     yield f"{may} {answer.question}, on {answer.vendor.title} ({why}{documented})"
     yield _labeled_row("why", decision.clause)
     if answer.counts_key:
-        yield _labeled_row("key", "not here; the answer assumes it")
+        yield _labeled_row("key", "not here; the answer assumes that the process has the key")
     yield from (_labeled_row("and", str(problem)) for problem in answer.problems[1:])
     if len(answer.parts) > 1 and not answer.allowed:
         for part in answer.parts:

@@ -69,7 +69,7 @@ def observing_options(enclave_help: str) -> Callable[[Decorated], Decorated]:
                 "--keystore",
                 type=PATH,
                 metavar="KEYSTORE",
-                help="The keystore of that enclave. [default: $ROS_SECURITY_KEYSTORE]",
+                help="The keystore of --enclave. [default: $ROS_SECURITY_KEYSTORE]",
             ),
             click.option("--enclave", metavar="ENCLAVE", help=enclave_help),
             click.option(

@@ -158,7 +158,7 @@ class AccessSource:
         return next((grant.subject for grant in known.grants), "") if known else ""
 
     def as_rights(self) -> RightsSource:
-        """Return the rights that a policy gives, without how it would be signed."""
+        """Return the rights that a policy gives, independently of how the policy would be signed."""
         return RightsSource(
             Path(self.shown),
             self.kind,
@@ -283,7 +283,7 @@ def _access_of_source(path: Path, source: RightsSource) -> AccessSource:
         raise DocumentError(
             f"'{path}' cannot be compared: it has Zenoh files, but not {ROUTER_FILE}",
             "Only the file of the router shows which rights Zenoh enforces.",
-            "Compare the keystore that it comes from, or only the permissions of an enclave, such "
+            "Compare the original keystore, or only the permissions of an enclave, such "
             f"as '{folder}'.",
         )
     rights_source = load_zenoh_rights(keystore, hidden=True)

@@ -195,7 +195,7 @@ def chosen_vendor(
 ) -> tuple[Vendor, str]:
     """Return the vendor of a name such as ``cyclonedds``, or else `vendor_here`, and the reason.
 
-    With a distribution, the vendor is in its release.
+    With a distribution, the vendor has the rules of the release that the distribution ships.
 
     Raises:
         UsageError: the distribution does not ship that vendor.

@@ -968,7 +968,7 @@ def test_a_copy_without_keys_is_answered_as_if_they_were_there(whole: Path, tmp_
         key.unlink()
     said = explain(copy, ENCLAVE, "publish", "/chatter").ok()
     assert "note [explain.without-keys]: no enclave in" in said.err
-    assert "\n  key       not here; the answer assumes it\n" in said.out
+    assert "\n  key       not here; the answer assumes that the process has the key\n" in said.out
     assert answer(copy, ENCLAVE, "publish", "/chatter")["counts_key"]
     assert not answer(whole, ENCLAVE, "publish", "/chatter")["counts_key"]
     assert "no rule allows" in explain(copy, ENCLAVE, "publish", "/nothing").out

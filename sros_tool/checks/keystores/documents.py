@@ -544,8 +544,8 @@ NO_TOPIC_RULE = FindingKind(
     "governance.no-topic-rule",
     ERROR,
     "topics without a topic rule",
-    "If no topic rule matches, the endpoint cannot be created; without a rule for "
-    "ros_discovery_info no ROS 2 node starts.",
+    "An endpoint can be created only if a topic rule matches, and every ROS 2 node needs "
+    "ros_discovery_info.",
     f"{_GOVERNANCE}; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
     "Add a rule for * at the end.",
 )

@@ -273,8 +273,8 @@ def _cut_off_error(
         by_hand = f" by hand (`sros distribute_key {where} --robot NAME FOLDER --force`)" * seals
         return KeystoreError(
             f"several stages at once would cut off every robot: {names}",
-            "No robot can trust the new CA before it has the new files: until then, and until its "
-            f"processes were restarted, it cannot communicate with others that have them{refuses}.",
+            "A robot trusts the new CA only once it has the new files, and its processes were "
+            f"restarted: before, it cannot communicate with robots that have the files{refuses}.",
             "If the robots may stand still, add --allow-unconfirmed, then bring the files to every "
             f"robot{by_hand}, and restart everything. Otherwise go stage by stage, with "
             f"`sros rotate_ca {where} --next`.",
@@ -572,7 +572,7 @@ class _Rotator:
                 raise KeystoreError(
                     f"the file of the {role} CA has {authority_text(strangers[0])}, which the "
                     "keystore does not know",
-                    "Every process trusts it, and would go on to trust it during the rotation.",
+                    "Every process trusts this CA, and would still trust it during the rotation.",
                     f"Restore '{self._root}/{ca_certificate(role)}' from a backup; or, if all "
                     "processes may be restarted together, replace the CAs at once with --finish.",
                 )
