@@ -158,7 +158,7 @@ class AccessSource:
         return next((grant.subject for grant in known.grants), "") if known else ""
 
     def as_rights(self) -> RightsSource:
-        """Return the rights that a policy gives, independently of how the policy would be signed."""
+        """Return the rights that a policy gives, whatever the documents are signed with."""
         return RightsSource(
             Path(self.shown),
             self.kind,
