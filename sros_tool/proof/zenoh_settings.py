@@ -47,7 +47,7 @@ _OPEN: tuple[tuple[str, Callable[[ConfigurationDocument], bool], bool, str], ...
         "transport/link/tls/verify_name_on_connect",
         lambda document: document.tls.verifies_name,
         False,
-        "another host with a certificate of the CA can pose as the host that the process connects to",
+        "another host with a certificate of the CA can pose as the host at the other end",
     ),
     (
         "transport/link/tls/close_link_on_expiration",
