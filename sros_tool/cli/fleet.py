@@ -144,7 +144,8 @@ def _report(folder: Path, robot: str) -> None:
         problems = shortened_problems(installed_sentences(folder, confirmation.enclaves(), moment))
     confirmation, agent = replace(confirmation, problems=problems), read_state(folder)
     if agent.due and agent.boot == boot_id():  # without an agent, nobody knows
-        confirmation = replace(confirmation, restart=agent.due, crl_restart=agent.list_due)
+        # Not which of them lack the list: files may have changed since the agent looked.
+        confirmation = replace(confirmation, restart=agent.due)
     echo_document(render_confirmation(confirmation))
 
 

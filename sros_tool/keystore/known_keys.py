@@ -76,13 +76,13 @@ def _entries_of_trusted(keystore: OpenedKeystore) -> Iterator[Entry]:
             yield entry
 
 
-def revoked_issues(keystore: OpenedKeystore) -> Iterator[Entry]:
+def revoked_issues(keystore: OpenedKeystore, listed: Collection[str] = ()) -> Iterator[Entry]:
     """Yield what was issued to enclaves with revoked certificates of CAs that are trusted now.
 
     Each such certificate is yielded once, by the entry that records it, else by its revocation; and
-    all permissions of its enclave.
+    all permissions of its enclave.  Certificates with the serial numbers ``listed`` are left out.
     """
-    serials = {f"{serial:x}" for serial in revoked_serials(keystore)}
+    serials = {f"{serial:x}" for serial in revoked_serials(keystore)}.difference(listed)
     recorded = keystore.ledger_file.with_values("serial", serials).entries if serials else ()
     names = {entry.enclave for entry in recorded if entry.serial in serials} - {""}
     since = _trusted_since(keystore) if names else ""
@@ -126,8 +126,8 @@ def unlisted_revocations(keystore: OpenedKeystore, now: datetime) -> Sequence[st
     def read() -> Sequence[str]:
         lists = keystore.revocation_lists
         listed = {f"{entry.serial:x}" for crl in lists for entry in crl.revoked}
-        revoked = (e for e in revoked_issues(keystore) if e.serial and e.not_after > iso(now))
-        return sorted({entry.enclave for entry in revoked if entry.serial not in listed})
+        revoked = revoked_issues(keystore, listed)
+        return sorted({e.enclave for e in revoked if e.serial and e.not_after > iso(now)})
 
     return keystore.once(("unlisted", now), read)
 
@@ -166,16 +166,19 @@ def _known_authorities(keystore: OpenedKeystore, role: str) -> frozenset[str] | 
 
 
 def _is_of_trusted(keystore: OpenedKeystore, entry: Entry, since: str) -> bool:
-    """Return whether a CA that is trusted ``since`` a moment issued a revoked certificate.
+    """Return whether a CA that is trusted ``since`` a moment may have issued a certificate.
 
-    Where the ledger does not tell, the certificate in the folder ``revoked`` does, if it is there.
+    The CA before it goes on to issue until the stage reissue of a rotation: of certificates since
+    then, the revoked file tells, if it is there and the one that the ledger records.
     """
-    if entry.what == "certificate" and entry.time != since:
-        return entry.time > since
+    recorded = entry.what == "certificate"
+    if recorded and entry.time < since:
+        return False
     file = keystore.identity_file
     with suppress(SrosError):
         certificate = keystore.certificate(f"{REVOKED}/{entry.serial}/{CERTIFICATE_FILE}")
-        return not file or any(issued_by(certificate, ca) for ca in keystore.certificates_of(file))
+        if file and (not recorded or digest(certificate) == entry.sha256):
+            return any(issued_by(certificate, ca) for ca in keystore.certificates_of(file))
     return True
 
 

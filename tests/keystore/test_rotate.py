@@ -6,7 +6,7 @@ import json
 import re
 import shutil
 import subprocess
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -19,9 +19,10 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.delivery.export import distribute
+from sros_tool.keystore.delivery.release import retired_authorities
 from sros_tool.keystore.issuing import keyring
 from sros_tool.keystore.issuing.keyring import Keyring
-from sros_tool.keystore.known_keys import revoked_issues
+from sros_tool.keystore.known_keys import revoked_issues, unlisted_revocations
 from sros_tool.keystore.layout import ROTATION, enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
@@ -297,6 +298,23 @@ def test_an_existing_ca_replaces_one_only_with_its_key(separate: Path, tmp_path:
     sros(*rotate, "--identity", "--identity-ca", other / ca.format("identity"), *named).ok()
     (now,) = OpenedKeystore(separate).certificates_of("identity_ca")
     assert pem(now) == (other / ca.format("identity")).read_bytes()
+    rotate_ca(separate, roles=["permissions"], now=NOW)
+    with pytest.raises(UsageError, match="stage distribute of a rotation to another CA"):
+        rotate_ca(separate, now=NOW, existing={"identity": pem(now)})
+
+
+def test_robots_never_take_the_ca_that_comes_next_for_one_that_was_replaced(root: Path) -> None:
+    """As for a CA that was imported today: what sros makes is valid from a day ago."""
+    early = NOW - timedelta(hours=3)
+    before = [ca for role in ("identity", "permissions") for ca in trusted_by(root, role)]
+    rotate_ca(root, now=early)
+    for role in ("identity", "permissions"):
+        old = [ca for ca in trusted_by(root, role) if ca in before]
+        assert old and not retired_authorities(old, trusted_by(root, role))
+
+
+def trusted_by(root: Path, role: str) -> Sequence[x509.Certificate]:
+    return OpenedKeystore(root).authority(role)
 
 
 def test_same_key_is_not_for_a_ca_that_signs_permissions(tmp_path: Path) -> None:
@@ -486,6 +504,22 @@ def test_a_revoked_certificate_of_a_ca_that_is_gone_is_not_of_a_trusted_one(
     assert not [e for e in revoked_issues(OpenedKeystore(separate)) if e.serial]
     revoke(separate, ["/a"], now=NOW)
     assert {e.enclave for e in revoked_issues(OpenedKeystore(separate)) if e.serial} == {"/a"}
+
+
+def test_what_the_old_ca_issued_during_a_rotation_and_was_revoked_keeps_no_export(
+    separate: Path, tmp_path: Path
+) -> None:
+    """Its list is gone with the CA; no certificate says that it is of the CA that came next."""
+    rotate_ca(separate, now=NOW)
+    later = NOW + timedelta(minutes=1)
+    create_enclaves(separate, ["/late"], now=later)
+    revoke(separate, ["/late"], now=later)
+    (folder,) = (separate / "revoked").iterdir()
+    rotate_ca(separate, finish=True, now=later)
+    distribute(OpenedKeystore(separate), ["/a"], tmp_path / "out", now=later)
+    assert not unlisted_revocations(OpenedKeystore(separate), later)
+    shutil.copy(enclave_path(separate, "/a") / "cert.pem", folder / "cert.pem")
+    assert unlisted_revocations(OpenedKeystore(separate), later) == ["/late"], "another certificate"
 
 
 def lists_of(root: Path) -> list[tuple[str, set[int]]]:

@@ -23,7 +23,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.fleet.robots import robot_of
-from sros_tool.keystore.fleet import checked_fleet, load_fleet
+from sros_tool.keystore.fleet import checked_fleet, load_fleet, publish_command
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.authority import (
     Authority,
@@ -161,13 +161,19 @@ def rotate_ca(
         KeystoreError: a key is missing, an enclave cannot be moved to the new CA, robots would be
             cut off, or vendors would refuse enclaves that they accept today.
         UsageError: the stage ``to`` is over, or is not the next stage, or has no old key that
-            ``delete_old_key`` could delete.
+            ``delete_old_key`` could delete; or a rotation that goes on has ``existing`` CAs.
     """
     change = KeystoreChange(
         root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
     )
     with change:
         rotation = read_rotation(change.keystore)
+        if existing and rotation.stage is not RotationStage.NONE:
+            raise UsageError(
+                f"the keystore is at the stage {rotation.stage} of a rotation to another CA",
+                "A rotation to a CA that exists begins with its certificate.",
+                "End this rotation first, without the certificate.",
+            )
         stage = RotationStage.RETIRE if finish else _target_stage(change.keystore, rotation, to)
         rotator = _Rotator(change, rotation, delete_old_key=delete_old_key)
         cut_off: tuple[str, ...] = ()
@@ -996,10 +1002,20 @@ def _make_successor(
     name = old[0].subject
     if PERMISSIONS not in roles:
         name = common_name(f"{template.authority_name} identity CA {secrets.token_hex(4)}")
+    # Robots tell by the dates which CA replaced which: see `retired_authorities`.
+    first = validity_of(old[0]).not_before
     if existing:
         certificate = _existing_ca(change, roles, existing, key, name)
+        if validity_of(certificate).not_before < first and publish_command(change.root):
+            raise KeystoreError(
+                f"{authority_text(certificate)} is valid from before the {_ca_name(roles)} that it "
+                "would replace",
+                "Robots that fetch would take it for a CA that was replaced, and refuse it.",
+                "Make a new CA: leave out its certificate.",
+            )
     else:
-        certificate = issue_ca(key, name, validity)
+        later = replace(validity, not_before=max(validity.not_before, first))
+        certificate = issue_ca(key, name, later)
     return _Successor(file, roles, old, Authority(certificate, key), place or at)
 
 
