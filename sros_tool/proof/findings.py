@@ -28,6 +28,7 @@ from sros_tool.policy.model import ALLOW, Source
 from sros_tool.policy.rights import KIND_OF, Right
 from sros_tool.proof.decide import MOST_STEPS, KeptUse, Use, Verdict, Witness, Worlds
 from sros_tool.proof.requirements import (
+    EXCEPT,
     Apart,
     AtMost,
     Must,
@@ -294,19 +295,16 @@ def _edit_text(violation: Violation) -> str:
     """Return the edit of a requirement that would accept what breaks it, as a sentence, or ""."""
     requirement = violation.requirement
     match requirement:
-        case Only():
-            differing = [steps[0].use.enclave for steps in violation.differing]
-            key, enclaves = (
-                "enclaves",
-                [violation.steps[0].use.enclave, *violation.alike, *differing],
-            )
-        case Apart():
+        case Only(enclaves=listed):
+            key, enclaves = "enclaves", [violation.steps[0].use.enclave, *violation.alike]
+            enclaves += [steps[0].use.enclave for steps in violation.differing]
+        case Apart(through=listed, sources=sources):
             key, enclaves = "through", [violation.steps[-2].use.enclave]
-            if enclaves[0] in requirement.sources:  # it would be kept apart from nothing any more
+            if enclaves[0] in sources:  # it would be kept apart from nothing any more
                 return ""
         case _:
             return ""
-    if requirement.robot:  # its enclaves stand for those of all robots
+    if not requirement.as_written or any(name.startswith(EXCEPT) for name in listed):
         return ""
     place, quoted = requirement.source, [f'"{name}"' for name in sorted({*enclaves})]
     return (

@@ -79,7 +79,8 @@ class RobotNames(NamedTuple):
 class Requirement:
     """Base class of requirements: place of its table in the file, its name and reason (or "").
 
-    ``robot`` is the robot whose values its placeholders have, or "".
+    ``robot`` is the robot whose values its placeholders have, or "".  ``as_written`` says whether
+    its names are those in the file, and not of a robot or namespace.
     """
 
     KIND: ClassVar[str]
@@ -89,6 +90,7 @@ class Requirement:
     why: str = ""
     robot: str = ""
     of_robots: tuple[RobotNames, ...] = field(default=(), compare=False, repr=False)
+    as_written: bool = field(default=True, compare=False, repr=False)
 
     def __str__(self) -> str:
         """Return the requirement's own name, or the sentence with its demand."""
@@ -454,7 +456,8 @@ class _Table:
                 )
         texts = {key: self.text(key) if key in self.values else "" for key in _WORDS}
         robots = {"robot": self.robot, "of_robots": self.of_robots}
-        return {"source": self.source, **robots, **texts}
+        as_written = not self.robot and self.namespace == "/"
+        return {"source": self.source, "as_written": as_written, **robots, **texts}
 
     def text(self, key: str) -> str:
         value = self.values.get(key)

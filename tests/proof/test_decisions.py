@@ -126,10 +126,20 @@ def test_after_the_edit_that_a_finding_names_the_requirement_holds(
     assert not decided(rights, required.replace(kept, f"{kept}, {added}")).violations
 
 
-def test_no_edit_lets_an_enclave_through_that_a_requirement_names_as_its_source() -> None:
-    rights = {"/web": may("publish", "/cmd"), "/motor": may("subscribe", "/cmd")}
-    required = parse_requirements(b'[[apart]]\nfrom = ["/web"]\nto = ["/motor"]\n', "r.toml")
-    (finding,) = requirement_findings(required, robot(rights))
+@pytest.mark.parametrize(
+    ("required", "namespace"),
+    [
+        ('[[apart]]\nfrom = ["/n/web"]\nto = ["/n/motor"]\n', "/"),
+        ('[[only]]\npublish = ["/cmd"]\nenclaves = ["*", "!/n/web"]\n', "/"),
+        ('[[only]]\npublish = ["/cmd"]\nenclaves = ["/motor"]\n', "/n"),
+    ],
+)
+def test_no_edit_is_named_that_would_empty_a_requirement_or_not_help(
+    required: str, namespace: str
+) -> None:
+    rights = {"/n/web": may("publish", "/cmd"), "/n/motor": may("subscribe", "/cmd")}
+    requirements = parse_requirements(required.encode(), "r.toml", namespaces=[namespace])
+    (finding,) = requirement_findings(requirements, robot(rights))
     assert "if this is wanted" not in finding.remedy
 
 
