@@ -744,13 +744,14 @@ def _missing_common_part_cause(lacking: Sequence[_Lacking]) -> Cause:
     target = quote(str(file.parent / COMMON))
     copy = "" if copied else f"Run `sros policies --copy {target}`, and "
     at = f"line{'s' * (len(lines) > 1)} {names_text([str(line) for line in lines])}"
-    if plural:
+    place = "the <profile> of every node" if plural else "its <profile>"
+    if plural and len(lines) == len(nodes):  # one in each line, as sed edits the first of a line
         addresses = "".join(f"{line}ba;" for line in lines)
         edit = quote(f"{addresses}b;:a;s|<profile [^>]*[^/>]>|&{_INCLUDE}|")
-        put = f"put the line in this command into the <profile> of every node ({at}): "
+        put = f"put the line in this command into {place} ({at}): "
         remedy = f"{copy}{put}`sed -i {edit} {quote(str(file))}`"
     else:
-        remedy = f"{copy}put this line into its <profile> ({at}): {_INCLUDE}"
+        remedy = f"{copy}put this line into {place} ({at}): {_INCLUDE}"
     remedy = f"{remedy[0].upper()}{remedy[1:]}"
     if any(_is_any_node(node) for node in nodes):
         remedy = f"{_NAME_FIRST} {remedy}"

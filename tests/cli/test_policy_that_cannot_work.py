@@ -104,6 +104,9 @@ def test_nodes_without_the_common_part_are_one_paragraph_with_one_mend(tmp_path:
     (command,) = re.findall("`(sed .+?)`", ended.out)
     subprocess.run(shlex.split(command), cwd=tmp_path, check=True)
     assert policy.read_text() == by_hand
+    policy.write_text(before.replace("\n", ""))  # sed would edit the first profile alone, each time
+    said = sros("check", "robot.xml", cwd=tmp_path).out
+    assert "6 nodes lack the common part" in said and "`sed " not in said
 
 
 def test_an_older_common_part_that_is_included_is_replaced(tmp_path: Path) -> None:
