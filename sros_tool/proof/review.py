@@ -652,7 +652,10 @@ class _Review:
             content = self.request.repository.content(entries[path].id)
             if (Path(path).name, content) not in shipped:
                 lines.append((f"{_NOT_USED} --leave-out {quote(path)}, or delete it", path))
-        for path in self._unreviewed_keystores(changed):
+        earlier = list(self._changed_files(self.base, self.head))
+        for path in self._unreviewed_keystores([*changed, *earlier]):
+            if not self._has(self.head, str(Path(path) / ENCLAVES)):
+                continue  # the change deletes it, or it only has certificates of CAs
             text = (
                 "is a keystore that changes and is not reviewed: name it with --keystore, or leave"
             )
@@ -668,11 +671,7 @@ class _Review:
                 named.append(("changes and is too large to be reviewed", path))
             if clause := self._hidden_entry_clause(path, entry):
                 lines.append((f"changes and is not reviewed: it is {clause}", path))
-        gone = [
-            (path, entry)
-            for path, entry in self._changed_files(self.base, self.head)
-            if not self._has(self.head, path)
-        ]
+        gone = [(path, entry) for path, entry in earlier if not self._has(self.head, path)]
         for path in self._policies_among(gone, self.base, known=False):
             new = names.get(dict(gone)[path].id)
             named.append((f"is renamed to '{new}'" if new else "is deleted", path))

@@ -971,9 +971,14 @@ def test_whether_a_keystore_is_signed_for_the_policies(
     assert changed.status == 1
     assert "'r1/export' is a keystore that changes and is not reviewed: name it" in changed.out
     assert "'ks' is a keystore" not in changed.out
-    for file in ("public/identity_ca.cert.pem", "enclaves/a/cert.pem"):
+    certificate = "enclaves/a/cert.pem"
+    for file, new in (
+        ("public/identity_ca.cert.pem", "x"),
+        (certificate, "x"),
+        (certificate, None),
+    ):
         change.base = change.commit({})
-        change.commit({f"ks/{file}": "another"})
+        change.commit({f"ks/{file}": new})
         assert "'ks' is a keystore that ch" in change.review("--policy", "robot.xml").out, file
     with monkeypatch.context() as patched:
         patched.setattr(review, "_MOST_ENTRIES", 20)
@@ -983,6 +988,10 @@ def test_whether_a_keystore_is_signed_for_the_policies(
     change.base = change.commit({})
     change.commit({"ks/enclaves/a/permissions.p7s": "x", "enclaves/governance.p7s": "y"})
     assert " is a keystore" not in change.review("--policy", "robot.xml", *left).ok().out
+    change.base = change.commit({})
+    shutil.rmtree(change.folder / "ks")
+    change.commit({})
+    assert "'ks' is a keystore" not in change.review("--policy", "robot.xml").ok().out
 
 
 def test_private_keys_in_a_commit_are_named(change: Change, made_keystores: Path) -> None:
