@@ -12,6 +12,7 @@ from subprocess import PIPE
 
 import pytest
 
+from ansible_collections.sros.fleet.plugins.module_utils import places
 from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
 from ansible_collections.sros.fleet.plugins.module_utils.places import Place
 from sros_tool.runtime.processes import boot_id
@@ -347,7 +348,9 @@ def test_processes_that_may_lack_the_revocation_list_are_remembered(
     assert not [name for name in beside(place) if "trusting" in name]
 
 
-def test_restarts_that_an_agent_noted_are_due(place: Place) -> None:
+def test_restarts_that_an_agent_noted_are_due(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It may have brought files since the last play, and its processes are not restarted yet."""
     files, path = place.read(), Path(place.path, ".agent/state.json")
     assert place.agent_due(files) == []
@@ -365,3 +368,6 @@ def test_restarts_that_an_agent_noted_are_due(place: Place) -> None:
     module = pytest.importorskip("ansible_collections.sros.fleet.plugins.modules.enclaves")
     said = module._confirmation(place, {"robot": "r1"}, files, 0.0)
     assert said["restart"] == said["crl_restart"] == ["/a"]
+    path.write_text(json.dumps({"due": ["/b"], "boot": "perhaps of an earlier start"}))
+    monkeypatch.setattr(places, "_BOOT_ID", "/nowhere")
+    assert place.agent_due(files) == ["/b"]

@@ -23,7 +23,7 @@ from sros_tool.keystore.delivery.release import retired_authorities
 from sros_tool.keystore.issuing import keyring
 from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.known_keys import revoked_issues, unlisted_revocations
-from sros_tool.keystore.layout import ROTATION, enclave_path, list_enclaves
+from sros_tool.keystore.layout import FLEET_ROOT, ROTATION, enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotate import RotationStep, renew_identity_ca, rotate_ca
@@ -311,6 +311,21 @@ def test_robots_never_take_the_ca_that_comes_next_for_one_that_was_replaced(root
     for role in ("identity", "permissions"):
         old = [ca for ca in trusted_by(root, role) if ca in before]
         assert old and not retired_authorities(old, trusted_by(root, role))
+
+
+def test_no_existing_ca_that_robots_would_take_for_a_replaced_one(
+    separate: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "other"
+    create_keystore(other, template=load_template("production"), now=NOW - timedelta(days=1))
+    ca = {"identity": (other / "public/identity_ca.cert.pem").read_bytes()}
+    key = Keyring(places={"identity": f"file:{other}/private/identity_ca.key.pem"})
+    rotate = partial(rotate_ca, separate, roles=["identity"], now=NOW, existing=ca, new_keys=key)
+    assert rotate(dry_run=True).stage is RotationStage.DISTRIBUTE, "no robot fetches"
+    (separate / FLEET_ROOT).parent.mkdir(exist_ok=True)
+    (separate / FLEET_ROOT).touch()
+    with pytest.raises(KeystoreError, match="is valid from before the identity CA"):
+        rotate()
 
 
 def trusted_by(root: Path, role: str) -> Sequence[x509.Certificate]:

@@ -31,6 +31,7 @@ _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _OF_OTHERS = stat.S_IWGRP | stat.S_IWOTH
 _MOST_LINKS = 40
 _AGENT, _AGENT_STATE = ".agent", "state.json"
+_BOOT_ID = "/proc/sys/kernel/random/boot_id"
 _LONGEST_WAIT = 60.0
 
 
@@ -364,7 +365,8 @@ class Place:
                 content = _read_file(agent, _AGENT_STATE, os.path.join(self.path, _AGENT))
             state = json.loads(content.decode())
             due = sorted({check_enclave(enclave) for enclave in state["due"]})
-            return [] if state["boot"] not in ("", _boot_id()) else due
+            boot = _boot_id()
+            return [] if boot and state["boot"] not in ("", boot) else due
         except FileNotFoundError:
             return []
         except (
@@ -410,8 +412,10 @@ class Place:
 
 
 def _boot_id() -> str:
-    with open("/proc/sys/kernel/random/boot_id") as file:
+    """Return the id of the start of the machine; "" if it cannot be read."""
+    with contextlib.suppress(OSError), open(_BOOT_ID) as file:
         return file.read().strip()
+    return ""
 
 
 def _mode(path: str) -> int:
