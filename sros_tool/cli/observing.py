@@ -145,6 +145,7 @@ def observe(
         look_for,
         settle,
         with_certified_enclaves,
+        with_owners_of_strays,
     )
     from sros_tool.runtime.variables import ENABLE
     from sros_tool.validity import parse_duration
@@ -170,7 +171,7 @@ def observe(
             return replace(
                 snapshot,
                 observation=identify(snapshot.observation),
-                everything=identify(snapshot.everything),
+                everything=identify(with_owners_of_strays(snapshot.everything)),
             ), graph.rmw
     except ObserverError as error:
         raise _observer_error(error, environment) from error

@@ -26,12 +26,19 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol, Self
 
 from sros_tool.errors import UnavailableError
-from sros_tool.graph.observation import Endpoint, Observation, ObservedNode, make_observation
+from sros_tool.graph.observation import (
+    SUBSCRIBE,
+    Endpoint,
+    Observation,
+    ObservedNode,
+    make_observation,
+)
+from sros_tool.names import SERVICE_ENDS, node_of_service
 from sros_tool.pki.certificates import IDENTITY_DIGITS
 
 _LOG = logging.getLogger(__name__)
@@ -436,6 +443,48 @@ def _with_enclaves_by_order(
     ):
         return candidates  # the list is not in the documented order
     return {process: frozenset(by_owner.get(process, left)) for process, left in candidates.items()}
+
+
+# ── nodes that were never announced ─────────────────────────────────────────────────────
+
+
+def with_owners_of_strays(observation: Observation) -> Observation:
+    """Return the observation with the strays of each process as endpoints of its only node.
+
+    A process that leaves soon may never announce its node: the standard services of every node
+    name it.  Its possible enclaves are those of nodes with the same name, or else "/".  Strays of a
+    process without a known node, or with several nodes, stay strays.
+    """
+    by_process: dict[str, set[Endpoint]] = {}
+    for participant, endpoint in observation.strays:
+        by_process.setdefault(participant, set()).add(endpoint)
+    announced = {(enclave, ns, name) for enclave, ns, name in observation.silent}
+    names: dict[str, set[_Name]] = {}
+    for node in observation.nodes:
+        announced |= {(enclave, node.ns, node.name) for enclave in node.enclaves}
+        names.setdefault(node.participant, set()).add((node.ns, node.name))
+    owners = []
+    for participant, endpoints in by_process.items():
+        known = names.get(participant, set()) | set(_serving_nodes(endpoints))
+        if len(known) == 1:
+            (owner,) = known
+            enclaves = tuple(sorted(e for e, *name in announced if tuple(name) == owner))
+            owners.append(
+                ObservedNode(
+                    enclaves or _DEFAULT_ENCLAVE, *owner, participant, frozenset(endpoints)
+                )
+            )
+    return observation.union(make_observation(owners))
+
+
+def _serving_nodes(endpoints: Iterable[Endpoint]) -> Iterator[_Name]:
+    """Yield namespace and name of each node whose standard services these endpoints serve."""
+    for topic, direction in endpoints:
+        if topic.startswith("rq/") and direction == SUBSCRIBE:
+            node = node_of_service(topic[2:].removesuffix(SERVICE_ENDS["rq"]))
+            if node:
+                ns, _, name = node.rpartition("/")
+                yield ns or "/", name
 
 
 # ── enclaves by certificates ────────────────────────────────────────────────────────────

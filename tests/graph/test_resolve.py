@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from sros_tool.graph.observation import Endpoint
-from sros_tool.graph.observe import NOBODY, Listed, Sighting, resolve
+from sros_tool.graph.observation import Endpoint, make_observation
+from sros_tool.graph.observe import NOBODY, Listed, Sighting, resolve, with_owners_of_strays
+from tests.graph.graphs import graph, node
 
 X = Endpoint("rt/x", "publish")
 
@@ -75,3 +76,25 @@ def test_endpoints_of_nobody_and_nodes_without_endpoints() -> None:
     assert seen.silent == {("/one", "/", "quiet")}
     assert seen.strays == {("p1", X), ("p9", X)}
     assert [node.name for node in seen.nodes] == ["a"]
+
+
+def test_strays_belong_to_the_only_node_of_their_process() -> None:
+    tool = node("/n/tool", "call dock", like="python", enclave="/tool", participant="p2")
+    seen = make_observation(
+        [node("/a", "publish x"), node("/n/tool", "publish y", enclave="/tool", participant="p3")],
+        strays=[
+            ("p1", Endpoint("rt/later", "publish")),
+            *(("p2", endpoint) for endpoint in tool.endpoints),
+        ],
+    )
+    found = with_owners_of_strays(seen)
+    assert found.strays == frozenset()
+    assert found.nodes[0].endpoints == node("/a", "publish x", "publish later").endpoints
+    assert found.nodes[1] == tool
+
+
+def test_strays_of_a_process_without_a_name_or_with_two_stay() -> None:
+    other = node("/b", like="python").endpoints
+    strays = [("p9", X), *(("p1", endpoint) for endpoint in other)]
+    seen = make_observation(graph(node("/a", "publish x")).nodes, strays=strays)
+    assert with_owners_of_strays(seen) == seen
