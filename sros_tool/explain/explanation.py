@@ -48,10 +48,8 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.participant import LoadedEnclave, plan_enclave
 from sros_tool.names import (
-    GLOBAL_TOPICS,
     NODE_SERVICES,
     is_expression,
-    node_of_service,
     nodes_served,
 )
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source
@@ -379,17 +377,16 @@ _ALIKE = 0.9
 """Lowest similarity (`difflib` ratio, 0 to 1) that counts as a typing error in a ROS name."""
 
 
-def likely_names(answer: Answer, *, or_only: bool = False) -> tuple[str, ...]:
+def likely_names(answer: Answer) -> tuple[str, ...]:
     """Return at most three allowed names that may be meant instead of the denied name.
 
     For a service that every node offers, they are the same services of the enclave's nodes.  For
     any other name, they are names with the same last part (a forgotten remapping), or else names
-    with a similar spelling, or else, with ``or_only``, the only name of its kind.
+    with a similar spelling.
     """
     question = answer.question
     names = {right.name for right in named_rights(answer) if right.right == question.right}
-    is_service = question.type == "service"
-    return _similar_names(question.name, names - {question.name}, is_service, or_only=or_only)
+    return _similar_names(question.name, names - {question.name}, question.type == "service")
 
 
 def likely_meaning(right: Right, used: Collection[Right], named: Iterable[Right]) -> str:
@@ -406,7 +403,7 @@ def likely_meaning(right: Right, used: Collection[Right], named: Iterable[Right]
             kind = "an action" if other.kind == "actions" else "a service"
             return f"the policy has it as {kind} ({other.right})"
     names = {other.name for other in unused if other.right == right.right}
-    similar = _similar_names(right.name, names, right.kind == "services", or_only=True)
+    similar = _similar_names(right.name, names, right.kind == "services")
     meaning = f"perhaps the policy means {' or '.join(similar)}" if similar else ""
     if len(similar) == 1 and right.kind != "actions":
         meaning += f" (the node may lack its remapping: -r {right.name}:={similar[0]})"
@@ -420,9 +417,7 @@ def named_rights(answer: Answer) -> tuple[Right, ...]:
     return tuple(sorted(named, key=order))
 
 
-def _similar_names(
-    name: str, names: AbstractSet[str], is_service: bool, *, or_only: bool
-) -> tuple[str, ...]:
+def _similar_names(name: str, names: AbstractSet[str], is_service: bool) -> tuple[str, ...]:
     last = name.rpartition("/")[2]
     same_last = sorted(other for other in names if other.rpartition("/")[2] == last)
     if (is_service and last in NODE_SERVICES) or 0 < len(same_last) <= _SHOWN:
@@ -431,10 +426,7 @@ def _similar_names(
         return ()
     from difflib import get_close_matches  # for this alone, which is asked last
 
-    similar = get_close_matches(name, sorted(names), n=_SHOWN, cutoff=_ALIKE)
-    candidates = [other for other in names - GLOBAL_TOPICS if not node_of_service(other)]
-    is_only = or_only and len(candidates) == 1 and name not in GLOBAL_TOPICS
-    return tuple(similar or (candidates if is_only else ()))
+    return tuple(get_close_matches(name, sorted(names), n=_SHOWN, cutoff=_ALIKE))
 
 
 _SHOWN = 3

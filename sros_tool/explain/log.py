@@ -42,7 +42,7 @@ from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.selection import likely_names as likely_enclaves
 from sros_tool.names import ACTION_SEPARATOR, SERVICE_ENDS, check_enclave_name, nodes_served
 from sros_tool.pki.certificates import IDENTITY_DIGITS
-from sros_tool.policy.model import ALLOW, Policy
+from sros_tool.policy.model import ALLOW, Enclave, Policy, policy_in_namespace
 from sros_tool.policy.patterns import covers
 from sros_tool.runtime.log_texts import NO_ENCLAVE, RUNS_OPEN, UNKNOWN, LogText
 from sros_tool.runtime.vendor_log import (
@@ -194,6 +194,35 @@ class SearchedKeystore:
         return {node: tuple(sorted(enclaves)) for node, enclaves in enclaves_by_node.items()}
 
 
+@dataclass(frozen=True, slots=True)
+class AskedPolicy:
+    """The policy of a question about a log, perhaps of a robot that has it in a namespace.
+
+    ``file`` is its path, and ``name`` the enclave that the user named, or "".
+    """
+
+    file: str
+    policy: Policy
+    name: str
+
+    def place(self, enclave: str) -> tuple[str, str]:
+        """Return the namespace of the policy on the robot, and an enclave's path in the policy.
+
+        ``enclave`` is the path on the robot.  The path in the policy is "" if no enclave fits.
+        """
+        paths = [stated.path for stated in self.policy.enclaves]
+        if enclave in paths:
+            return "", enclave
+        fitting = [path for path in paths if path != "/" and enclave.endswith(path)]
+        path = self.name if self.name in fitting else max(fitting, key=len, default="")
+        return enclave.removesuffix(path) if path else "", path
+
+    def enclave(self, enclave: str) -> Enclave | None:
+        """Return an enclave as the robot has it, or None if the policy has none for it."""
+        ns, path = self.place(enclave)
+        return policy_in_namespace(self.policy, ns).enclave(enclave) if path else None
+
+
 FindEnclave = Callable[[str], LoadedEnclave | None]
 """Function that loads an enclave by name ("": the one that the user named), or returns None."""
 
@@ -217,11 +246,12 @@ def explain_log_of(
         PolicyError: the policy cannot be read, or does not have the enclave ``name``.
     """
     named: LoadedEnclave | None = None
-    policy: Policy | None = None
+    policy: AskedPolicy | None = None
     if policy_file:
-        _, policy = policy_to_ask(policy_file, fleet_of(asking.fleet_file, None))
-        if name and policy.enclave(name) is None:
-            raise not_in_policy_error(policy, name, policy_file)
+        _, stated = policy_to_ask(policy_file, fleet_of(asking.fleet_file, None))
+        policy = AskedPolicy(str(policy_file), stated, name)
+        if name and not policy.place(name)[1]:
+            raise not_in_policy_error(stated, name, policy_file)
     elif name:
         named = signed_enclave(keystore, name, asking.at)
         if named is None and not name.startswith("/"):
@@ -240,12 +270,12 @@ def explain_log_of(
     def find(enclave: str) -> LoadedEnclave | None:
         if named is not None and enclave in ("", named.name):
             return named
-        if policy is not None:
-            stated = policy.enclave(enclave or name)
-            return planned_enclave(stated, None, asking) if stated else None
-        if keystore is None or not enclave:
+        if policy is None and (keystore is None or not enclave):
             return None
         try:
+            if policy is not None:
+                of_robot = policy.enclave(check_enclave_name(enclave or name))
+                return planned_enclave(of_robot, None, asking) if of_robot else None
             check_enclave_name(enclave)
             return signed_enclave(keystore, enclave, asking.at, planned=True)
         except SrosError:  # the log names an enclave of another keystore, or a path
@@ -257,7 +287,7 @@ def explain_log_of(
         lambda enclave: asking.context(enclave.joined_domains),
         str(keystore.root) if keystore else "",
         SearchedKeystore(keystore) if keystore and is_keystore(keystore.root) else None,
-        str(policy_file or ""),
+        policy,
     )
     return ExplainedLog(log, findings, _NOTES if any(e.found for e in findings) else ())
 
@@ -277,7 +307,7 @@ def explain_log(
     context: Callable[[LoadedEnclave], JoinContext],
     root: str = "",
     keystore: SearchedKeystore | None = None,
-    policy: str = "",
+    policy: AskedPolicy | None = None,
 ) -> tuple[LogFinding, ...]:
     """Return the security messages of a log, each once, in the order of the log.
 
@@ -285,7 +315,7 @@ def explain_log(
 
     ``find`` loads an enclave; ``context`` returns domain and time for it.  ``root`` is the path of
     the keystore as suggested commands name it.  The enclaves of peers and nodes in the log are
-    looked up in ``keystore``.  ``policy`` is the path of the policy if enclaves are from one.
+    looked up in ``keystore``.  ``policy`` is the policy if enclaves are from one.
     """
     plain = plain_text(text)
     examiner = _Examiner(find, context, root, keystore, policy)
@@ -563,7 +593,7 @@ class _Examiner:
         context: Callable[[LoadedEnclave], JoinContext],
         root: str,
         keystore: SearchedKeystore | None,
-        policy: str,
+        policy: AskedPolicy | None,
     ) -> None:
         self._find = find
         self._policy = policy
@@ -851,13 +881,10 @@ class _Examiner:
         words = _words_to_ask(denial, name)
         if len(words) != 1 or denial.by_rule:
             return [], ""
-        asked = self._answer(enclave, denial.vendor, ask(words[0], name))
-        names = likely_names(asked)
-        meant = ": perhaps that is meant" if names else " instead"
-        names = names or likely_names(asked, or_only=True)
+        names = likely_names(self._answer(enclave, denial.vendor, ask(words[0], name)))
         if not names:
             return [], ""
-        return [f"the enclave may {words[0]} {' and '.join(names)}{meant}"], (
+        return [f"the enclave may {words[0]} {' and '.join(names)}: perhaps that is meant"], (
             f"If a remapping was forgotten, add `--ros-args -r {quote(name)}:={quote(names[0])}`; "
             f"otherwise {remedy}"
         )
@@ -865,15 +892,24 @@ class _Examiner:
     def _how_to_ask(self, denial: Denial, name: str) -> str:
         """Return the commands that show which rights a policy lacks for the topic of a denial."""
         root, enclave = self._root or "KEYSTORE", denial.enclave or "ENCLAVE"
-        asked = quote(self._policy) if self._policy else root
+        asked, advice = self._policy.file if self._policy else root, ""
+        if self._policy:
+            ns, path = self._policy.place(denial.enclave or self._policy.name)
+            enclave = path or self._policy.name or enclave
+            if ns and name.startswith(f"{ns}/"):
+                name = name.removeprefix(ns)
+                advice = (
+                    f" Write {name[1:]} in the policy, without a / at its beginning: the robot of "
+                    f"the log has the policy in namespace {ns}."
+                )
         enclave = "PEER" if denial.remote else enclave
         commands = [
-            f"`sros explain {asked} {quote(enclave)} {word} {quote(name)}`"
+            f"`sros explain {quote(asked)} {quote(enclave)} {word} {quote(name)}`"
             for word in _words_to_ask(denial, name)
         ]
         if commands:
             shows = "shows" if len(commands) == 1 else "show"
-            return f"{' and '.join(commands)} {shows} what is missing in the policy."
+            return f"{' and '.join(commands)} {shows} what is missing in the policy.{advice}"
         folder = f"{root}/enclaves/{enclave.lstrip('/')}".rstrip("/")
         return (
             f"`sros inspect {quote(folder)}` shows what the permissions allow: no policy in ROS "

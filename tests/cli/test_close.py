@@ -252,7 +252,7 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     robot.units = UNITS
     robot.close()
     policy = robot.folder / "robot/policy.xml"
-    policy.write_text(policy.read_text().replace("chatter", "gossip", 1))
+    policy.write_text(policy.read_text().replace("chatter", "old/chatter", 1))
     changed = policy.read_text()
     ended = robot.close()
     assert "/listener: the rights that it lost still work until 20" in ended.err
@@ -265,8 +265,9 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     again = robot.close("--for", "1s", status=1)
     assert policy.read_text() == changed
     assert "nothing is closed yet; fix this first:\n  'robot/policy.xml' stays as it " in again.out
-    remapped = "perhaps the policy means /gossip (the node may lack its remapping: -r /chatter:="
-    assert f"lacks 1 right seen now (/listener subscribe /chatter); {remapped}/gossip)" in again.out
+    remapped = "perhaps the policy means /old/chatter (the node may lack its remapping: -r "
+    assert f"lacks 1 right seen now (/listener subscribe /chatter); {remapped}" in again.out
+    assert "-r /chatter:=/old/chatter)" in again.out
     assert "; then restart it with that, and watch again: sros close robot --for 1m;" in again.out
     assert " otherwise, if a process should not have them, stop it, and run `sros c" in again.out
     add = "sros merge_policy robot/policy.xml robot/seen.xml --in-place"
@@ -704,7 +705,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     robot.remaining = (TALKER, LISTENER)
     robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
     policy = robot.folder / "robot/policy.xml"
-    policy.write_text(policy.read_text().replace("chatter", "gossip", 1))
+    policy.write_text(policy.read_text().replace("chatter", "old/chatter", 1))
     ended = robot.close("--proof", "--partial")
     assert (
         "policy.xml' differs from the signed permissions of /listener: `sros close robot` checks"
@@ -1214,7 +1215,7 @@ def test_a_dry_run_changes_nothing(robot: Robot) -> None:
     robot.close()
     policy = robot.folder / "robot/policy.xml"
     signed = policy.read_text()
-    policy.write_text(signed.replace("chatter", "gossip", 1))
+    policy.write_text(signed.replace("chatter", "old/chatter", 1))
     before = snapshot(robot.folder)
     ended = robot.close("--apply", "--dry-run")
     assert "kept: sros create_keystore" in ended.err

@@ -900,6 +900,34 @@ def test_a_log_is_explained_by_a_policy_alone(tmp_path: Path) -> None:
     assert "unable to find enclave /b" in sros("explain", policy, "/b", "--log", log).err
 
 
+@pytest.mark.parametrize("named", [(), ("/a",), ("/left/a",)])
+def test_a_log_of_a_robot_that_has_the_policy_in_a_namespace(
+    named: tuple[str, ...], tmp_path: Path
+) -> None:
+    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    policy.write_text(policy_text({"/a": publish("y")}))
+    log.write_text(
+        "[INFO] [1.0] [rcl]: Found security directory: /k/enclaves/left/a\n"
+        "[SECURITY Error] rt/left/x topic not found in allow rule. -> check_create_datawriter\n"
+        "[SECURITY Error] rt/left/y topic not found in allow rule. -> check_create_datawriter\n"
+    )
+    said = sros("explain", policy, *named, "--log", log).out
+    assert f"`sros explain {policy} /a publish /x` shows what is missing in the policy" in said
+    assert "Write x in the policy, without a / at its beginning: the robot of the log has" in said
+    assert "no rule allows publish rt/left/x" in said and "the policy allows it" in said
+
+
+def test_the_enclave_that_the_user_names_is_asked_about_another_one(tmp_path: Path) -> None:
+    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    policy.write_text(policy_text({"/a": publish("y")}))
+    log.write_text(
+        "[INFO] [1.0] [rcl]: Found security directory: /k/enclaves/other\n"
+        "[SECURITY Error] rt/x topic not found in allow rule. -> check_create_datawriter\n"
+    )
+    said = sros("explain", policy, "/a", "--log", log).out
+    assert f"`sros explain {policy} /a publish /x` shows" in said
+
+
 def test_a_topic_that_is_denied_in_either_direction_is_looked_up_in_both(
     keystore: Path, tmp_path: Path
 ) -> None:
@@ -963,7 +991,7 @@ def test_a_forgotten_remapping_is_shown(keystore: Path, tmp_path: Path) -> None:
     for topic, why in (
         ("front/chatter", meant),
         ("chater", meant),
-        ("odom", " instead"),
+        ("odom", ""),  # another name, though it is the only one
         ("tf", ""),
     ):
         log.write_text(
