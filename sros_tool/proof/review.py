@@ -429,7 +429,8 @@ class _Review:
         for path, keystore in keystores.items():
             earlier_keystore = base_keystores.get(path)
             yield from self._keystore(path, keystore, earlier_keystore, of_head, head_fleet)
-        yield from self._step_result("files", "", self._converted_step)
+        # Whoever allows new access has read the commit, not what a checkout may make of it.
+        yield from self._step_result("files", "", self._converted_step, can_be_allowed=False)
         yield from self._step_result("keystore", " ".join(asked.keystores), self._keys_step)
         if self.base:
             yield from self._step_result(
@@ -448,6 +449,7 @@ class _Review:
         decide: Callable[[], tuple[int, Content] | None],
         *,
         only_with_result: bool = True,
+        can_be_allowed: bool = True,
     ) -> Iterator[ReviewStep]:
         """Run ``decide`` and yield a step with its result or its error."""
         if not only_with_result:
@@ -460,7 +462,7 @@ class _Review:
             decided = _UNDECIDED, DocumentError(f"'{error.filename}': {error.strerror}")
         if decided:
             status, content = decided
-            allowed = status == _FOUND and self._allows(kind)
+            allowed = status == _FOUND and can_be_allowed and self._allows(kind)
             yield ReviewStep(
                 kind,
                 subject,

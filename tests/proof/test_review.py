@@ -663,7 +663,8 @@ def test_a_part_that_is_missing_in_archives_is_said(change: Change, line: bytes)
     policy = (change.folder / "robot.xml").read_text().replace("</profile>", include)
     change.commit({"robot.xml": policy.encode(), "parts/part.xml": part})
     change.commit({".gitattributes": line})
-    ended = change.review("--policy", "robot.xml")
+    ended = change.review("--policy", "robot.xml", "--new-access", "allow")
+    assert ended.status == 1  # who allows new access has not seen this
     assert "'parts/part.xml' git may leave it out of an archive (export-ignore" in ended.out
 
 
