@@ -1053,8 +1053,19 @@ def _check_rules(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         if statement.allows:
             yield from _statement_findings(statement, checked_policy.rules)
         elif not checked_policy.rules.overlaps(statement.right._replace(qualifier=ALLOW)):
-            yield statement.found(NO_EFFECT, f"no rule allows to {statement.right.describe()}")
+            text = f"no rule allows to {statement.right.describe()}"
+            yield statement.found(NO_EFFECT, text, _remedy_of_denial(statement.written))
     yield from _redundancy_findings(checked_policy)
+
+
+def _remedy_of_denial(written: str) -> str:
+    """Return the remedy for a DENY without effect of a name, as it is written."""
+    if written.startswith(("/", "~")):
+        return NO_EFFECT.remedy
+    return (
+        f"{NO_EFFECT.remedy} Write /*{written.lstrip('*')} to deny the name in every namespace: "
+        f"after `sros merge_policy --namespace /left`, {written} denies only /left/{written}."
+    )
 
 
 def _statement_findings(statement: _Statement, rules: Rules) -> Iterator[Finding]:

@@ -35,7 +35,7 @@ UNNAMED = FindingKind(
 )
 DROPPED = FindingKind(
     "requirement.dropped",
-    WARNING,
+    ERROR,
     "a requirement that was removed or weakened",
     "The earlier requirements file was stricter: a policy can now allow what it forbade, without a "
     "finding.",

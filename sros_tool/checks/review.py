@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sros_tool.checks.kind import ERROR, WARNING, FindingKind
+from sros_tool.checks.kind import ERROR, FindingKind
 
 NEW_ACCESS = FindingKind(
     "review.new-access",
@@ -15,7 +15,7 @@ NEW_ACCESS = FindingKind(
 )
 DROPPED_DENIAL = FindingKind(
     "review.dropped-denial",
-    WARNING,
+    ERROR,
     "a DENY that the change drops",
     "It gives no access by itself, but other policies that are merged with this one may allow the "
     "names now.",
@@ -40,7 +40,7 @@ PRIVATE_KEY = FindingKind(
 )
 EXPIRY = FindingKind(
     "review.expiry",
-    WARNING,
+    ERROR,
     "an enclave that has to be renewed",
     "Vendors refuse an enclave whose certificate or permissions expired.",
     "The keystore of the commit, and --renew-within.",

@@ -81,6 +81,15 @@ def test_a_name_that_is_too_long(tmp_path: Path) -> None:
         assert ("policy.name-never-matches" in ids(tmp_path, text)) == found
 
 
+@pytest.mark.parametrize(
+    ("name", "advised"), [("cmd_vel", True), ("/cmd_vel", False), ("~/x", False)]
+)
+def test_a_relative_denial_is_of_one_namespace(name: str, advised: bool, tmp_path: Path) -> None:
+    found = findings(tmp_path, policy(enclave(deny("publish", name))))
+    (remedy,) = [each.remedy for each in found if each.id == "policy.deny-without-effect"]
+    assert ("Write /*cmd_vel to deny the name in every namespace" in remedy) is advised
+
+
 def test_a_denial_reaches_the_other_nodes_of_the_process(tmp_path: Path) -> None:
     other = f'</profile><profile ns="/" node="m">{BASICS}{deny("publish", "/rosout")}'
     (found, *_) = [

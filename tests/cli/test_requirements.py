@@ -135,7 +135,7 @@ def test_what_is_no_longer_demanded(folder: Path, tmp_path: Path) -> None:
     asked = (*ONLY, "--requirements", new, "--requirements-before", "required.toml")
     ended = sros(*asked, cwd=folder)
     assert ended.status == 1
-    head = f"{new}: warning: a requirement that was removed or weakened [requirement.dropped]"
+    head = f"{new}: error: a requirement that was removed or weakened [requirement.dropped]"
     assert ended.out.splitlines().count(head) == 3
     assert (
         "    only /mux may publish /cmd_vel: the new file demands less: "

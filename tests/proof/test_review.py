@@ -142,7 +142,7 @@ def test_what_fails_a_review_is_in_its_sarif(
         results = json.loads(sarif.read_text())["runs"][0]["results"]
         lines = commands.read_text().splitlines()
     result = next(each for each in results if each["ruleId"] == found)
-    assert result["level"] in ("error", "warning")
+    assert result["level"] == "error"
     (at,) = result["locations"]
     where = at["physicalLocation"]
     assert (where["artifactLocation"]["uri"], where["region"]["startLine"]) == place
@@ -161,6 +161,7 @@ def test_a_denial_that_is_gone_is_named_as_what_failed(change: Change) -> None:
     assert step["result"].startswith("1 DENY is gone, so that other policies may allow the names")
     (finding,) = json.loads(ended.out)["findings"]
     assert (finding["id"], finding["file"]) == ("review.dropped-denial", "robot.xml")
+    assert finding["severity"] == "error"
     assert "### New access: none, but a DENY is gone" in said and "**1 DENY gone**" in said
     allowed = change.review("--policy", "robot.xml", "--new-access", "allow", "--json").ok()
     (finding,) = json.loads(allowed.out)["findings"]
@@ -208,7 +209,7 @@ def test_dropping_a_requirement_is_a_consent_of_its_own(change: Change) -> None:
     words = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
     failed = change.review(*words)
     lines = (
-        "  robot.toml: warning: only /a may publish /x: the new file demands less: only /a, /b may "
+        "  robot.toml: error: only /a may publish /x: the new file demands less: only /a, /b may "
         f"publish /x [requirement.dropped] (required before: git:{change.base[:12]}:robot.toml:1)",
         "  robot.xml:6: error: /b: may publish /x, but only /a may publish /x "
         "[requirement.violated]",
