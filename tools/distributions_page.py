@@ -38,6 +38,8 @@ def distributions_page() -> str:
         written[0].rstrip(),
         MADE,
         shipped,
+        "The versions of rmw_zenoh are the first of the distribution, and the first that reads the "
+        "files of sros. "
         "A version of rmw_zenoh between those of two distributions is of Rolling, and counts for "
         "the next one: Lyrical has 0.10, and 0.7 to 0.9 came before it. The versions of DDS are "
         "the latest as of November 2026; sros assumes that patches of a release "
@@ -61,7 +63,7 @@ def _shipped() -> Iterator[tuple[str, ...]]:
     for distribution in SUPPORTED:
         first, second = map(_release, distribution.shipped)
         release = distribution.zenoh
-        zenoh = f"from {version_text(release.begin)}; {version_text(release.least)} is needed"
+        zenoh = f"from {version_text(release.begin)}; sros needs {version_text(release.least)}"
         nodes = "~/get_type_description" if has_type_descriptions(distribution.name) else ""
         yield distribution.title, distribution.until, first, second, zenoh, nodes or "without"
 

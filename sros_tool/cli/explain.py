@@ -1116,13 +1116,10 @@ def _text_without_findings(log: str) -> str:
             f"{_SILENT_ON_ZENOH}"
         )
     return (
-        f"a node ran in '{match['folder']}'. A node that its peers refuse often logs nothing: "
-        "explain the log of the other node, too. Both logs can be empty if the CAs, a revocation "
-        "list, the governance or the domains of both ends do not fit: `sros check FOLDER OTHER` "
-        "finds this in their keystores or exports. Both can also be empty if a clock is wrong: "
-        "`sros check runtime` on both machines finds a clock that is behind, `date -u` shows one "
-        "that is ahead. `sros explain KEYSTORE --who publish NAME` says whether anybody may send; "
-        f"{_SILENT_ON_ZENOH}"
+        f"the log shows nothing that was refused to a node in '{match['folder']}'. If it hears "
+        "nothing, peers may refuse it silently: explain their logs, too, and run `sros check "
+        "FOLDER OTHER` (CAs, revocation list, governance, domains) and `sros check runtime` (clock) "
+        "on both machines; on Zenoh, only logs with RUST_LOG=zenoh=trace have denials"
     )
 
 
