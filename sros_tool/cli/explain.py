@@ -1118,8 +1118,8 @@ def _text_without_findings(log: str) -> str:
     return (
         f"the log shows nothing that was refused to a node in '{match['folder']}'. If it hears "
         "nothing, peers may refuse it silently: explain their logs, too, and run `sros check "
-        "FOLDER OTHER` (CAs, revocation list, governance, domains) and `sros check runtime` (clock) "
-        "on both machines; on Zenoh, only logs with RUST_LOG=zenoh=trace have denials"
+        "FOLDER OTHER` (CAs, revocation list, governance, domains) and `sros check runtime` "
+        "(clock) on both machines; on Zenoh, only logs with RUST_LOG=zenoh=trace have denials"
     )
 
 
