@@ -41,6 +41,17 @@ SOON = timedelta(days=30)
 """How long before it expires a document counts as expiring soon, unless its validity is short."""
 
 
+def soon_limit(lifetime: timedelta) -> timedelta:
+    """Return how long before it expires a document with this lifetime counts as expiring soon.
+
+    This is 30 days, or a third of the lifetime if that is shorter, in whole days if possible, so
+    that nothing is renewed each day.
+    """
+    limit = min(SOON, lifetime / 3)
+    unit = timedelta(days=1) if limit >= timedelta(days=1) else timedelta(seconds=1)
+    return limit // unit * unit
+
+
 @dataclass(frozen=True, slots=True)
 class Window:
     """A validity from ``not_before`` to ``not_after``, both included and both in UTC."""
@@ -64,11 +75,8 @@ class Window:
         return self.not_before <= moment <= self.not_after
 
     def expires_soon_from(self) -> datetime:
-        """Return the time from which the window counts as expiring soon.
-
-        This is 30 days before it expires, or a third of its length if that is shorter.
-        """
-        return self.not_after - min(SOON, (self.not_after - self.not_before) / 3)
+        """Return the time from which the window counts as expiring soon; see `soon_limit`."""
+        return self.not_after - soon_limit(self.lifetime())
 
     def lifetime(self, made_at: datetime | None = None) -> timedelta:
         """Return how long a document with this validity is valid after it was made.

@@ -17,6 +17,7 @@ from sros_tool.validity import (
     iso,
     parse_duration,
     parse_iso,
+    soon_limit,
     window,
 )
 
@@ -98,3 +99,11 @@ def test_a_window_within_another(moment: datetime, lengths: list[int]) -> None:
         Window(moment, moment)
     with pytest.raises(UsageError):
         one.intersection(Window(one.not_after, one.not_after + timedelta(seconds=1)))
+
+
+def test_a_new_document_of_short_validity_does_not_expire_soon() -> None:
+    """Though sros writes that it is valid since a day before, which is most of its validity."""
+    made = datetime(2026, 11, 1, tzinfo=UTC)
+    for lifetime in (timedelta(minutes=5), timedelta(days=20), timedelta(days=365)):
+        soon_from = Window(made - BACKDATE, made + lifetime).expires_soon_from()
+        assert soon_from == made + lifetime - soon_limit(lifetime) > made

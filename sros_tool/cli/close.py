@@ -239,7 +239,9 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
     elif process.enclave in closed.absent:
         state = "not running"
     elif process.pid:
-        sign = process.known_by if process.known_by == "elimination" else f"its {process.known_by}"
+        # Whoever was known by its enclave and does not run there is known by its command.
+        signs = {"elimination": "elimination", "enclave": "its command"}
+        sign = signs.get(process.known_by, f"its {process.known_by}")
         state = f"process {process.pid}" + ("" if runs else f", known by {sign}")
     elif runs:
         state = "started by another command than observed"

@@ -109,9 +109,18 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
 
 def _proof_of_files(robot: LocalRobot) -> Proof:
     """Ask `check` about the files that the processes use, such as a key that others read."""
-    status = robot.shell.check(str(robot.export))
-    reasons = {0: "sros check finds none", 1: "sros check finds one", 2: "they are not checked"}
-    holds, reason = {0: True, 1: False}.get(status), reasons[status]
+    place = str(robot.export)
+    status = robot.shell.check(place)
+    holds = {0: True, 1: False}.get(status)
+    reason = "sros check finds no error" if holds else "they are not checked"
+    if holds is False:
+        _, output, _ = robot.shell.run(("check", place, "--fail-on", "error", "--json"), False)
+        errors = [of for of in json.loads(output)["findings"] if of["severity"] == "error"]
+        first = "{file}: {text}. {remedy}".format_map(errors[0]).rstrip(".")
+        reason = (
+            f"sros check finds {counted(len(errors), 'error')}, the first in {first}; then run "
+        )
+        reason += f"`{robot.close_command}`, and restart the processes"
     if holds and robot.keystore.exists():  # an export from before a revocation has no error
         try:
             _, value = robot.shell.read_json((*robot.export_words(), "--dry-run", "--json"))
@@ -123,7 +132,7 @@ def _proof_of_files(robot: LocalRobot) -> Proof:
                 number = counted(len(changes), "file")
                 reason = f"{number} of '{robot.keystore}' would change there, such as {changes[0]}"
                 holds, reason = False, f"{reason}; `{robot.close_command}` exports them"
-    return Proof("the files have no error", holds, f"{reason}: {robot.export}")
+    return Proof("the files are accepted", holds, f"{reason}: {robot.export}")
 
 
 def _proof_of_requirements(robot: LocalRobot) -> Iterator[Proof]:
@@ -345,13 +354,16 @@ class _TalkComparison:
             text += f", but for {counted(len(denied), 'right')} that the policy denies now: "
             text += ", ".join(f"{right.right.enclave} {right.right.describe()}" for right in denied)
         known = {*map(node_name, before.nodes)}
-        _, without_profile = self._nodes.divide_by_profile(self.current.nodes)
+        with_profile, without_profile = self._nodes.divide_by_profile(self.current.nodes)
         new = sorted(
             f"{node_name(node)} in {' or '.join(node.enclaves) or 'no enclave'}"
             for node in without_profile
             if node_name(node) not in known and not is_tool(node)
         )
-        return text + (f"; new, without a profile: {first_few(new, MOST_NAMES)}" if new else "")
+        text += f"; new, without a profile: {first_few(new, MOST_NAMES)}" if new else ""
+        expected = {*map(node_name, self._nodes.expected(self.current).nodes)}
+        new = sorted({*map(node_name, with_profile)} - expected)
+        return text + (f"; not compared: {first_few(new, MOST_NAMES)} (new)" if new else "")
 
 
 def _renamed_text(nodes: ObservedNodes, current: Observation | None, *, fails: bool) -> str:

@@ -164,9 +164,9 @@ def ask(word: str, name: str = "", kind: str | None = None) -> Question:
     if chosen not in fitting:
         verbs = " or ".join(verb for verb, right in _RIGHTS if right == chosen)
         raise UsageError(
-            f"nobody can {word} {_with_article(chosen)}",
-            f"A node can {word} {' or '.join(map(_with_article, fitting))}, and "
-            f"{verbs} {_with_article(chosen)}.",
+            f"nobody can {word} {with_article(chosen)}",
+            f"A node can {word} {' or '.join(map(with_article, fitting))}, and "
+            f"{verbs} {with_article(chosen)}.",
             f"Leave --type out, or write --type {fitting[0]}.",
         )
     return Question(word, chosen, _RIGHTS[word, chosen], _checked_name(name, word, chosen))
@@ -223,7 +223,7 @@ def _checked_name(name: str, word: str, kind: str) -> str:
     """Return the name; raise UsageError if no node can use it."""
     if not name:
         raise UsageError(
-            f"{word} needs the name of {_with_article(kind)}", "", f"Write `{word} /NAME`."
+            f"{word} needs the name of {with_article(kind)}", "", f"Write `{word} /NAME`."
         )
     problem = expression_problem(name)
     remedy = ""
@@ -238,12 +238,13 @@ def _checked_name(name: str, word: str, kind: str) -> str:
         problem = "It is a namespace."
     if problem:
         raise UsageError(
-            f"{name!r} cannot be the name of {_with_article(kind)} here", problem, remedy
+            f"{name!r} cannot be the name of {with_article(kind)} here", problem, remedy
         )
     return name
 
 
-def _with_article(kind: str) -> str:
+def with_article(kind: str) -> str:
+    """Return text such as ``an action``."""
     return f"an {kind}" if kind[0] in "aeiou" else f"a {kind}"
 
 

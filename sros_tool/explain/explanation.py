@@ -398,16 +398,23 @@ def likely_meaning(right: Right, used: Collection[Right], named: Iterable[Right]
     if right.kind == "dds":
         return ""
     unused = [other for other in named if other not in used]
-    for other in unused:
-        if other.name == right.name and {other.kind, right.kind} == {"services", "actions"}:
-            kind = "an action" if other.kind == "actions" else "a service"
-            return f"the policy has it as {kind} ({other.right})"
+    if of_other_kind := meaning_of_other_kind(right, unused):
+        return of_other_kind
     names = {other.name for other in unused if other.right == right.right}
     similar = _similar_names(right.name, names, right.kind == "services")
     meaning = f"perhaps the policy means {' or '.join(similar)}" if similar else ""
     if len(similar) == 1 and right.kind != "actions":
         meaning += f" (the node may lack its remapping: -r {right.name}:={similar[0]})"
     return meaning
+
+
+def meaning_of_other_kind(right: Right, named: Iterable[Right]) -> str:
+    """Return, as a clause, that ``named`` have a service as an action, or vice versa; or ""."""
+    for other in named:
+        if other.name == right.name and {other.kind, right.kind} == {"services", "actions"}:
+            kind = "an action" if other.kind == "actions" else "a service"
+            return f"the policy has it as {kind} ({other.right})"
+    return ""
 
 
 def named_rights(answer: Answer) -> tuple[Right, ...]:

@@ -20,7 +20,7 @@ from typing import NamedTuple
 from sros_tool.dds.decision.access import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import Note, SrosError, UsageError
-from sros_tool.explain.answer import Answer, Evaluator, Part, Question, ask
+from sros_tool.explain.answer import Answer, Evaluator, Part, Question, ask, with_article
 from sros_tool.explain.asking import (
     AskingContext,
     fleet_of,
@@ -30,7 +30,12 @@ from sros_tool.explain.asking import (
     signed_enclave,
 )
 from sros_tool.explain.denials import Denial, read_denials, serving_node
-from sros_tool.explain.explanation import likely_names, remedy
+from sros_tool.explain.explanation import (
+    likely_names,
+    meaning_of_other_kind,
+    named_rights,
+    remedy,
+)
 from sros_tool.faults import NEEDS_CA_KEYS, ORIGINAL_KEYSTORE, Fault, remedy_in_original_keystore
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.keystore.known_keys import enclaves_by_identity
@@ -40,7 +45,13 @@ from sros_tool.keystore.participant import JoinContext, LoadedEnclave
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.selection import likely_names as likely_enclaves
-from sros_tool.names import ACTION_SEPARATOR, SERVICE_ENDS, check_enclave_name, nodes_served
+from sros_tool.names import (
+    ACTION_PARTS,
+    ACTION_SEPARATOR,
+    SERVICE_ENDS,
+    check_enclave_name,
+    nodes_served,
+)
 from sros_tool.pki.certificates import IDENTITY_DIGITS
 from sros_tool.policy.model import ALLOW, Enclave, Policy, policy_in_namespace
 from sros_tool.policy.patterns import covers
@@ -771,7 +782,7 @@ class _Examiner:
         ``ns`` is the namespace that the whole process lacks, or "".
         """
         line, text = named[0][0], " ".join(named[0][1].split())
-        right, name = _in_ros_terms(denial)
+        right, name, _ = _in_ros_terms(denial)
         who = "a peer" if denial.remote else denial.enclave or "the process"
         by = {
             True: "a rule of the policy denies it",
@@ -878,15 +889,23 @@ class _Examiner:
         self, denial: Denial, name: str, enclave: LoadedEnclave, remedy: str
     ) -> tuple[list[str], str]:
         """Return causes and a remedy if the enclave has rights to similar names."""
-        words = _words_to_ask(denial, name)
-        if len(words) != 1 or denial.by_rule:
+        questions = _questions_to_ask(denial)
+        if len(questions) != 1 or denial.by_rule:
             return [], ""
-        names = likely_names(self._answer(enclave, denial.vendor, ask(words[0], name)))
+        (question,) = questions
+        asked = self._answer(enclave, denial.vendor, question)
+        denied = question.allowed(enclave.name)
+        if other := meaning_of_other_kind(denied, named_rights(asked)):
+            return [f"{other}, but {name} is {with_article(question.type)}"], ""
+        names = likely_names(asked)
         if not names:
             return [], ""
-        return [f"the enclave may {words[0]} {' and '.join(names)}: perhaps that is meant"], (
-            f"If a remapping was forgotten, add `--ros-args -r {quote(name)}:={quote(names[0])}`; "
-            f"otherwise {remedy}"
+        rules = (
+            f"-r {quote(name + part)}:={quote(names[0] + part)}"
+            for _, part in ACTION_PARTS.get(question.right, (("", ""),))
+        )
+        return [f"the enclave may {question.word} {' and '.join(names)}: perhaps that is meant"], (
+            f"If a remapping was forgotten, add `--ros-args {' '.join(rules)}`; otherwise {remedy}"
         )
 
     def _how_to_ask(self, denial: Denial, name: str) -> str:
@@ -904,8 +923,9 @@ class _Examiner:
                 )
         enclave = "PEER" if denial.remote else enclave
         commands = [
-            f"`sros explain {quote(asked)} {quote(enclave)} {word} {quote(name)}`"
-            for word in _words_to_ask(denial, name)
+            f"`sros explain {quote(asked)} {quote(enclave)} {question.word} {quote(name)}"
+            f"{' --type action' * (question.type == 'action')}`"
+            for question in _questions_to_ask(denial)
         ]
         if commands:
             shows = "shows" if len(commands) == 1 else "show"
@@ -1061,29 +1081,34 @@ _HALVES = {
 }
 
 
-def _in_ros_terms(denial: Denial) -> tuple[str, str]:
-    """Return the denied operation (a word of `question.WORDS`) and the ROS name."""
+def _in_ros_terms(denial: Denial) -> tuple[str, str, str]:
+    """Return the denied operation (one of `answer.WORDS`, or "use"), the ROS name, and its type."""
     prefix, topic = denial.topic[:2], denial.topic[2:]
     if prefix in SERVICE_ENDS and topic.endswith(SERVICE_ENDS[prefix]):
         name, part, _ = topic.removesuffix(SERVICE_ENDS[prefix]).partition(ACTION_SEPARATOR)
         word = _HALVES.get((prefix, denial.direction), "use")
-        return ("execute" if part and word == "serve" else word), name
-    if prefix == "rt" and topic.startswith("/"):
-        return denial.direction or "use", topic
-    return denial.direction or "use", denial.topic
+        if part:
+            return "execute" if word == "serve" else word, name, "action"
+        return word, name, "service"
+    is_topic = prefix == "rt" and topic.startswith("/")
+    return denial.direction or "use", topic if is_topic else denial.topic, "topic"
 
 
-def _words_to_ask(denial: Denial, name: str) -> tuple[str, ...]:
-    """Return the operations to ask `sros explain` about for a denied topic."""
-    right, _ = _in_ros_terms(denial)
-    either = ("call", "serve") if denial.topic[:2] in SERVICE_ENDS else (PUBLISH, SUBSCRIBE)
-    words = either if right == "use" else (right,)
+_WORDS_OF_TYPES = {
+    "topic": (PUBLISH, SUBSCRIBE),
+    "service": ("call", "serve"),
+    "action": ("call", "execute"),
+}
+
+
+def _questions_to_ask(denial: Denial) -> tuple[Question, ...]:
+    """Return the questions to ask `sros explain` about a denied topic; () without a ROS name."""
+    right, name, kind = _in_ros_terms(denial)
+    words = _WORDS_OF_TYPES[kind] if right == "use" else (right,)
     try:
-        for word in words:
-            ask(word, name)
+        return tuple(ask(word, name, kind) for word in words)
     except SrosError:  # a name that ROS does not have
         return ()
-    return words
 
 
 def _question(denial: Denial) -> Question:

@@ -20,7 +20,7 @@ from sros_tool.keystore.template import Template
 from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text, validity_of
-from sros_tool.validity import SOON, Window, duration_text, iso, parse_duration, time_of_file
+from sros_tool.validity import Window, iso, parse_duration, time_of_file
 from sros_tool.wording import counted, first_few
 
 
@@ -36,14 +36,8 @@ class Threshold(NamedTuple):
 
 
 def renewal_command(root: Path, *names: str) -> str:
-    """Return the command that renews what expires soon in a keystore, and the enclaves ``names``.
-
-    If the validity of its files is not known, 30 days before they expire count as soon.
-    """
-    limit = SOON
-    with suppress(SrosError, OSError):
-        limit = OpenedKeystore(root).template.renewal_limit
-    words = ("sros", "renew", str(root), *names, "--all-expiring", duration_text(limit))
+    """Return the command that renews what expires soon in a keystore: ``names``, or all."""
+    words = ("sros", "renew", str(root), *names, "--all-expiring", "soon")
     return " ".join(map(quote, words))
 
 

@@ -28,7 +28,15 @@ from sros_tool.names import (
 from sros_tool.pki.token import refuse_pin
 from sros_tool.policy.model import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.policy.patterns import covers, matches
-from sros_tool.validity import SOON, Span, duration_text, parse_duration, parse_span, span_text
+from sros_tool.validity import (
+    SOON,
+    Span,
+    duration_text,
+    parse_duration,
+    parse_span,
+    soon_limit,
+    span_text,
+)
 from sros_tool.xml import read_bytes
 
 if TYPE_CHECKING:
@@ -87,14 +95,10 @@ class Template:
 
     @property
     def renewal_limit(self) -> timedelta:
-        """How long before it expires an enclave is renewed: 30 days, or a third of its validity if
-        that is shorter, in whole days if possible, so that it is not renewed each day.
-        """
+        """How long before it expires an enclave is renewed: the shortest `soon_limit`."""
         validities = (self.certificate_validity, self.permissions_validity)
         lengths = (span if isinstance(span, timedelta) else span.length for span in validities)
-        limit = min((SOON, *(length / 3 for length in lengths if length)))
-        unit = timedelta(days=1) if limit >= timedelta(days=1) else timedelta(seconds=1)
-        return limit // unit * unit
+        return min((SOON, *(soon_limit(length) for length in lengths if length)))
 
     def longest_validity(self, enclave: str) -> timedelta | None:
         """Return the longest validity of a short-lived enclave; None for all others."""

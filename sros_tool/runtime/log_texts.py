@@ -224,6 +224,15 @@ _ROS_TEXTS = (
         "Correct the name: `sros list_enclaves KEYSTORE` shows all names.",
     ),
     _log_text(
+        "not-started", _ROS,
+        r"Unable to (?:run the command|print the environment): (?P<reason>a process cannot run in "
+        r"enclave .+)",
+        "sros did not start the process: {reason}",
+        "Repair what the line names (if a file expired: `sros renew KEYSTORE ENCLAVE`, and export "
+        "the enclave again), and start the process again.",
+        _ALL_FAULTS,
+    ),
+    _log_text(
         "not-started", _ROS, r"Unable to (?:run the command|print the environment): (?P<reason>.+)",
         "sros did not start the process: {reason}",
         "Repair what the line names, and start the process again.",

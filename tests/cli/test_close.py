@@ -357,7 +357,7 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     assert closed.out.splitlines()[-5:] == [
         "yes: every process was started in its enclave: 2 enclaves, and no open process in "
         "domain 0",
-        "yes: the files have no error: sros check finds none: robot/export",
+        "yes: the files are accepted: sros check finds no error: robot/export",
         "yes: the requirements hold: all of them: robot/requirements.toml",
         "yes: everything that talked can still talk: 2 nodes with 36 endpoints as before "
         "(types are not compared)",
@@ -686,7 +686,8 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     key.chmod(0o600)
     named = f"process 4711 (run): the mode of '{key}' is 0644\n"
     assert f"no: every process was started in its enclave: {named}" in ended.out
-    assert "no: the files have no error: sros check finds one: robot/export\n" in ended.out
+    assert "no: the files are accepted: sros check finds 1 error, the first in rob" in ended.out
+    assert "`; then run `sros close robot`, and restart the processes: robot/export\n" in ended.out
     assert "no: the requirements hold: one is violated: robot/requirements.toml\n" in ended.out
     assert "/talker: may publish /chatter" in ended.err
     needed.write_text(kept)
@@ -694,7 +695,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     sros("crl", "robot/keystore", "--refresh", cwd=robot.folder).ok()
     ended = robot.close("--proof", "--partial", status=1)
     crl = "3 files of 'robot/keystore' would change there, such as robot/export/enclaves/"
-    assert f"no: the files have no error: {crl}" in ended.out, "as in an export that is restored"
+    assert f"no: the files are accepted: {crl}" in ended.out, "as in an export that is restored"
     again = "distribute_key", "robot/keystore", "--all", "robot/export", "--force"
     sros(*again, cwd=robot.folder).ok()
     assert (
@@ -898,6 +899,7 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     said = robot.close("--proof").out
     assert "policy has no profile for them any more: /rear_camera (if they have new names, " in said
     assert "watched again: sros close robot --undo, sros close robot --for 1m)\n" in said
+    assert "; not compared: /nav/bow_camera, /nav/stern_camera (new); not" in said
 
 
 def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None:
@@ -973,7 +975,9 @@ def test_a_process_with_the_name_of_another_is_not_signed(robot: Robot) -> None:
         twins = remembered._replace(processes=[*remembered.processes, same])
         content = json.dumps(as_plain(twins))
         (robot.folder / "robot/processes.json").write_text(content)
-        assert "call themselves" not in robot.close().out, "one has ended, or ran in the enclave"
+        said = robot.close().out
+        assert "call themselves" not in said, "one has ended, or ran in the enclave"
+        assert "known by its enclave" not in said, "it runs open now"
 
 
 def test_a_program_that_starts_its_nodes_has_one_enclave(

@@ -1004,6 +1004,41 @@ def test_a_forgotten_remapping_is_shown(keystore: Path, tmp_path: Path) -> None:
         assert f"`sros explain {keystore} {ENCLAVE} publish /{topic}`" in found
 
 
+def test_an_action_is_no_service(keystore: Path, tmp_path: Path) -> None:
+    """Neither the advised command nor a proposed name is about a service."""
+    log, policy = tmp_path / "robot.log", tmp_path / "robot.xml"
+    log.write_text(
+        "rr/arm/_action/send_goalReply topic not found in allow rule. "
+        "-> Function check_create_datareader\n"
+    )
+    rules = " ".join(
+        f"-r /arm/_action/{part}:=/base/arm/_action/{part}"
+        for part in ("cancel_goal", "get_result", "send_goal", "feedback", "status")
+    )
+    for group, name, told in (
+        ("services request", "arm", "the policy has it as a service (request), but /arm is an"),
+        ("services request", "inspect", ""),
+        ("actions call", "base/arm", f"add `--ros-args {rules}`"),
+    ):
+        kind = group.partition("s ")[0]
+        rights = f'<{group}="ALLOW"><{kind}>/{name}</{kind}></{kind}s>'
+        policy.write_text(policy_text({ENCLAVE: rights}))
+        found = sros("explain", policy, ENCLAVE, "--log", log).out
+        assert f"`sros explain {policy} {ENCLAVE} call /arm --type action` shows" in found
+        assert told in found and "may call /inspect" not in found
+
+
+def test_an_expired_enclave_is_renewed(keystore: Path, tmp_path: Path) -> None:
+    """`sros run` names the command that renews it, and so does the explanation of its message."""
+    BREAKAGES["certificate expired"](Enclave(keystore))
+    refused, renew = sros("run", keystore, ENCLAVE, "--", "true"), f"`sros renew {keystore} "
+    assert refused.status == 2 and f"{renew}{ENCLAVE}`." in refused.err
+    log = tmp_path / "robot.log"
+    log.write_text(refused.err.partition(": it expired")[0])
+    assert f"{renew}{ENCLAVE}`." in sros("explain", keystore, ENCLAVE, "--log", log).out
+    assert f"{renew}ENCLAVE`" in sros("explain", keystore, "--log", log).out
+
+
 def test_a_known_line_is_shown_without_time_and_source() -> None:
     log = LOGS / f"{FAST_14}.node_of_another_enclave.log"
     shown = sros("explain", "--log", log).out.splitlines()[0]

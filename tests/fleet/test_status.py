@@ -810,7 +810,7 @@ def test_robots_with_files_that_expire_soon_are_named(
     assert not any("expiry" in line for line in lines[31])
     (line,) = (line for line in lines[24] if "expiry" in line)
     assert f"{end:%Y-%m-%d} (r1, {kind}), within 30 days on 3 robots: `sros renew" in line
-    assert line.endswith("--all-expiring 30d`, then deliver")
+    assert line.endswith("--all-expiring soon`, then deliver")
 
     def command(status: FleetStatus) -> str:
         lines = _facts(ComparedFleet(end - timedelta(days=1), status, [], []))
@@ -821,7 +821,7 @@ def test_robots_with_files_that_expire_soon_are_named(
     monkeypatch.setattr(
         Template, "longest_validity", lambda _, name: timedelta(1) if name != "/r2/base" else None
     )
-    named = "`sros renew ks /r1/base /r3/base --all-expiring 30d`, then deliver"
+    named = "`sros renew ks /r1/base /r3/base --all-expiring soon`, then deliver"
     assert command(fleet_status(OpenedKeystore(field.root))).replace(str(field.root), "ks") == named
 
 
