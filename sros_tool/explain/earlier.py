@@ -55,9 +55,9 @@ def note_on_earlier_permissions(
         names, root = sorted(ends), quote(str(keystore.root))
         which = quote(names[0]) if len(names) == 1 else "ENCLAVE..."
         text = (
-            f"{first_few(names, 3)}: earlier permissions, signed from another policy, may allow it "
-            f"until {max(ends.values())} to whoever kept them and the key. To end that, run `sros "
-            f"renew {root} {which} --revoke-old`."
+            f"the rights in earlier permissions of {first_few(names, 3)} are not known here: they "
+            "were signed from another policy. Whoever kept them and the key has these rights until "
+            f"{max(ends.values())}. To end that, run `sros renew {root} {which} --revoke-old`."
         )
         yield Note("explain.earlier-permissions", text)
 
@@ -105,7 +105,7 @@ def note_on_revoked_enclaves(
         remedy = "the files at a restart: Zenoh has no revocation list"
     for decided, has_right in (
         (True, "have the right"),
-        (False, "may have the right, by permissions that are not here"),
+        (False, "work with permissions that are not here, whose rights are not known"),
     ):
         gone = {of.name: of.until for of in revoked if of.decided is decided}
         if gone := {name: until for name, until in gone.items() if name not in named}:

@@ -785,7 +785,10 @@ def test_a_revoked_enclave_that_processes_without_the_list_still_accept(keystore
     kept = permissions.read_bytes()
     permissions.write_bytes(kept + b"changed")
     other = (keystore, "--who", "publish", "/nothing")
-    assert "may have the right, by permissions that are not here" in revoked_notes(*other)
+    assert (
+        "work with permissions that are not here, whose rights are not known. A"
+        in revoked_notes(*other)
+    )
     permissions.write_bytes(kept)
     (keystore / "ledger.jsonl").rename(keystore / "kept")
     assert "is not known: ledger.jsonl is missing" in revoked_notes(*other)
@@ -811,7 +814,10 @@ def test_a_revoked_enclave_with_earlier_permissions(keystore: Path, tmp_path: Pa
     sros("create_permission", keystore, ENCLAVE, policy).ok()
     sros("revoke", keystore, ENCLAVE).ok()
     asked = (keystore, "--who", "publish")
-    assert f"certificates of {ENCLAVE} may have the right" in revoked_notes(*asked, "/chatter")
+    assert (
+        f"certificates of {ENCLAVE} work with permissions that are not here, whose"
+        in revoked_notes(*asked, "/chatter")
+    )
     assert f"certificates of {ENCLAVE} have the right" in revoked_notes(*asked, "/other")
 
 
@@ -840,7 +846,7 @@ def test_earlier_permissions_that_still_allow_it(keystore: Path, tmp_path: Path)
     for words in ((keystore, ENCLAVE), (keystore, "--who")):
         denied = explain(*words, *asked)
         assert denied.status == 1
-        assert f"note [explain.earlier-permissions]: {ENCLAVE}: earlier permissions" in denied.err
+        assert f"the rights in earlier permissions of {ENCLAVE} are not known here: " in denied.err
     assert "earlier-permissions" not in explain(keystore, "--who", "publish", "/other").err
     ledger = keystore / "ledger.jsonl"
     lines = ledger.read_text().splitlines(keepends=True)
