@@ -286,7 +286,8 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
         echo(f"the robot is closed{exceptions}{_until(closed)}{following}", err=True)
     elif closed.proofs:
         accept = _ACCEPT if closed.is_proved(partial=True) else ""
-        next_command = f"ask again with sros close {folder} --proof, or go back with --undo"
+        next_command = f"mend what the lines name, and ask again with sros close {folder} --proof, "
+        next_command += "or go back with --undo"
         echo(f"the robot is not proved closed; next: {accept}{next_command}", err=True)
     elif apply:
         for command, processes in closed.pending_by_hand.items():

@@ -687,6 +687,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     named = f"process 4711 (run): the mode of '{key}' is 0644\n"
     assert f"no: every process was started in its enclave: {named}" in ended.out
     assert "no: the files are accepted: sros check finds 1 error, the first in rob" in ended.out
+    assert "next: mend what the lines name, and ask again with sros close robot --pr" in ended.err
     assert "`; then run `sros close robot`, and restart the processes: robot/export\n" in ended.out
     assert "no: the requirements hold: one is violated: robot/requirements.toml\n" in ended.out
     assert "/talker: may publish /chatter" in ended.err
