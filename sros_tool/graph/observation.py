@@ -7,7 +7,8 @@ unambiguous; `sros_tool.graph.learn` translates them to ROS names.
 graph through rclpy, so that a DDS that logs to standard output, refuses or crashes does no harm to
 its parent.  It writes JSON, one object per line, to the file descriptor FD: first
 ``{"ready": RMW}`` or ``{"failed": STAGE, "reason": TEXT}``, then the graph after each change.  It
-reads the graph every PERIOD seconds, and exits when its standard input is closed.
+reads the graph every PERIOD seconds, after a change at once, and exits when its standard input is
+closed.
 """
 
 from __future__ import annotations
@@ -171,6 +172,8 @@ _ORDERED = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp", "rmw_cyclonedds_cpp"
 _LOG_FLUSH_SECONDS = 0.3
 """Time to wait before exit, so that the logging thread of Fast DDS prints why the node failed."""
 _ATTEMPTS = 5
+_AGAIN_SECONDS = 0.01
+"""Time until a graph that changes is read again."""
 
 
 def main() -> int:
@@ -221,15 +224,17 @@ class GraphObserver(Protocol):
 def report_graph(observer: GraphObserver, report: Any, period: float, *, ordered: bool) -> None:
     """Report the graph after each change until standard input is closed.
 
+    A graph that has changed is read again at once, before a node leaves that is not complete yet.
     ``ordered`` says that the nodes are listed by ascending participant.
     """
     before: object = None
     while True:
         now = observer.sight()
-        if now is not None and now != before:
+        changes = now is None or now != before
+        if now is not None and changes:
             listed, endpoints = before = now
             send(report, {"ordered": ordered, "listed": listed, "endpoints": endpoints})
-        if select.select([sys.stdin], [], [], period)[0]:
+        if select.select([sys.stdin], [], [], _AGAIN_SECONDS if changes else period)[0]:
             return
 
 

@@ -305,12 +305,15 @@ def watch(
 
     ``report`` is called with the union after it has grown and then not changed for ``still``
     seconds, so that no node is reported before it is discovered completely; at the latest
-    ``patience`` seconds after the union has grown.
+    ``patience`` seconds after the union has grown.  The watch ends as much later at most, while
+    a node that has just started is not announced yet.
     """
     begin = clock()
     seen = union = reported = Observation()
     grown = changed = begin
-    while not stop() and (seconds is None or clock() - begin < seconds):
+    while not stop() and (
+        seconds is None or clock() - begin < seconds + patience * bool(seen.strays)
+    ):
         news = source.next(_TICK)
         now = clock()
         if news is not None:

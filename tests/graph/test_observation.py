@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import io
+from typing import Any
+
+import pytest
+
 from sros_tool.graph.observation import (
     Endpoint,
     Observation,
     make_observation,
     observation_from_json,
+    report_graph,
 )
 from sros_tool.values import as_plain
 from tests.graph.graphs import graph, node
@@ -66,3 +72,24 @@ def test_a_node_that_spoke_later_is_not_silent() -> None:
 def test_json_gives_the_same_back() -> None:
     seen = graph(node("/a", "publish x", "call fib"), node("/n/b", "reply s", participant="p2"))
     assert observation_from_json(as_plain(seen)) == seen
+
+
+def test_a_graph_that_changed_is_read_again_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tool that lives shorter than a period would otherwise be seen only while it starts."""
+    full = (["tool"], ["rosout", "chatter"])
+    looks: list[Any] = [([], ["rosout"]), None, full, full]
+    waits: list[float] = []
+
+    class Script:
+        def sight(self) -> Any:
+            return looks.pop(0)
+
+    def select(*words: Any) -> tuple[bool]:
+        waits.append(words[-1])
+        return (not looks,)
+
+    monkeypatch.setattr("select.select", select)
+    report = io.StringIO()
+    report_graph(Script(), report, 60.0, ordered=True)
+    assert report.getvalue().count("rosout") == 2
+    assert [wait < 0.05 for wait in waits] == [True, True, True, False]

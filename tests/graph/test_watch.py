@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from sros_tool.graph.observation import Observation
+from sros_tool.graph.observation import Endpoint, Observation, make_observation
 from sros_tool.graph.observe import Settling, look_for, settle, watch
 from tests.graph.graphs import graph, node
 
@@ -105,6 +105,19 @@ def test_a_restless_graph_is_told_nevertheless() -> None:
     told: list[Observation] = []
     watch(script, 12.0, script.clock, stop=lambda: False, report=told.append)
     assert len(told) >= 4
+
+
+def test_a_node_that_starts_at_the_end_of_a_watch_is_waited_for() -> None:
+    starting = make_observation(ONE.nodes, strays=[("p9", Endpoint("rt/rosout", "publish"))])
+    for changes, end, seconds in (
+        ([(0.1, ONE), (2.9, starting), (3.5, TWO)], TWO, 3.5),
+        ([(0.1, starting)], starting, 5.0),
+    ):
+        script = Script(changes)
+        told: list[Observation] = []
+        snapshot = watch(script, 3.0, script.clock, stop=lambda: False, report=told.append)
+        assert snapshot.observation == end
+        assert abs(snapshot.seconds - seconds) < 0.5
 
 
 def test_a_watch_ends_when_it_is_told_to() -> None:
