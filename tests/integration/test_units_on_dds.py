@@ -125,7 +125,7 @@ def test_the_jobs_do_their_work_under_their_restrictions(robot: Path, tmp_path: 
         files = make(job, str(keystore), user="root", sros="/bin/sros")
         (tmp_path / "job").write_text(files[f"sros-{job}.service"])
         (line,) = re.findall("^ExecStart=/bin/sros (.*)$", (tmp_path / "job").read_text(), re.M)
-        words = line.replace("/var/lib/sros-metrics", str(metrics)).replace("30d", "9999d")
+        words = line.replace("/var/lib/sros-metrics", str(metrics)).replace(" soon", " 9999d")
         program = [sys.executable, "-m", "sros_tool", *words.split()]
         folders = (keystore, metrics, *([pub] if job is Job.COLLECT else []))
         confined = [sys.executable, CONFINED, tmp_path / "job", *folders, "--", *program]
