@@ -1064,7 +1064,7 @@ def _remedy_of_denial(written: str) -> str:
         return NO_EFFECT.remedy
     return (
         f"{NO_EFFECT.remedy} Write /*{written.lstrip('*')} to deny the name in every namespace: "
-        f"after `sros merge_policy POLICY --namespace /left`, {written} denies only /left/{written}."
+        f"merged with `--namespace /left`, {written} denies only /left/{written}."
     )
 
 

@@ -281,7 +281,7 @@ def test_a_copy_of_the_whole_keystore_has_ca_keys(fleet: Path) -> None:
     keys = [each for each in findings if each.id == "keystore.home-or-robot"]
     (said,) = keys
     assert "private/identity_ca.key.pem, private/permissions_ca.key.pem" in said.text
-    assert said.remedy.startswith("On the keystore machine, run")
+    assert said.remedy.startswith("On the keystore machine, keep the CA keys, and run")
     # The enclave whose key is on its robot is no finding at home.
     assert [each.name for each in arrival.enclaves if each.key_on_robot] == [BORN]
     assert not [each for each in findings if each not in keys]

@@ -184,9 +184,9 @@ HOME_OR_ROBOT = FindingKind(
     "create any enclave, with any rights. The files do not show whether this folder is on a "
     "robot.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
-    "On the keystore machine, run `sros check KEYSTORE`. On a robot, replace the folder by an "
-    "export (made with `sros distribute_key KEYSTORE ENCLAVE TARGET`); if others had access, "
-    "replace the CAs (`sros rotate_ca`).",
+    "On the keystore machine, keep the CA keys, and run `sros check KEYSTORE`. On a robot, replace "
+    "the folder by an export (`sros distribute_key KEYSTORE ENCLAVE TARGET`); if others had "
+    "access, run `sros rotate_ca`.",
 )
 UNREADABLE = FindingKind(
     "keystore.file-unreadable",
