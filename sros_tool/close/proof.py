@@ -114,25 +114,34 @@ def _proof_of_files(robot: LocalRobot) -> Proof:
     holds = {0: True, 1: False}.get(status)
     reason = "sros check finds no error" if holds else "they are not checked"
     if holds is False:
-        _, output, _ = robot.shell.run(("check", place, "--fail-on", "error", "--json"), False)
-        errors = [of for of in json.loads(output)["findings"] if of["severity"] == "error"]
-        first = "{file}: {text}. {remedy}".format_map(errors[0]).rstrip(".")
-        reason = (
-            f"sros check finds {counted(len(errors), 'error')}, the first in {first}; then run "
-        )
-        reason += f"`{robot.close_command}`, and restart the processes"
+        reason = f"{_errors_text(robot)}; then run `{robot.close_command}`, and restart the "
+        reason += "processes"
     if holds and robot.keystore.exists():  # an export from before a revocation has no error
         try:
             _, value = robot.shell.read_json((*robot.export_words(), "--dry-run", "--json"))
             changes = [change["path"] for change in value["changes"]]
-        except SrosError as error:
+        except UnavailableError as error:
             holds, reason = None, f"they cannot be compared with the keystore: {error}"
+        except SrosError as error:  # such as a revocation list that was put back
+            holds, reason = False, f"the keystore does not export them: {error}"
         else:
             if changes:
                 number = counted(len(changes), "file")
                 reason = f"{number} of '{robot.keystore}' would change there, such as {changes[0]}"
                 holds, reason = False, f"{reason}; `{robot.close_command}` exports them"
     return Proof("the files are accepted", holds, f"{reason}: {robot.export}")
+
+
+def _errors_text(robot: LocalRobot) -> str:
+    """Return how many errors `check` finds in the export, and the first one with its remedy."""
+    words = ("check", str(robot.export), "--fail-on", "error", "--json")
+    _, output, _ = robot.shell.run(words, False)
+    findings = json.loads(output)["findings"]
+    errors = [finding for finding in findings if finding["severity"] == "error"]
+    if not errors:  # the files changed since `check` found some
+        return "sros check found an error: ask again"
+    first = "{file}: {text}. {remedy}".format_map(errors[0]).rstrip(".")
+    return f"sros check finds {counted(len(errors), 'error')}, the first in {first}"
 
 
 def _proof_of_requirements(robot: LocalRobot) -> Iterator[Proof]:

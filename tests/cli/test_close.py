@@ -699,6 +699,15 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     assert f"no: the files are accepted: {crl}" in ended.out, "as in an export that is restored"
     again = "distribute_key", "robot/keystore", "--all", "robot/export", "--force"
     sros(*again, cwd=robot.folder).ok()
+    sros("create_keystore", "other", cwd=robot.folder).ok()
+    authority = robot.folder / "robot/keystore/public/identity_ca.cert.pem"
+    trusted = authority.read_bytes()
+    authority.write_bytes(
+        trusted + (robot.folder / "other/public/identity_ca.cert.pem").read_bytes()
+    )
+    refused = robot.close("--proof", "--partial", status=1).out  # --partial accepts no refusal
+    authority.write_bytes(trusted)
+    assert "no: the files are accepted: the keystore does not export them: " in refused
     assert (
         "not checked: everything that talked can still talk: there is nothing to audit" in ended.out
     )
