@@ -201,11 +201,11 @@ _ROS_TEXTS = (
         "a robot, export the enclave again.", _FILE_FAULTS,
         refuses=RefusedObject.PARTICIPANT,
     ),
-    _log_text(
+    _log_text(  # rmw_cyclonedds
         "files-missing", _ROS, r"could not find all security files",
         "a file of the enclave is missing, a broken link, or closed to the user of this process; "
-        "the message does not say which. If ROS_SECURITY_STRATEGY is not exactly Enforce, the node "
-        "RUNS UNSECURED (except with rmw_cyclonedds, which then starts no node)",
+        "the message does not say which. With ROS_SECURITY_STRATEGY=Enforce, no node starts; with "
+        "any other value, the node RUNS UNSECURED",
         "`sros explain KEYSTORE ENCLAVE join` names the file and the command that restores it; on "
         "a robot, export the enclave again.", _FILE_FAULTS,
         refuses=RefusedObject.PARTICIPANT,

@@ -399,6 +399,12 @@ def test_single_lines(line: str, name: str) -> None:
     assert found.cause and found.remedy and "\x1b" not in found.text
 
 
+def test_what_rmw_cyclonedds_does_without_a_file_depends_on_the_strategy() -> None:
+    """As it did with rclpy on Cyclone DDS 0.10.5, with Enforce and with Permissive."""
+    (found,) = explained("[INFO] [1.2] [rmw_cyclonedds_cpp]: could not find all security files")
+    assert "=Enforce, no node starts; with any other value, the node RUNS UNSECURED" in found.cause
+
+
 @pytest.mark.parametrize(
     "line",
     [
