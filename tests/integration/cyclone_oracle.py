@@ -15,6 +15,7 @@ share the permissions of the first.  The library is loaded once, before they are
 from __future__ import annotations
 
 import ctypes
+import faulthandler
 import json
 import os
 import select
@@ -123,6 +124,7 @@ class Process:
             return
         try:
             end_with_parent()
+            faulthandler.disable()  # that the library crashes is an answer, and no news
             os.close(self._end)
 
             def say(report: Report) -> None:
