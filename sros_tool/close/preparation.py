@@ -311,11 +311,12 @@ def _unknown_process_problems(robot: LocalRobot, state: CloseState) -> Iterator[
     if observed.unknown:
         processes = first_few(observed.unknown, MOST_NAMES)
         undo = f"go back by {close} --undo, and " if state.secured else ""
-        name = ", or name the node in the command of each that has a node below (--ros-args -r "
-        name = f"{name}__node:=NODE -r __ns:=NAMESPACE)" if observed.elsewhere else ""
+        remap = "--ros-args -r __node:=NODE -r __ns:=NAMESPACE"
+        advice = f", or name its node in the command of each process ({remap})"
+        advice = advice if observed.elsewhere else ""
         yield (
             f"sros saw no node of {counted(len(observed.unknown), 'process', 'processes')}: "
-            f"{processes}; {undo}watch again while they run{name}: {close} --for 1m; "
+            f"{processes}; {undo}watch again while they run{advice}: {close} --for 1m; "
             f"otherwise {silent}"
         )
     routers = [process for process in RunningRobot(robot).open_processes if process.is_router]

@@ -839,6 +839,20 @@ def test_a_node_of_another_robot_is_not_proposed_for_another_machine(robot: Robo
     assert "--elsewhere" not in ended.out
 
 
+@sometimes("processes_that_show_no_id_are_to_be_named", 1 / 2)
+def test_processes_that_show_no_id_are_to_be_named(robot: Robot) -> None:
+    """As in containers, in each of which the only process has the id 1."""
+    now, mapped = datetime.now(UTC), frozenset({"libfastrtps"})
+    robot.more = tuple(Process(pid, ("main",), {}, now, mapped, own_pid=1) for pid in (5, 6))
+    robot.nodes += tuple(
+        ros_node(name, f"010f7f0101000{index}00000000", "publish rt/chatter")
+        for index, name in enumerate(("left", "right"))
+    )
+    said = robot.close(status=1).out
+    assert "; watch again while they run, or name its node in the command of each process" in said
+    assert "for nodes of /left, /right; if they run on another machine" in said
+
+
 @sometimes("nothing_is_closed_of_what_is_not_understood", 1 / 2)
 def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
     robot.units = UNITS
