@@ -653,6 +653,28 @@ def test_the_table_has_every_name_and_those_that_only_one_side_may_use(
         assert "nobody may subscribe" in details(page)
 
 
+def test_a_group_of_the_table_says_how_much_of_it_is_left_out(
+    browser: Browser, tmp_path: Path
+) -> None:
+    own = [[f"/{'ab'[n % 2]}/t{n}" for n in range(1, 512) if n >> at & 1] for at in range(9)]
+    enclaves = {f"/e{at}": group("topics", "publish", *names) for at, names in enumerate(own)}
+    policy, path = tmp_path / "robot.xml", tmp_path / "table.html"
+    policy.write_text(policy_text(enclaves))
+    sros("view", policy, "-o", path).ok()
+    with opened(browser, path) as page:
+        page.click("#tab-names")
+        assert "511 names in 511 rows; shown are the first 400." in page.inner_text("#names")
+        shown = page.locator("#names .group").evaluate_all(
+            "groups => groups.map(it => [it.querySelectorAll('tbody tr').length,"
+            " it.querySelector('.soft').textContent])"
+        )
+        assert sum(rows for rows, _ in shown) == 400
+        said = [
+            f"{rows} of {names} names" for (rows, _), names in zip(shown, (256, 255), strict=True)
+        ]
+        assert [text.split(",")[0] for _, text in shown] == said
+
+
 def test_a_phone_shows_first_who_may_drive_and_what_everybody_may_do(
     browser: Browser, open_keystores: dict[str, Path], tmp_path: Path
 ) -> None:

@@ -62,13 +62,15 @@ export function namesTable(rows, lacking, opens) {
     const fit = ordered.filter(
       (row) => (basics.checked || !row.common) && (row.lacks || !only.checked) && (!text || mentions(row, text)),
     );
-    const shown = fit.slice(0, MOST);
+    const shown = new Set(fit.slice(0, MOST));
     const table = (some) => el("table", { class: "names" }, el("thead", {}, el("tr", {}, heads())), el("tbody", {}, some.map((row) => line(row, opens, !same))));
-    const parts = shown.length > FEW ? grouped(shown) : [];
-    groups.replaceChildren(
-      ...(parts.length > 1 ? parts.map(([title, some]) => group(title, some, table(some), Boolean(text))) : [table(shown)]),
-    );
-    const names = fit.reduce((sum, row) => sum + row.names.length, 0);
+    const parts = shown.size > FEW ? grouped(fit) : [];
+    const part = ([title, all]) => {
+      const some = all.filter((row) => shown.has(row));
+      return some.length ? [group(title, all, some, table(some), Boolean(text))] : [];
+    };
+    groups.replaceChildren(...(parts.length > 1 ? parts.flatMap(part) : [table([...shown])]));
+    const names = namesIn(fit);
     const shared = names > fit.length ? " (names with the same rights share a row)" : "";
     const first = fit.length > MOST ? `; shown are the first ${MOST}` : "";
     status.textContent = `${counted(names, "name")} in ${counted(fit.length, "row")}${shared}${first}.${same}`;
@@ -109,11 +111,14 @@ function namespaceOf({ names }) {
   return others.length ? "several namespaces" : first ? `/${first}` : "no namespace";
 }
 
-function group(title, rows, table, searched) {
-  const names = rows.reduce((sum, row) => sum + row.names.length, 0);
+const namesIn = (rows) => rows.reduce((sum, row) => sum + row.names.length, 0);
+
+// A group of which only some rows are shown says so.
+function group(title, rows, shown, table, searched) {
   const most = Math.max(...rows.map((row) => row.senders.length));
-  const said = `${counted(names, "name")}${most > 1 ? `, up to ${most} may send` : ""}`;
-  const open = searched || !isSmall() || (GROUPS.includes(title) && rows.length <= FEW);
+  const cut = shown.length < rows.length ? `${namesIn(shown)} of ` : "";
+  const said = `${cut}${counted(namesIn(rows), "name")}${most > 1 ? `, up to ${most} may send` : ""}`;
+  const open = searched || !isSmall() || (GROUPS.includes(title) && shown.length <= FEW);
   return el("details", { class: "group", open }, el("summary", {}, el("b", { text: title }), " ", el("span", { class: "soft", text: said })), table);
 }
 
