@@ -242,7 +242,7 @@ def _read(path: Path, fleet: Fleet | None, drawing: Drawing, title: str) -> Pict
     try:
         findings = (
             list(policy_file_findings(path, fleet=fleet, policy=source.policy))
-            if source.policy
+            if source.policy and path.is_file()
             else path_findings([path], at)
         )
     except SrosError as error:

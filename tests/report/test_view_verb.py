@@ -83,6 +83,13 @@ def test_an_observation_is_a_source(tmp_path: Path) -> None:
     assert {e["name"]: e["mark"] for e in over["edges"]} == {"/x": "both", "/y": "first"}
 
 
+def test_a_folder_of_policies_has_the_findings_of_its_files(tmp_path: Path) -> None:
+    policies = tmp_path / "policies"
+    policies.mkdir()
+    alone = value(write(policies, "p.xml", "/x"))["findings"]
+    assert alone and value(policies)["findings"] == alone
+
+
 def test_a_keystore_tells_validity_protection_and_findings(robot_keystore: Path) -> None:
     found = value(robot_keystore)
     kinds = [v["kind"] for v in found["validities"]]
