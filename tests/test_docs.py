@@ -112,6 +112,13 @@ def test_the_files_that_a_contributor_is_sent_to_are_there() -> None:
     assert [each for each in sorted(named) if not any(PROJECT.glob(each))] == []
 
 
+def test_examples_install_a_release_that_has_what_they_use() -> None:
+    version = tomllib.loads(read("pyproject.toml"))["project"]["version"]
+    for page in ("docs/pull_requests.md", "docs/howto/ci.md"):
+        installed = re.findall(r"\b(?:v|sros_tool==)(\d+\.\d+\.\d+)", read(page))
+        assert set(installed) == {version.partition(".dev")[0]}, page
+
+
 def test_the_changelog_is_about_this_version() -> None:
     version = tomllib.loads(read("pyproject.toml"))["project"]["version"]
     changelog = read("CHANGELOG.md")
