@@ -22,7 +22,7 @@ from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Network, unguarded
 from sros_tool.report.compose import PictureSource, compose
 from sros_tool.report.layout import scenes_of
 from sros_tool.report.pages import render_page
-from sros_tool.report.picture import SourceTitle, Validity
+from sros_tool.report.picture import PicturedFinding, SourceTitle, UnreadUnits, Validity
 from tests.report.pictures import (
     HOSTILE,
     MOBILE_ROBOT,
@@ -751,6 +751,22 @@ def test_a_robot_of_unknown_names_says_who_may_do_most_and_equal_findings_are_on
         page.click("#tab-findings")
         assert "5 enclaves" in page.inner_text("#findings")
         assert page.locator("#findings .finding").count() < 5
+
+
+def test_only_what_was_checked_is_without_an_error(browser: Browser, tmp_path: Path) -> None:
+    source, path = tmp_path / "p.xml", tmp_path / "p.html"
+    source.write_text(policy_text({"/a": publish("/x")}))
+    rights = policy_rights(read_policy(source))
+    picture = compose(PictureSource(SourceTitle("p.xml", "policy"), rights))
+    skipped = replace(picture, findings=(PicturedFinding("view.not-checked", "note", "why"),))
+    sampled = replace(picture, unread=(UnreadUnits("robot", ("r2", "r3"), 4, "r1"),))
+    for each, said in (
+        (sampled, "No error or warning was found in the enclaves that were read."),
+        (skipped, "Not all was checked: 1 note"),
+    ):
+        path.write_text(render_page(each, scenes_of(each), NOW))
+        with opened(browser, path) as page:
+            assert said in page.inner_text("#headlines").split("\n")
 
 
 def test_it_prints_every_part(browser: Browser, robot_page: Path) -> None:
