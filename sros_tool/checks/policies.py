@@ -747,9 +747,10 @@ def _missing_common_part_cause(lacking: Sequence[_Lacking]) -> Cause:
     place = "the <profile> of every node" if plural else "its <profile>"
     if plural and len(lines) == len(nodes):  # one in each line, as sed edits the first of a line
         addresses = "".join(f"{line}ba;" for line in lines)
-        edit = quote(f"{addresses}b;:a;s|<profile [^>]*[^/>]>|&{_INCLUDE}|")
+        # The line of a <profile> is the one where its start tag ends, perhaps begun before.
+        edit = quote(f"{addresses}b;:a;s#(<profile |^)([^<>]*[^/<>])?>#&{_INCLUDE}#")
         put = f"put the line in this command into {place} ({at}): "
-        remedy = f"{copy}{put}`sed -i {edit} {quote(str(file))}`"
+        remedy = f"{copy}{put}`sed -E -i {edit} {quote(str(file))}`"
     else:
         remedy = f"{copy}put this line into {place} ({at}): {_INCLUDE}"
     remedy = f"{remedy[0].upper()}{remedy[1:]}"

@@ -100,10 +100,11 @@ def test_nodes_without_the_common_part_are_one_paragraph_with_one_mend(tmp_path:
     fixed(policy, ended.out)
     assert sros("check", "--strict", "robot.xml", cwd=tmp_path).ok().out == ""
     by_hand = policy.read_text()
-    policy.write_text(before)
-    (command,) = re.findall("`(sed .+?)`", ended.out)
-    subprocess.run(shlex.split(command), cwd=tmp_path, check=True)
-    assert policy.read_text() == by_hand
+    for between in (" ", "\n "):  # a start tag in one line, and in two
+        policy.write_text(before.replace(" node=", f"{between}node="))
+        (command,) = re.findall("`(sed .+?)`", sros("check", "robot.xml", cwd=tmp_path).out)
+        subprocess.run(shlex.split(command), cwd=tmp_path, check=True)
+        assert policy.read_text() == by_hand.replace(" node=", f"{between}node=")
     policy.write_text(before.replace("\n", ""))  # sed would edit the first profile alone, each time
     said = sros("check", "robot.xml", cwd=tmp_path).out
     assert "6 nodes lack the common part" in said and "`sed " not in said
