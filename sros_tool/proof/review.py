@@ -1026,9 +1026,10 @@ class _Review:
         choice = self.request.template
         if not (choice and self.base) or choice in template_names():
             return False
-        with suppress(SrosError):  # said where the template is read
+        try:
             return self.base.entry(choice) != self.head.entry(choice)
-        return False
+        except DocumentError:  # a link is on its path, perhaps in the base alone
+            return True
 
     def _keystore_fleet(self, path: str) -> Fleet | None:
         """Return the fleet of a keystore in BASE; None if it has none."""

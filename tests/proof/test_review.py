@@ -950,6 +950,11 @@ def test_requirements_get_the_protection_of_a_template(change: Change) -> None:
 
 
 def test_whether_a_keystore_is_signed_for_the_policies(
+    (change.folder / "link").symlink_to(".")
+    change.base = change.commit({})
+    (change.folder / "link").unlink()
+    change.commit({"link/t.toml": weaker})
+    assert "by the changes of 'link/t.toml'" in change.review(*words, "link/t.toml").out
     change: Change, made_keystores: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It never fails: who changes a policy seldom has the keys of the CAs."""
