@@ -62,6 +62,11 @@ _TITLES = {
     "rights": "Rights",
 }
 """Titles of the kinds of steps, the most important first: a comment is cut at its end."""
+_ALLOWED_BY = {
+    "requirements-before": "option --dropped-requirements allow",
+    "signed": "review: whoever changes a policy seldom has the keys of the CAs",
+}
+"""What allows the findings of steps; for other kinds, it is the option for new access."""
 
 
 class _Lines(_PathsType):
@@ -453,12 +458,11 @@ def _sentences(result: Review, steps: Sequence[ReviewStep]) -> Iterator[tuple[Re
 def _findings(result: Review, request: ReviewRequest) -> list[Finding]:
     """Return the findings of all steps; a step that fails has at least one that says why.
 
-    Paths are relative to the top of the repository.  What the options allow is accepted.
+    Paths are relative to the top of the repository.  What is allowed is accepted.
     """
     findings: dict[Finding, None] = {}
     for step in result.steps:
-        option = "dropped-requirements" if step.kind == "requirements-before" else "new-access"
-        allowed = f"option --{option} allow" if step.allowed and step.kind != "signed" else ""
+        allowed = _ALLOWED_BY.get(step.kind, "option --new-access allow") if step.allowed else ""
         for finding in _step_findings(result, step, request):
             accepted = finding.accepted or allowed
             findings[result.shown_finding(finding._replace(accepted=accepted))] = None
@@ -540,7 +544,7 @@ def _text(result: Review) -> list[str]:
 
 def _lines_to_read(step: ReviewStep) -> list[str]:
     """Return what a reviewer has to read: new access and dropped requirements, also if they are
-    allowed; rights that nobody answers any more; the findings of a failed step.
+    allowed; rights that nobody answers any more; findings.
     """
     from sros_tool.checks.formats import folded_findings
     from sros_tool.checks.kind import ChosenFindings
@@ -563,9 +567,7 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
             differing = folded_differences(before, after, compared.rights, ("BASE", "HEAD"))
             differing += enclave_lines(compared, after.fleet or before.fleet)
             return [*unanswered, *_absolute_lines(step.content), *differing]
-        case (ChosenFindings() as chosen) | DroppedRequirements(chosen=chosen) if (
-            step.status or step.allowed
-        ):
+        case (ChosenFindings() as chosen) | DroppedRequirements(chosen=chosen):
             one_per_group = ((finding,) for finding in chosen.shown)
             return [
                 f"{_finding_line(finding)}{others and f' ({others})'}"
@@ -680,7 +682,8 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
     shown_by = "which `sros review` prints"
     match step.content:
         case ChosenFindings() as chosen:
-            return findings(chosen) if chosen.shown else ""
+            title = f"### {_TITLES[step.kind]}: allowed\n\n" if step.allowed else ""
+            return title + findings(chosen) if chosen.shown else ""
         case AccessChange(before=before, after=after, growth=growth, dropped=dropped):
             return access_markdown(before, after, growth, dropped)
         case RightsChange(before=before, after=after, compared=compared) as change:

@@ -307,7 +307,7 @@ class StepResult(NamedTuple):
     result: str
     """The result as a sentence, or why the step could not be decided."""
     lines: Sequence[str]
-    """New access, dropped requirements, changed rights, or findings of a failed step."""
+    """New access, dropped requirements, changed rights, or findings."""
 
 
 class ReviewResult(NamedTuple):
