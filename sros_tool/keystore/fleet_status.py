@@ -641,13 +641,20 @@ class _ComparedRobot(NamedTuple):
         return {name: running[name] for name in self.enclaves if name in running}
 
     def restart(self) -> tuple[str, ...] | None:
-        """Return the enclaves whose processes have earlier files; None if it was not reported."""
-        running = self.running()
-        due = self.confirmed.restart if self.confirmed else None
+        """Return the enclaves whose processes have earlier files; None if it was not reported.
+
+        `sros fleet report` states only restarts that an agent noted, and neither ``running`` nor
+        ``crl_restart``: nothing is known of the enclaves that it leaves out.
+        """
+        running, confirmed = self.running(), self.confirmed
+        due = confirmed.restart if confirmed else None
         if due is None and running is None:
             return None
         earlier = {name for name, files in (running or {}).items() if files == RunningFiles.EARLIER}
-        return tuple(sorted(earlier | ({*(due or ())} & {*self.enclaves})))
+        own = earlier | ({*(due or ())} & {*self.enclaves})
+        if due and not own and running is None and confirmed and confirmed.crl_restart is None:
+            return None
+        return tuple(sorted(own))
 
     def crl_restart(self) -> tuple[str, ...] | None:
         """Return the enclaves whose processes may lack the revocation list; None if not reported.

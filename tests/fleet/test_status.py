@@ -688,6 +688,8 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     assert in_force() == [False, False, False], "r1 does not say which processes it has"
     said = field.run("fleet", "status", "ks", status=1).out
     assert "on 0 of 3 robots; 2 more have it, but it is not known that all processes" in said
+    field.confirm("r1", restart=["/r9/base"])
+    assert in_force() == [False, False, False], "`fleet report` states what the agent noted"
     field.confirm("r1", restart=[])
     assert in_force() == [True, False, False]
     found = field.status()["robots"]["r2"]
