@@ -361,11 +361,13 @@ def _check_not_older(folder: Folder, place: str, sent: OpenedEnclave, now: datet
             load_certificates(state.files.get(file, b""), file) for state in (present, sent)
         )
         if retired := retired_authorities(trusted, brought):
+            is_single = sent.files.get(IDENTITY_CA_FILE) == sent.files.get(PERMISSIONS_CA_FILE)
+            flag = "" if is_single else f" --{role}"
             raise KeystoreError(
                 f"the release goes back to the {role} CA {authority_text(retired[0])}, which a "
                 "later CA replaced on this robot",
                 "the keystore comes from a backup: replace the CA again where it is, with `sros "
-                f"rotate_ca KEYSTORE --{role} --finish --allow-unconfirmed`, and publish",
+                f"rotate_ca KEYSTORE{flag} --finish --allow-unconfirmed`, and publish",
             )
     same_authority = present.files.get(PERMISSIONS_CA_FILE) == sent.files.get(PERMISSIONS_CA_FILE)
     newer = [
