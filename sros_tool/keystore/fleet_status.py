@@ -554,11 +554,8 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
     )
     if older := records.age_clause:  # there may be a later list, which it does not have
         statuses = tuple(status.without_list() for status in statuses)
-    is_any_listed, any_waits = (
-        records.is_any_listed(),
-        any(status.crl_in_force is False for status in statuses),
-    )
-    is_any_revoked = is_any_listed or (any_waits and records.is_any_revoked)
+    any_waits = any(status.crl_in_force is False for status in statuses)
+    is_any_revoked = records.is_any_listed() or (any_waits and records.is_any_revoked)
     return FleetStatus(
         keystore.root,
         stages.of_keystore,
@@ -566,7 +563,7 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
         unassigned,
         older=older,
         edited=edited_fleet(keystore, keystore.ledger_with("what", "fleet")),
-        revoked_until=records.revoked_until() if is_any_revoked else None,
+        revoked_until=records.revoked_until(any_waits=any_waits) if is_any_revoked else None,
         publication=records.publication,
         is_any_revoked=is_any_revoked,
         groups=fleet.groups,
@@ -1044,15 +1041,15 @@ class _KeystoreRecords:
         except SrosError:
             return self.has_list
 
-    def revoked_until(self) -> datetime | None:
+    def revoked_until(self, *, any_waits: bool) -> datetime | None:
         """Return when the last certificate on the revocation list expires; None if unknown.
 
-        If the list is empty: when the last revoked certificate expires.
+        If a robot waits for the list, the certificates on lists of replaced CAs count, too.
         """
         with suppress(SrosError):
             lists = self._keystore.revocation_lists
-            listed_serials = {f"{entry.serial:x}" for crl in lists for entry in crl.revoked}
-            serials = listed_serials or self._revoked_serials
+            serials = {f"{entry.serial:x}" for crl in lists for entry in crl.revoked}
+            serials |= self._revoked_serials if any_waits else set()
             entries = self._keystore.ledger_file.with_values("serial", serials).entries
             expiries = {entry.serial: entry.not_after for entry in entries if entry.not_after}
             if serials and serials <= expiries.keys():

@@ -364,6 +364,11 @@ def test_until_when_a_revocation_is_needed(field: Field) -> None:
         f"; robots need it until {until:%Y-%m-%d}, when the revoked certificates have expired\n"
         in said
     )
+    field.run("update_keystore", "ks", "--set", "certificates.validity=90d")
+    field.run("rotate_ca", "ks", "--identity", "--finish", "--allow-unconfirmed")
+    field.run("create_enclave", "ks", "/short")
+    field.run("revoke", "ks", "/short")
+    assert field.status()["revoked_until"] == iso(until), "robots may still trust the earlier CA"
     (field.root / "ledger.jsonl").unlink()
     assert field.status()["revoked_until"] is None, "nobody knows"
 
