@@ -7,8 +7,10 @@ import os
 import shutil
 import stat
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from subprocess import PIPE
+from typing import Any, TypeAlias
 
 import pytest
 
@@ -19,6 +21,8 @@ from sros_tool.runtime.processes import boot_id
 
 OLD = {"enclaves/a/cert.pem": b"old", "enclaves/a/key.pem": b"key"}
 NEW = {"enclaves/a/cert.pem": b"new", "enclaves/b/c/cert.pem": b"other"}
+
+Play: TypeAlias = Callable[[dict[str, bytes], set[str]], dict[str, Any]]
 
 
 @pytest.fixture
@@ -297,19 +301,26 @@ def test_the_owner_gets_the_files(tmp_path: Path) -> None:
         Place(place.path, "no such user")
 
 
-def test_processes_of_a_folder_that_was_lost_have_to_be_restarted(
-    place: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """They still have the files of before.  Twin: an enclave that is new has no processes."""
+@pytest.fixture
+def play(place: Place, monkeypatch: pytest.MonkeyPatch) -> Play:
+    """Return a function that brings files; the second argument are enclaves with equal trust."""
     module = pytest.importorskip("ansible_collections.sros.fleet.plugins.modules.enclaves")
     verified = {"by": "openssl", "ok": True, "problems": [], "remarks": []}
     monkeypatch.setattr(module, "verify", lambda *_: verified)
     asked = {"robot": "r1", "verifier": ["sros"], "replace_authorities": False}
 
+    def bring(files: dict[str, bytes], same: set[str]) -> dict[str, Any]:
+        result: dict[str, Any] = module._install(place, place.read(), files, asked, 0.0, same=same)
+        return result
+
+    return bring
+
+
+def test_processes_of_a_folder_that_was_lost_have_to_be_restarted(place: Place, play: Play) -> None:
+    """They still have the files of before.  Twin: an enclave that is new has no processes."""
+
     def deliver(files: dict[str, bytes]) -> list[str]:
-        due: list[str] = module._install(place, place.read(), files, asked, 0.0, same=set())[
-            "restart"
-        ]
+        due: list[str] = play(files, set())["restart"]
         place.set_due([])
         return due
 
@@ -322,18 +333,14 @@ def test_processes_of_a_folder_that_was_lost_have_to_be_restarted(
 
 
 def test_processes_that_may_lack_the_revocation_list_are_remembered(
-    place: Place, monkeypatch: pytest.MonkeyPatch
+    place: Place, play: Play
 ) -> None:
     """Whoever lacks only its own new documents has the list; also another list that is equal."""
-    module = pytest.importorskip("ansible_collections.sros.fleet.plugins.modules.enclaves")
-    verified = {"by": "openssl", "ok": True, "problems": [], "remarks": []}
-    monkeypatch.setattr(module, "verify", lambda *_: verified)
-    asked = {"robot": "r1", "verifier": ["sros"], "replace_authorities": False}
 
     def deliver(same: set[str], **changed: bytes) -> list[list[str]]:
         named = {f"enclaves/a/{name}": content for name, content in changed.items()}
         files = place.read() | {path.replace("_", "."): data for path, data in named.items()}
-        said = module._install(place, place.read(), files, asked, 0.0, same=same)["confirmation"]
+        said = play(files, same)["confirmation"]
         return [said["restart"], said["crl_restart"]]
 
     assert deliver(set(), crl_pem=b"list") == [["/a"], ["/a"]]
