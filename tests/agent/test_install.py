@@ -333,18 +333,22 @@ def test_an_enclave_does_not_trust_a_replaced_ca_again(
     assert has(robot, later)
 
 
-def test_a_single_ca_that_was_replaced_is_named_without_its_role(tmp_path: Path) -> None:
-    """A keystore with one CA for both roles refuses --identity; the robot pins the earlier CA."""
+@pytest.mark.parametrize(("template", "options"), [("sros2", ""), ("production", " --permissions")])
+def test_a_pinned_ca_that_was_replaced_is_not_trusted_again(
+    template: str, options: str, tmp_path: Path
+) -> None:
+    """A keystore with one CA for both roles refuses to replace it for one role."""
     root, robot = tmp_path / "home", tmp_path / "robot"
-    sros("create_keystore", root, "--template", "sros2").ok()
+    sros("create_keystore", root, "--template", template).ok()
     sros("create_enclave", root, "/r1/a").ok()
     authority = authority_of(root)
     earlier = release_of(files_of(root, ("/r1/a",)), 1, authority)
-    rotate_ca(root, now=moment() + timedelta(hours=2), finish=True)
+    roles = ["permissions"] if options else ["identity", "permissions"]
+    rotate_ca(root, roles=roles, now=moment() + timedelta(hours=2), finish=True)
     sros("distribute_key", root, "/r1/a", robot).ok()
     pinned, late = frozenset({digest(authority.certificate)}), moment() + timedelta(hours=4)
     done = install_release(robot, earlier, "r1", now=late, pinned=pinned)
-    assert "`sros rotate_ca KEYSTORE --finish" in done.kept["/r1/a"]
+    assert f"`sros rotate_ca KEYSTORE{options} --finish" in done.kept["/r1/a"]
 
 
 def older_a(home: Home) -> dict[str, bytes]:

@@ -927,6 +927,27 @@ def test_a_restored_keystore_never_brings_back_a_ca_that_was_replaced(
     assert (now == later) is has_key
 
 
+@pytest.mark.parametrize("steps", [(0, 1), (1, 3)])
+def test_a_restored_keystore_does_not_leave_a_later_stage_of_a_rotation(
+    publisher: Home, steps: tuple[int, int]
+) -> None:
+    """It lacks the new CA, or still trusts the old one."""
+
+    def rotate(times: int) -> None:
+        for _ in range(times):
+            publisher.now += LATER
+            rotate_ca(publisher.root, roles=["identity"], now=publisher.now, allow_unconfirmed=True)
+
+    rotate(steps[0])
+    backup = copy_of(publisher.root, publisher.folder / "backup")
+    rotate(steps[1] - steps[0])
+    publisher.publish()
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    with pytest.raises(KeystoreError, match="the identity CA was replaced after the backup"):
+        publisher.publish(restored=True)
+
+
 def test_a_clock_that_was_set_back(publisher: Home) -> None:
     """Its own ledger lies in the future: nothing that is published now has the right dates."""
     before = snapshot(publisher.pub)

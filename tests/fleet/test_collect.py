@@ -439,13 +439,16 @@ def test_a_revoked_robot_that_is_still_in_the_fleet(home: Home) -> None:
 
 
 def test_a_certificate_of_the_ca_that_a_rotation_replaces(home: Home) -> None:
+    home.send("r3")
+    assert home.of("r3").outcome == "kept"
+    home.run("renew", "ks", "/r3/base", "--revoke-old")
     home.run("rotate_ca", "ks", "--next")
     home.run("rotate_ca", "ks", "--next", "--allow-unconfirmed")
     home.send("r1")
     assert home.of("r1").outcome == "kept", "the old CA is still trusted"
     home.run("rotate_ca", "ks", "--next", "--allow-unconfirmed")
     known = home.of("r1")
-    assert (known.outcome, known.enclave, known.sequence) == ("unchanged", "/r1/base", 1)
+    assert (known.outcome, known.enclave, known.sequence) == ("unchanged", "/r1/base", 2)
     assert "it missed the rotation" in known.remarks[0]
     home.send("r1")
     assert home.of("r1").outcome == "refused" and "it missed the rotation" in home.of("r1").why
@@ -453,6 +456,7 @@ def test_a_certificate_of_the_ca_that_a_rotation_replaces(home: Home) -> None:
     assert "it missed" not in home.of("r1").why
     home.put("r2", home.message("r1", NOW))
     assert home.of("r2").why.startswith("no identity CA of the keystore"), "of another robot"
+    assert home.of("r3").why.startswith("no identity CA of the keystore"), "it was revoked"
 
 
 @pytest.mark.parametrize(

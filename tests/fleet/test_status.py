@@ -508,6 +508,10 @@ def test_a_robot_that_was_off_during_a_rotation_has_missed_it(field: Field) -> N
     """It sent nothing new, and a web server may refuse it: its last message counts on."""
     field.run("fleet", "publish", "ks", "pub")
     field.send("r2", release=1)
+    field.run("rotate_ca", "ks", "--same-key")
+    field.run("fleet", "publish", "ks", "pub")
+    said = field.run("fleet", "status", "ks", "--robot", "r2", status=1).out
+    assert "an identity CA that was replaced" not in said, "its key still counts"
     for _ in range(3):
         field.run("rotate_ca", "ks", "--identity", "--next", "--allow-unconfirmed")
         field.run("fleet", "publish", "ks", "pub")
@@ -716,6 +720,11 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     (field.folder / "more.xml").write_text(policy_text(rights))
     field.run("generate_artifacts", "-k", "ks", "-p", "more.xml", "--fleet", "fleet.toml")
     assert in_force() == [True, True, True], "nothing runs in an enclave that a robot does not have"
+    enclaves = field.folder / "r1" / ENCLAVES
+    (copy_of(enclaves / "r1/base", enclaves / "x") / "crl.pem").write_text("of before")
+    field.confirm("r1", restart=[])
+    field.confirm("r2", restart=[], files={}, certificates={})
+    assert in_force() == [False, False, True], "an enclave of another list, and no enclave"
 
 
 def test_a_list_whose_ca_was_replaced_is_missed_until_nothing_trusts_the_ca(field: Field) -> None:
