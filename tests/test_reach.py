@@ -161,6 +161,7 @@ def test_links_are_found_without_the_name_of_each_hop() -> None:
     names = [star.format(number) for star in stars for number in (1, 2)]
     found = [f"/w{n} publish {name}" for n, name in enumerate(names)]
     found += [f"/r{n} subscribe {name}" for n, name in enumerate(names)]
+    found += ["/w publish /*d", "/w !publish /d*", "/r subscribe /d*"]
     network = Network(rights(*found))
     for enclave in network.enclaves:
         linked = {reader for reader, _ in network.links(enclave, ())}

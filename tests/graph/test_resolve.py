@@ -95,6 +95,7 @@ def test_strays_belong_to_the_only_node_of_their_process() -> None:
 
 def test_strays_of_a_process_without_a_name_or_with_two_stay() -> None:
     other = node("/b", like="python").endpoints
-    strays = [("p9", X), *(("p1", endpoint) for endpoint in other)]
+    asked = Endpoint("rq/a/get_parametersRequest", "publish")  # the service of another process
+    strays = [("p9", X), ("p9", asked), *(("p1", endpoint) for endpoint in other)]
     seen = make_observation(graph(node("/a", "publish x")).nodes, strays=strays)
     assert with_owners_of_strays(seen) == seen

@@ -82,6 +82,7 @@ def test_a_policy_in_a_namespace(namespace: str, path: str, relative: str) -> No
     [
         (["x:=/front/x"], {"/front/x", "/n/y", "/z", "/w/*"}),
         (["/x:=y", "/y:=/never"], {"/y", "/n/y", "/z", "/w/*"}),
+        (["x:=/first", "x:=/later"], {"/first", "/n/y", "/z", "/w/*"}),
         (["n:~/y:=~/q"], {"/x", "/n/q", "/z", "/w/*"}),
         (["other:x:=/front/x"], None),
         (["__node:=m", "__ns:=/left", "x:=a"], {"/left/a", "/left/m/y", "/z", "/w/*"}),
