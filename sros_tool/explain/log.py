@@ -231,7 +231,11 @@ class AskedPolicy:
     def enclave(self, enclave: str) -> Enclave | None:
         """Return an enclave as the robot has it, or None if the policy has none for it."""
         ns, path = self.place(enclave)
-        return policy_in_namespace(self.policy, ns).enclave(enclave) if path else None
+        stated = self.policy.enclave(path) if path else None
+        if stated is None:
+            return None
+        alone = replace(self.policy, enclaves=(stated,))  # whoever writes the log names many
+        return policy_in_namespace(alone, ns).enclave(enclave)
 
 
 FindEnclave = Callable[[str], LoadedEnclave | None]
@@ -812,8 +816,11 @@ class _Examiner:
         ]
         answer = answers[0]
         if all(answer.allowed for answer in answers):
-            allowing = "policy allows" if self._policy else "current permissions allow"
-            facts = [f"the {allowing} it"]
+            facts = ["the current permissions allow it"]
+            if self._policy:
+                space, path = self._policy.place(enclave.name)
+                where = f" to {path}, which is {enclave.name} in namespace {space}" if space else ""
+                facts = [f"the policy allows it{where}"]
             elsewhere, remedy = self._other_folder_cause(denial, enclave)
             facts += elsewhere
             remedy = remedy or (

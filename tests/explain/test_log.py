@@ -14,7 +14,7 @@ import pytest
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.explain import asking
-from sros_tool.explain.log import LogFinding, explain_log
+from sros_tool.explain.log import LogFinding, explain_log, explain_log_of
 from sros_tool.files import policies_dir
 from sros_tool.keystore.ledger import Ledger, LedgerFile
 from sros_tool.keystore.participant import LoadedEnclave, load_enclave_of
@@ -921,7 +921,29 @@ def test_a_log_of_a_robot_that_has_the_policy_in_a_namespace(
     said = sros("explain", policy, *named, "--log", log).out
     assert f"`sros explain {policy} /a publish /x` shows what is missing in the policy" in said
     assert "Write x in the policy, without a / at its beginning: the robot of the log has" in said
-    assert "no rule allows publish rt/left/x" in said and "the policy allows it" in said
+    assert "no rule allows publish rt/left/x" in said
+    assert "the policy allows it to /a, which is /left/a in namespace /left\n" in said
+
+
+def test_a_log_with_many_enclaves_does_not_put_the_whole_policy_into_each_namespace(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    policy.write_text(policy_text({f"/e{number}": publish("y") for number in range(50)}))
+    log.write_text(
+        "[INFO] [1.0] [rcl]: Found security directory: /k/enclaves/left/e7\n"
+        "[SECURITY Error] rt/left/x topic not found in allow rule. -> check_create_datawriter\n"
+    )
+    placed: list[str] = []
+
+    def below(path: str, namespace: str) -> str:
+        placed.append(path)
+        return f"{namespace}{path}".rstrip("/")
+
+    monkeypatch.setattr("sros_tool.policy.model.below_namespace", below)
+    at = asking.AskingContext(datetime.now(UTC), UTC)
+    explained_log = explain_log_of("robot.log", log.read_text(), None, "", at, policy)
+    assert explained_log.findings[0].checked and {*placed} == {"/", "/e7"}
 
 
 def test_the_enclave_that_the_user_names_is_asked_about_another_one(tmp_path: Path) -> None:
