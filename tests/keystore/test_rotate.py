@@ -535,6 +535,8 @@ def test_what_the_old_ca_issued_during_a_rotation_and_was_revoked_keeps_no_expor
     assert not unlisted_revocations(OpenedKeystore(separate), later)
     shutil.copy(enclave_path(separate, "/a") / "cert.pem", folder / "cert.pem")
     assert unlisted_revocations(OpenedKeystore(separate), later) == ["/late"], "another certificate"
+    refresh_crl(separate, now=later)
+    assert not unlisted_revocations(OpenedKeystore(separate), later), "as the remedy says"
 
 
 def lists_of(root: Path) -> list[tuple[str, set[int]]]:

@@ -23,7 +23,7 @@ from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.keystore.fleet import publish_command
 from sros_tool.keystore.issuing.authority import Authority, write_bundle
 from sros_tool.keystore.issuing.keyring import Keyring
-from sros_tool.keystore.known_keys import restored_at, revoked_serials
+from sros_tool.keystore.known_keys import restored_at, revoked_issues, revoked_serials
 from sros_tool.keystore.layout import (
     CRL,
     CRL_FILE,
@@ -527,7 +527,11 @@ class RevocationListSigner:
         )
 
     def _lost_revocations(self, expiries: Mapping[int, str]) -> list[Revoked]:
-        """Return the revocations that the current list lacks, if it is older than the last list."""
+        """Return the revocations that the current list lacks.
+
+        If it is the last list, these are only those for which `unlisted_revocations` refuses an
+        export: it rightly lacks certificates of CAs that were replaced.
+        """
         entries = self._keystore.ledger_file.with_values("what", ("revocation", "crl")).entries
         count = max(
             (i for i, entry in enumerate(entries, 1) if entry.what == "revocation"), default=0
@@ -535,15 +539,19 @@ class RevocationListSigner:
         keystore = self._keystore
         present = keystore.read(CRL, "revocation list") if keystore.has(CRL) else b""
         sha256 = hashlib.sha256(present).hexdigest()
-        if any(entry.what == "crl" and entry.sha256 == sha256 for entry in entries[count:]):
-            return []
+        is_last = any(entry.what == "crl" and entry.sha256 == sha256 for entry in entries[count:])
         listed = {entry.serial for entry in self.present.revoked} if self.present else set()
+        on_a_list = {
+            f"{entry.serial:x}" for crl in keystore.revocation_lists for entry in crl.revoked
+        }
+        missed = {entry.serial for entry in revoked_issues(keystore, on_a_list)}
         moment = iso(self._now)
         return [
             Revoked(serial, self._now.replace(microsecond=0), reason)
             for entry in entries[:count]
             if entry.what == "revocation" and entry.serial
             if (serial := int(entry.serial, 16)) not in listed
+            if entry.serial in missed or not is_last
             if expiries.get(serial, moment) >= moment
             for reason in (entry.reason if entry.reason in REASONS else "unspecified",)
         ]
