@@ -254,8 +254,9 @@ class RobotStatus:
     pending: tuple[ConfirmedFile, ...]
     """Files that differ from the keystore; empty if the robot sent no confirmation."""
     restart: tuple[str, ...] | None
-    """The robot's enclaves whose processes may still run with earlier files, by its last
-    confirmation; null if the confirmation does not tell."""
+    """The enclaves whose processes may still run with earlier files on the robot, by its last
+    confirmation, also those that it should not have any more; null if the confirmation does not
+    tell."""
     running: Mapping[str, RunningFiles] | None
     """The files that the processes of each enclave of the robot have loaded, by its last
     confirmation; null if the confirmation does not tell."""
@@ -640,18 +641,14 @@ class _ComparedRobot(NamedTuple):
     def restart(self) -> tuple[str, ...] | None:
         """Return the enclaves whose processes have earlier files; None if it was not reported.
 
-        `sros fleet report` states only restarts that an agent noted, and neither ``running`` nor
-        ``crl_restart``: nothing is known of the enclaves that it leaves out.
+        Processes may still run in an enclave that the keystore gives to the robot no more.
         """
-        running, confirmed = self.running(), self.confirmed
-        due = confirmed.restart if confirmed else None
+        running = self.running()
+        due = self.confirmed.restart if self.confirmed else None
         if due is None and running is None:
             return None
         earlier = {name for name, files in (running or {}).items() if files == RunningFiles.EARLIER}
-        own = earlier | ({*(due or ())} & {*self.enclaves})
-        if due and not own and running is None and confirmed and confirmed.crl_restart is None:
-            return None
-        return tuple(sorted(own))
+        return tuple(sorted(earlier.union(due or ())))
 
     def crl_restart(self) -> tuple[str, ...] | None:
         """Return the enclaves whose processes may lack the revocation list; None if not reported.
@@ -659,7 +656,7 @@ class _ComparedRobot(NamedTuple):
         Robots of earlier releases say only which enclaves have to restart, whatever changed.
         """
         due = self.confirmed.crl_restart if self.confirmed else None
-        return self.restart() if due is None else tuple(sorted({*due} & {*self.enclaves}))
+        return self.restart() if due is None else due
 
 
 def _compare_robots(

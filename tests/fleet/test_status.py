@@ -533,7 +533,7 @@ def test_a_robot_that_was_off_during_a_rotation_has_missed_it(field: Field) -> N
 def test_a_restart_that_is_due(field: Field) -> None:
     """The files are current, but processes run with those of before: that is not green."""
     assert field.status()["robots"]["r1"]["restart"] is None, "not said"
-    field.confirm("r1", restart=["/r1/base", "/r9/base"])
+    field.confirm("r1", restart=["/r1/base"])
     field.confirm("r2", restart=[])
     assert field.states() == {"r1": "restart", "r2": "current", "r3": "current"}
     robots = field.status()["robots"]
@@ -697,8 +697,9 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     assert in_force() == [False, False, False], "r1 does not say which processes it has"
     said = field.run("fleet", "status", "ks", status=1).out
     assert "on 0 of 3 robots; 2 more have it, but it is not known that all processes" in said
-    field.confirm("r1", restart=["/r9/base"])
-    assert in_force() == [False, False, False], "`fleet report` states what the agent noted"
+    field.confirm("r1", restart=["/r1/removed"])
+    assert in_force() == [False, False, False], "a process of an enclave that the robot had"
+    assert field.states()["r1"] == "restart"
     field.confirm("r1", restart=[])
     assert in_force() == [True, False, False]
     found = field.status()["robots"]["r2"]
