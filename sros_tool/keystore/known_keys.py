@@ -26,7 +26,7 @@ from sros_tool.keystore.layout import (
     REVOKED,
     revoked_certificates,
 )
-from sros_tool.keystore.ledger import REPORTED, RESTORED, SAME_KEY, Entry
+from sros_tool.keystore.ledger import REPORTED, RESTORED, Entry
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import (
@@ -53,27 +53,24 @@ def revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
 
 def restored_at(keystore: OpenedKeystore) -> str:
     """Return when a keystore was restored with an identity CA that it trusts; "" if never."""
-    entries = _entries_of_trusted(keystore)
-    return next((entry.time for entry in entries if entry.what == RESTORED), "")
+    entries = _since_trusted(keystore, keystore.ledger_with("what", RESTORED).entries)
+    return next((entry.time for entry in reversed(entries) if entry.what == RESTORED), "")
 
 
-def _trusted_since(keystore: OpenedKeystore) -> str:
-    """Return when the first identity CA that a keystore trusts was recorded, or later."""
-    return min((entry.time for entry in _entries_of_trusted(keystore)), default="")
+def _since_trusted(keystore: OpenedKeystore, entries: Sequence[Entry]) -> Sequence[Entry]:
+    """Return the entries from when the key of an identity CA that is trusted was recorded.
 
-
-def _entries_of_trusted(keystore: OpenedKeystore) -> Iterator[Entry]:
-    """Yield entries of CAs and of restores, the last first, from when a trusted CA was recorded."""
+    ``entries`` are of a reading of the ledger, each of which has all CAs; all are returned if a
+    trusted CA is not recorded, or CAs are recorded without keys, as by earlier versions of sros.
+    """
     file = keystore.identity_file
-    trusted = {digest(ca) for ca in (keystore.certificates_of(file) if file else ())}
-    ledger = keystore.ledger_file.with_values("what", (RESTORED, "ca"))
-    for entry in reversed(ledger.entries):
-        if not trusted:
-            return
-        if entry.what == "ca" and entry.reason != SAME_KEY:
-            trusted.discard(entry.sha256)
-        if entry.what in (RESTORED, "ca"):
-            yield entry
+    trusted = {_digest_of(ca) for ca in (keystore.certificates_of(file) if file else ())}
+    authorities = [place for place, entry in enumerate(entries) if entry.what == "ca"]
+    places = (
+        next((place for place in authorities if entries[place].key in (key, "")), 0)
+        for key in trusted
+    )
+    return entries[min(places, default=len(entries)) :]
 
 
 def revoked_issues(keystore: OpenedKeystore, listed: Collection[str] = ()) -> Iterator[Entry]:
@@ -85,13 +82,15 @@ def revoked_issues(keystore: OpenedKeystore, listed: Collection[str] = ()) -> It
     serials = {f"{serial:x}" for serial in revoked_serials(keystore)}.difference(listed)
     recorded = keystore.ledger_file.with_values("serial", serials).entries if serials else ()
     names = {entry.enclave for entry in recorded if entry.serial in serials} - {""}
-    since = _trusted_since(keystore) if names else ""
-    for entry in keystore.ledger_file.with_values("enclave", names).entries if names else ():
+    entries = keystore.ledger_file.with_values("enclave", names).entries if names else ()
+    earlier = len(entries) - len(_since_trusted(keystore, entries))
+    serials -= {entry.serial for entry in entries[:earlier]}
+    for entry in entries:
         if entry.enclave in names and entry.what == "permissions":
             yield entry
         elif entry.enclave in names and entry.serial in serials:
             serials.remove(entry.serial)
-            if _is_of_trusted(keystore, entry, since):
+            if _may_be_of_trusted(keystore, entry):
                 yield entry
 
 
@@ -105,15 +104,14 @@ def removed_enclaves(keystore: OpenedKeystore, now: datetime) -> Mapping[str, st
         recorded = [entry.enclave for entry in keystore.ledger.entries]
     gone = {*recorded}.difference(keystore.names, ("",))
     revoked = {f"{serial:x}" for serial in revoked_serials(keystore)} if gone else set()
-    since = _trusted_since(keystore) if gone else ""
+    entries = keystore.ledger_file.with_values("enclave", gone).entries if gone else ()
     expiry: dict[str, str] = {}
-    for entry in keystore.ledger_file.with_values("enclave", gone).entries if gone else ():
+    for entry in _since_trusted(keystore, entries):
         if (
             entry.what == "certificate"
             and entry.enclave in gone
             and entry.serial not in revoked
             and entry.reason != REPORTED
-            and entry.time >= since
             and entry.not_after > iso(now)
         ):
             expiry[entry.enclave] = max(entry.not_after, expiry.get(entry.enclave, ""))
@@ -165,19 +163,16 @@ def _known_authorities(keystore: OpenedKeystore, role: str) -> frozenset[str] | 
     return frozenset(known)
 
 
-def _is_of_trusted(keystore: OpenedKeystore, entry: Entry, since: str) -> bool:
-    """Return whether a CA that is trusted ``since`` a moment may have issued a certificate.
+def _may_be_of_trusted(keystore: OpenedKeystore, entry: Entry) -> bool:
+    """Return whether a trusted CA may have issued a certificate that was recorded after this CA.
 
-    The CA before it goes on to issue until the stage reissue of a rotation: of certificates since
-    then, the revoked file tells, if it is there and the one that the ledger records.
+    The CA before it goes on to issue until the stage reissue of a rotation: the revoked file tells,
+    if it is there and the one that the ledger records.
     """
-    recorded = entry.what == "certificate"
-    if recorded and entry.time < since:
-        return False
     file = keystore.identity_file
     with suppress(SrosError):
         certificate = keystore.certificate(f"{REVOKED}/{entry.serial}/{CERTIFICATE_FILE}")
-        if file and (not recorded or digest(certificate) == entry.sha256):
+        if file and entry.sha256 in ("", digest(certificate)):
             return any(issued_by(certificate, ca) for ca in keystore.certificates_of(file))
     return True
 

@@ -22,7 +22,7 @@ from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.delivery.release import retired_authorities
 from sros_tool.keystore.issuing import keyring
 from sros_tool.keystore.issuing.keyring import Keyring
-from sros_tool.keystore.known_keys import revoked_issues, unlisted_revocations
+from sros_tool.keystore.known_keys import removed_enclaves, revoked_issues, unlisted_revocations
 from sros_tool.keystore.layout import FLEET_ROOT, ROTATION, enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
@@ -519,6 +519,22 @@ def test_a_revoked_certificate_of_a_ca_that_is_gone_is_not_of_a_trusted_one(
     assert not [e for e in revoked_issues(OpenedKeystore(separate)) if e.serial]
     revoke(separate, ["/a"], now=NOW)
     assert {e.enclave for e in revoked_issues(OpenedKeystore(separate)) if e.serial} == {"/a"}
+
+
+def test_the_renewal_of_a_ca_brings_no_removed_enclave_of_an_earlier_ca_back(
+    separate: Path,
+) -> None:
+    def removed() -> list[str]:
+        return [*removed_enclaves(OpenedKeystore(separate), NOW)]
+
+    shutil.rmtree(enclave_path(separate, "/b"))
+    days = [NOW + timedelta(days=day) for day in range(1, 4)]
+    renew_identity_ca(separate, now=days[0])
+    assert removed() == ["/b"], "its certificate is of this key"
+    rotate_ca(separate, finish=True, now=days[1])
+    assert not removed()
+    renew_identity_ca(separate, now=days[2])
+    assert not removed()
 
 
 def test_what_the_old_ca_issued_during_a_rotation_and_was_revoked_keeps_no_export(
