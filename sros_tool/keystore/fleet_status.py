@@ -212,7 +212,9 @@ class RobotStatus:
     and ``is_locked_out`` that all its certificates are revoked, or of a CA that was replaced.
     ``lacks_ca`` says that it refuses releases, because it does not trust the CA that seals them.
     ``is_doubtful`` says that what it has is not known, whatever it confirmed: its last message was
-    refused, its release was never published, or two computers have its keys. The first ``reported``
+    refused, its release was never published, or two computers have its keys, and
+    ``may_trust_replaced`` that a process of it may trust an identity CA that was replaced. The
+    first ``reported``
     problems are in the words of the robot.
     """
 
@@ -282,6 +284,7 @@ class RobotStatus:
     short_lived: tuple[str, ...] = ()
     has_list: bool = False
     is_doubtful: bool = False
+    may_trust_replaced: bool = True
     renew_from: datetime | None = None
     lacks_key: tuple[str, ...] = ()
     reads_copy: bool = False
@@ -555,8 +558,10 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
     )
     if older := records.age_clause:  # there may be a later list, which it does not have
         statuses = tuple(status.without_list() for status in statuses)
-    any_waits = any(status.crl_in_force is False for status in statuses)
-    is_any_revoked = records.is_any_listed() or (any_waits and records.is_any_revoked)
+    may_trust_replaced = any(
+        status.crl_in_force is False and (older or status.may_trust_replaced) for status in statuses
+    )
+    is_any_revoked = records.is_any_listed() or (may_trust_replaced and records.is_any_revoked)
     return FleetStatus(
         keystore.root,
         stages.of_keystore,
@@ -564,7 +569,9 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
         unassigned,
         older=older,
         edited=edited_fleet(keystore, keystore.ledger_with("what", "fleet")),
-        revoked_until=records.revoked_until(any_waits=any_waits) if is_any_revoked else None,
+        revoked_until=records.revoked_until(may_trust_replaced=may_trust_replaced)
+        if is_any_revoked
+        else None,
         publication=records.publication,
         is_any_revoked=is_any_revoked,
         groups=fleet.groups,
@@ -1038,15 +1045,15 @@ class _KeystoreRecords:
         except SrosError:
             return self.has_list
 
-    def revoked_until(self, *, any_waits: bool) -> datetime | None:
+    def revoked_until(self, *, may_trust_replaced: bool) -> datetime | None:
         """Return when the last certificate on the revocation list expires; None if unknown.
 
-        If a robot waits for the list, the certificates on lists of replaced CAs count, too.
+        If a robot may trust a replaced CA, the certificates on lists of replaced CAs count, too.
         """
         with suppress(SrosError):
             lists = self._keystore.revocation_lists
             serials = {f"{entry.serial:x}" for crl in lists for entry in crl.revoked}
-            serials |= self._revoked_serials if any_waits else set()
+            serials |= self._revoked_serials if may_trust_replaced else set()
             entries = self._keystore.ledger_file.with_values("serial", serials).entries
             expiries = {entry.serial: entry.not_after for entry in entries if entry.not_after}
             if serials and serials <= expiries.keys():
@@ -1190,15 +1197,19 @@ def _status(
     problems = confirmed.problems if confirmed else None
     if two_computers := received.two_computers() if received and compared_robot.enclaves else "":
         problems = (*(problems or ()), two_computers)
-    has_list = (
-        records.has_list
-        and not two_computers
+    is_doubtful = bool(is_refused or is_later or two_computers)  # whichever state is shown
+    has_authorities = (
+        not is_doubtful
         and bool(compared_robot.enclaves)
         and received is not None
-        and not (is_refused or is_later)  # whichever state is shown
         and compared_robot.has_all("identity_ca")
+    )
+    has_list = (
+        records.has_list
+        and has_authorities
         and compared_robot.has_all("crl", records.is_list_equal)
     )
+    is_restarted = compared_robot.crl_restart() == ()
     fetches = bool(received and received.message)
     has_release = bool(different) and records.has_release(compared_robot)
     validity = records.validity(compared_robot)
@@ -1219,9 +1230,7 @@ def _status(
         different,
         restart,
         compared_robot.running(),
-        has_list and compared_robot.crl_restart() == ()
-        if records.has_list and compared_robot.enclaves
-        else None,
+        has_list and is_restarted if records.has_list and compared_robot.enclaves else None,
         {kind: file.window.not_after for kind, file in validity.items()},
         confirmed.dds if confirmed else None,
         problems,
@@ -1230,7 +1239,8 @@ def _status(
         lacks_ca=fetches and records.lacks_ca(compared_robot, is_published=has_release),
         short_lived=records.short_lived(validity),
         has_list=has_list,
-        is_doubtful=bool(is_refused or is_later or two_computers),
+        is_doubtful=is_doubtful,
+        may_trust_replaced=not (has_authorities and is_restarted),
         renew_from=min(
             (file.window.expires_soon_from() for file in validity.values()), default=None
         ),

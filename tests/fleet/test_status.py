@@ -369,6 +369,12 @@ def test_until_when_a_revocation_is_needed(field: Field) -> None:
     field.run("create_enclave", "ks", "/short")
     field.run("revoke", "ks", "/short")
     assert field.status()["revoked_until"] == iso(until), "robots may still trust the earlier CA"
+    field.deliver("r1", "r2", restart=[])
+    field.run("create_enclave", "ks", "/short")
+    certificate = read_certificate(field.root / ENCLAVES / "short/cert.pem")
+    field.run("revoke", "ks", "/short")
+    until = validity_of(certificate).not_after
+    assert field.status()["revoked_until"] == iso(until), "robots wait, and trust only the new CA"
     (field.root / "ledger.jsonl").unlink()
     assert field.status()["revoked_until"] is None, "nobody knows"
 
