@@ -43,11 +43,13 @@ if TYPE_CHECKING:
 
     from sros_tool.checks.kind import Finding
     from sros_tool.dds.advisories import Advisory
+    from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.distributions import Distribution
     from sros_tool.enclave_environment import EnclaveEnvironment
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.fleet.robots import Fleet
     from sros_tool.keystore.issuing.keyring import Keyring
+    from sros_tool.keystore.lifecycle.change import ChangeOptions
     from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.parallel import Tally
     from sros_tool.policy.model import Policy
@@ -783,6 +785,16 @@ def keyring(
         encrypt,
         bool(os.environ.get("SROS_SHORT_PASSPHRASE")),
     )
+
+
+def change_options(*, dry_run: bool, allow_refusal: Sequence[Vendor] = ()) -> ChangeOptions:
+    """Return the options of a change of a keystore that is made now, with the user's CA keys."""
+    return {
+        "now": now(),
+        "keyring": keyring(),
+        "allow_refusal": allow_refusal,
+        "dry_run": dry_run,
+    }
 
 
 def secrets() -> Callable[[str], str]:

@@ -14,6 +14,7 @@ from sros_tool.cli.changed import print_changed, print_closed, print_follow_up, 
 from sros_tool.cli.common import (
     PATH,
     allow_refusal_option,
+    change_options,
     chosen_enclaves,
     complete_file,
     domain_of,
@@ -22,7 +23,6 @@ from sros_tool.cli.common import (
     fleet_option,
     json_option,
     key_option,
-    keyring,
     keystore_argument,
     keystore_arguments,
     moment_of,
@@ -428,7 +428,6 @@ def sign_request(
     signed = sign(
         root,
         read_named(request, "signing request"),
-        now=now(),
         policy=_policy(policy_file, fleet_file),
         only_enclaves=only,
         refuse_revoked=refuse_revoked,
@@ -436,9 +435,7 @@ def sign_request(
         answer=None if stream else output,
         force=force,
         domain=domain_from(os.environ),
-        keyring=keyring(),
-        allow_refusal=allow_refusal,
-        dry_run=dry_run,
+        **change_options(dry_run=dry_run, allow_refusal=allow_refusal),
     )
     _show_signed(signed, output, existed=existed, as_json=as_json)
 
@@ -515,15 +512,12 @@ def _certify(
     done = certify_requests(
         root,
         read_named(request, "signing request"),
-        now=now(),
         policy=policy,
         only_enclaves=only,
         refuse_revoked=refuse_revoked,
         renew=renew,
         domain=domain_from(os.environ),
-        keyring=keyring(),
-        allow_refusal=allow_refusal,
-        dry_run=dry_run,
+        **change_options(dry_run=dry_run, allow_refusal=allow_refusal),
     )
     _show_signed(done, None, as_json=as_json)
 

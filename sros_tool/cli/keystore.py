@@ -23,6 +23,7 @@ from sros_tool.cli.common import (
     PATH,
     SeveralValues,
     allow_refusal_option,
+    change_options,
     chosen_enclaves,
     complete_template,
     dry_run_option,
@@ -84,12 +85,10 @@ def create_enclave(arguments: tuple[str, ...], key: str, dry_run: bool, as_json:
         result = create_enclaves(
             root,
             names,
-            now=now(),
             domain=ros_domain(),
             key=key,
-            keyring=keyring(),
-            dry_run=dry_run,
             progress=step,
+            **change_options(dry_run=dry_run),
         )
     _show(result, as_json)
 
@@ -154,13 +153,10 @@ def create_permission(
         root,
         chosen,
         policy,
-        now=now(),
         domain=ros_domain(),
         revoke_old=revoke_old,
         keep_same=not given,
-        keyring=keyring(),
-        allow_refusal=allow_refusal,
-        dry_run=dry_run,
+        **change_options(dry_run=dry_run, allow_refusal=allow_refusal),
     )
     left_out = [
         name
@@ -292,14 +288,11 @@ def generate_artifacts(
             root,
             enclaves=enclaves,
             policies=policies,
-            now=now(),
             domain=ros_domain(),
             create=template,
             revoke_old=revoke_old,
-            keyring=keyring(),
-            allow_refusal=allow_refusal,
-            dry_run=dry_run,
             progress=step,
+            **change_options(dry_run=dry_run, allow_refusal=allow_refusal),
         )
     if result.new_keystore and not dry_run:
         echo(f"'{root}' is not a valid keystore, creating new keystore", err=True)
@@ -785,7 +778,7 @@ def update_keystore(
             raise UsageError(
                 "--trust-records and other changes exclude each other", "", "Give it alone."
             )
-        update = trust(root, now=now(), keyring=keyring(), dry_run=dry_run)
+        update = trust(root, **change_options(dry_run=dry_run))
         _show_update(update, (), "", as_json)
         return 0
     if not any(value not in (None, (), False) for value in chosen):
@@ -829,16 +822,13 @@ def update_keystore(
             root,
             target,
             domains,
-            now=now(),
             next_stage=next_stage,
             allow_looser=allow_looser,
             revoke_old=revoke_old,
             replace_edits=take_edits or discard_edits,
             seen_settings=present,
-            keyring=keyring(),
-            allow_refusal=allow_refusal,
-            dry_run=dry_run,
             progress=step,
+            **change_options(dry_run=dry_run, allow_refusal=allow_refusal),
         )
     layout = any(key == "authorities.layout" for key, _ in map(_key_and_value, values))
     shared = next((r.text for r in update.remarks if r.id == "keystore.one-authority"), "")

@@ -20,6 +20,7 @@ from sros_tool.cli.changed import (
 from sros_tool.cli.common import (
     PATH,
     allow_refusal_option,
+    change_options,
     check_chosen,
     chosen_enclaves,
     dry_run_option,
@@ -117,15 +118,12 @@ def renew(
         result = work(
             root,
             names,
-            now=now(),
             expiring=threshold,
             new_key=new_key,
             key=key,
             revoke_old=revoke_old,
-            keyring=keyring(),
-            allow_refusal=allow_refusal,
-            dry_run=dry_run,
             progress=step,
+            **change_options(dry_run=dry_run, allow_refusal=allow_refusal),
         )
     print_changed(
         result,
@@ -244,13 +242,10 @@ def revoke(
         result = work(
             root,
             names,
-            now=now(),
             reason=reason_text,
-            keyring=keyring(),
             until_retired=until_retired,
             crl=_read_given_list(crl_file),
-            allow_refusal=allow_refusal,
-            dry_run=dry_run,
+            **change_options(dry_run=dry_run, allow_refusal=allow_refusal),
         )
     result = replace(result, remarks=(*selection_notes, *result.remarks))
     shown = None
@@ -301,11 +296,8 @@ def crl(
     if refresh:
         result = refresh_crl(
             root,
-            now=now(),
-            keyring=keyring(),
             crl=_read_given_list(crl_file),
-            allow_refusal=allow_refusal,
-            dry_run=dry_run,
+            **change_options(dry_run=dry_run, allow_refusal=allow_refusal),
         )
         if dry_run and not as_json:
             print_plan(root, result.changes)
@@ -532,12 +524,9 @@ def rotate_ca(
             )
         step = renew_identity_ca(
             root,
-            now=now(),
-            keyring=keyring(),
             validity=validity,
             issued=existing.get(IDENTITY, b""),
-            allow_refusal=allow_refusal,
-            dry_run=dry_run,
+            **change_options(dry_run=dry_run, allow_refusal=allow_refusal),
         )
     else:
         roles = [r for r, on in (("identity", identity), ("permissions", permissions)) if on]
@@ -546,17 +535,14 @@ def rotate_ca(
                 root,
                 RotationStage(to) if to else None,
                 roles=roles,
-                now=now(),
                 finish=finish,
-                keyring=keyring(),
                 new_keys=_new_keys(identity_key, permissions_key, encrypt_ca_keys),
                 existing=existing,
                 validity=validity,
                 delete_old_key=delete_old_key,
                 allow_unconfirmed=allow_unconfirmed,
-                allow_refusal=allow_refusal,
-                dry_run=dry_run,
                 progress=tick,
+                **change_options(dry_run=dry_run, allow_refusal=allow_refusal),
             )
     shown = None
     if as_json:

@@ -12,14 +12,13 @@ import click
 from sros_tool.cli.changed import print_follow_up, print_plan
 from sros_tool.cli.common import (
     PATH,
+    change_options,
     check_output,
     dry_run_option,
     echo_findings,
     force_option,
     json_option,
-    keyring,
     keystore_from_environment,
-    now,
     output_option,
     print_json,
     print_notes,
@@ -181,7 +180,7 @@ def zenoh(
     network = None if off else _network(settings, chosen_settings, further, crossing)
     with progress("writing the Zenoh files"):
         work = read_consistently(set_zenoh) if only_check else set_zenoh
-        result = work(root, network, now=now(), keyring=keyring(), dry_run=dry_run or only_check)
+        result = work(root, network, **change_options(dry_run=dry_run or only_check))
     # A document and the signed one next to it are written together.
     actions = {
         change.path: change.action

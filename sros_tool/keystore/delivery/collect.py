@@ -19,7 +19,7 @@ from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from shlex import quote
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, Unpack
 
 from cryptography import x509
 
@@ -54,7 +54,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
 )
 from sros_tool.keystore.ledger import REPORTED, Entry
-from sros_tool.keystore.lifecycle.change import KeystoreChange
+from sros_tool.keystore.lifecycle.change import ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import Forgotten
 from sros_tool.keystore.lifecycle.revoke import (
     REVOKED_AGAIN,
@@ -863,11 +863,7 @@ def _revoke_again(
 def _sign(
     root: Path,
     messages: Sequence[_ReceivedMessage],
-    *,
-    now: datetime,
-    allow_refusal: Sequence[Vendor],
-    keyring: Keyring,
-    dry_run: bool,
+    **options: Unpack[ChangeOptions],
 ) -> tuple[str, list[Note], list[FileChange]]:
     """Sign the requests that may be signed, all in one change of the keystore if that is possible.
 
@@ -889,13 +885,10 @@ def _sign(
             signed = certify_requests(
                 root,
                 b"".join(request.pem for request in requests),
-                now=now,
                 only_enclaves=[request.name for request in requests],
                 renew=True,
                 replace_keys=True,
-                allow_refusal=allow_refusal,
-                keyring=keyring,
-                dry_run=dry_run,
+                **options,
             )
         except SrosError as error:
             return error
@@ -915,7 +908,7 @@ def _sign(
     if not by_robot:
         return "", notes, changes
     joint = sign(by_robot)
-    if joint and (problem := _cannot_sign(root, now, keyring)):
+    if joint and (problem := _cannot_sign(root, **options)):
         for request in (request for judged in by_robot for request in judged):
             request.set_outcome("not_signed", problem)
         return problem, notes, changes
@@ -923,10 +916,10 @@ def _sign(
     return "", notes, changes
 
 
-def _cannot_sign(root: Path, now: datetime, keyring: Keyring) -> str:
+def _cannot_sign(root: Path, **options: Unpack[ChangeOptions]) -> str:
     """Return why the CAs of the keystore cannot sign, whatever is requested; "" if they can."""
     try:
-        with KeystoreChange(root, now=now, keyring=keyring, dry_run=True) as change:
+        with KeystoreChange(root, **options | {"dry_run": True}) as change:
             change.open_authorities()
     except SrosError as error:
         return error.what

@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, Unpack
 
 from cryptography import x509
 
-from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.permissions import name_notes
 from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError
 from sros_tool.files import staged_file
@@ -37,7 +36,6 @@ from sros_tool.keystore.issuing.enclave import (
     shared_files,
     stated_enclave,
 )
-from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -52,7 +50,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
 )
 from sros_tool.keystore.ledger import document_entry
-from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
+from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.create import refuse_less_protected
 from sros_tool.keystore.lifecycle.replaced import (
     EarlierPermissions,
@@ -110,7 +108,6 @@ def sign_request(
     root: Path,
     data: bytes,
     *,
-    now: datetime,
     policy: Policy | FleetPolicy | None = None,
     only_enclaves: Sequence[str] = (),
     refuse_revoked: bool = False,
@@ -118,9 +115,7 @@ def sign_request(
     answer: Path | None = None,
     force: bool = False,
     domain: int | None = None,
-    allow_refusal: Sequence[Vendor] = (),
-    keyring: Keyring = IN_KEYSTORE,
-    dry_run: bool = False,
+    **options: Unpack[ChangeOptions],
 ) -> Signed:
     """Certify the key of a request, sign the permissions, and make the answer for the robot.
 
@@ -139,7 +134,7 @@ def sign_request(
         answer: the path for the answer, which is written after the keystore has changed.
         force: replace ``answer`` if it exists.
         domain: the ROS domain that the keystore has to be for.
-        allow_refusal: vendors whose nodes may stop working.
+        options: those of every change of a keystore.
 
     Raises:
         PkiError: the request is not valid.
@@ -156,9 +151,7 @@ def sign_request(
     stated = _stated_rights(policy, [name])
     if answer is not None:
         _check_free(answer, force)
-    change = KeystoreChange(
-        root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
-    )
+    change = KeystoreChange(root, **options)
     with change:
         signer = _Signer(change, domain, stated)
         issued = signer.certify(
@@ -171,9 +164,11 @@ def sign_request(
         if not change.is_guess:
             _check_result(RequestAnswer(name, files, sealed), request, change.moment)
         archive = pack({SEAL: sealed, **files})
-        change.entries.append(document_entry(now, "answer", sealed, enclave=name, number=number))
+        change.entries.append(
+            document_entry(change.now, "answer", sealed, enclave=name, number=number)
+        )
         change.record()
-        staged = staged_file(answer, archive) if answer and not dry_run else nullcontext()
+        staged = staged_file(answer, archive) if answer and not change.dry_run else nullcontext()
         with staged as put_in_place:
             change.finish()
             if put_in_place:
@@ -214,16 +209,13 @@ def certify_requests(
     root: Path,
     data: bytes,
     *,
-    now: datetime,
     policy: Policy | FleetPolicy | None = None,
     only_enclaves: Sequence[str] = (),
     refuse_revoked: bool = False,
     renew: bool = False,
     replace_keys: bool = False,
     domain: int | None = None,
-    allow_refusal: Sequence[Vendor] = (),
-    keyring: Keyring = IN_KEYSTORE,
-    dry_run: bool = False,
+    **options: Unpack[ChangeOptions],
 ) -> Signed:
     """Certify the keys of several requests (PEM, one after the other), all or none.
 
@@ -249,9 +241,7 @@ def certify_requests(
         _check_requested_enclaves(requests, only_enclaves)
     _check_distinct(requests)
     stated = _stated_rights(policy, [check_enclave_name(request.name) for request in requests])
-    change = KeystoreChange(
-        root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
-    )
+    change = KeystoreChange(root, **options)
     kept: tuple[str, ...] = ()
     with change:
         if not renew:

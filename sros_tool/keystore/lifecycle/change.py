@@ -17,7 +17,7 @@ from datetime import datetime, timedelta
 from functools import cached_property
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Required, Self, TypedDict, TypeVar
 
 from cryptography import x509
 
@@ -68,7 +68,6 @@ from sros_tool.keystore.settings import (
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction import Change, Transaction, recover_keystore
 from sros_tool.keystore.zenoh_files import (
-    NO_CHANGE,
     Drift,
     Drifted,
     ZenohChange,
@@ -91,6 +90,21 @@ if TYPE_CHECKING:
 
 
 Result = TypeVar("Result", bound="Changed")
+
+
+class ChangeOptions(TypedDict, total=False):
+    """The options of every change of a keystore; `KeystoreChange` has their defaults."""
+
+    now: Required[datetime]
+    """Time of the change."""
+    keyring: Keyring
+    """Opens the keys of the CAs."""
+    allow_refusal: Sequence[Vendor]
+    """Vendors whose nodes may stop working."""
+    dry_run: bool
+    """Change nothing, but return the result that the change would have."""
+
+
 _NOTED = timedelta(days=1)
 """How much earlier than requested a certificate of a CA service may expire without a note."""
 
@@ -419,25 +433,43 @@ class KeystoreChange:
             replaced: the enclaves whose earlier certificates are revoked.
             stated: the policies of enclaves, whose lines errors name.
             created: new enclaves, which have no running process yet.
+
+        Raises:
+            PolicyError: an enclave's rights cannot be stated to Zenoh.
+            KeystoreError: the enclave of the router is missing.
         """
         if self.template.zenoh is None:
             return
-        from sros_tool.keystore.zenoh_files import ZenohChange
-
-        self.zenoh = _keep_zenoh(
-            self.transaction,
-            keystore=self.keystore,
-            network=self.template.zenoh,
-            domains=self.domains,
-            authority=self._permissions_certificate(),
-            signer=lambda: self.permissions,
-            now=self.now,
-            change=ZenohChange(
-                issued,
-                gone=gone_enclaves,
-                replaced=replaced,
-                stated=stated or {},
-                recorded=self.entries,
+        change = ZenohChange(
+            issued,
+            gone=gone_enclaves,
+            replaced=replaced,
+            stated=stated or {},
+            recorded=self.entries,
+        )
+        authority, existing = self._permissions_certificate(), self.transaction.enclaves
+        wanted = zenoh_documents(
+            *(self.keystore, self.template.zenoh, self.domains, authority, self.now, change),
+            existing=existing,
+        )
+        drifts = drifted_configurations(self.keystore, wanted, authority, gone_enclaves)
+        for drift in drifts:
+            if drift.kind is Drift.STALE:
+                _remove(self.transaction, drift.path)
+        changed = [drift for drift in drifts if drift.kind is not Drift.STALE]
+        written = (
+            _stage(self.transaction, wanted.files, changed, self.permissions) if changed else {}
+        )
+        names = tuple(wanted.enclaves.values())
+        self.zenoh = KeptZenoh(
+            {name: path for path, name in wanted.enclaves.items()},
+            wanted.nodes,
+            {name: why.rstrip(".") for name, why in wanted.left_out.items()},
+            written,
+            tuple(sorted({drift.enclave for drift in drifts if drift.kind is not Drift.UNSIGNED})),
+            (
+                *_left_out_notes(wanted.left_out),
+                *_revoked_names(wanted.ledger, names, self.now, replaced),
             ),
         ).without(created)
         self.notes += self.zenoh.notes
@@ -661,55 +693,6 @@ def _settings_of_ros2(
     present = present_settings(keystore)
     if protection_for(present.governance):  # else settings would say another protection
         yield write_settings(transaction, present.settings, now)
-
-
-def _keep_zenoh(
-    transaction: Transaction,
-    *,
-    keystore: OpenedKeystore,
-    network: ZenohNetwork,
-    domains: DomainSet,
-    authority: x509.Certificate,
-    signer: Callable[[], Authority],
-    now: datetime,
-    change: ZenohChange = NO_CHANGE,
-) -> KeptZenoh:
-    """Stage the Zenoh configurations that the keystore needs after a change.
-
-    Args:
-        transaction: the transaction, before its commit.
-        keystore: the keystore, as it was opened for the change.
-        network: the Zenoh network of the keystore's settings.
-        domains: the ROS domains of the keystore's governance.
-        authority: the permissions CA that signed what the keystore has.
-        signer: returns the permissions CA; called only if a configuration has to be signed.
-        now: the current time.
-        change: what the transaction changes.
-
-    Raises:
-        PolicyError: an enclave's rights cannot be stated to Zenoh.
-        KeystoreError: the enclave of the router is missing.
-    """
-    existing = transaction.enclaves
-    wanted = zenoh_documents(keystore, network, domains, authority, now, change, existing=existing)
-    drifts = drifted_configurations(keystore, wanted, authority, change.gone)
-    for drift in drifts:
-        if drift.kind is Drift.STALE:
-            _remove(transaction, drift.path)
-    changed = [drift for drift in drifts if drift.kind is not Drift.STALE]
-    written = _stage(transaction, wanted.files, changed, signer()) if changed else {}
-    names = tuple(wanted.enclaves.values())
-    return KeptZenoh(
-        {name: path for path, name in wanted.enclaves.items()},
-        wanted.nodes,
-        {name: why.rstrip(".") for name, why in wanted.left_out.items()},
-        written,
-        tuple(sorted({drift.enclave for drift in drifts if drift.kind is not Drift.UNSIGNED})),
-        (
-            *_left_out_notes(wanted.left_out),
-            *_revoked_names(wanted.ledger, names, now, change.replaced),
-        ),
-    )
 
 
 def _stage(

@@ -12,15 +12,14 @@ from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 from shlex import quote
 from types import MappingProxyType
+from typing import Unpack
 
 from cryptography import x509
 
-from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance, render_governance
 from sros_tool.dds.permissions import name_notes, parse_permissions
@@ -50,7 +49,6 @@ from sros_tool.keystore.issuing.enclave import (
     present_files,
     stated_enclave,
 )
-from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.issuing.tokens import EnclaveTokens, place_in, token_notes, token_places
 from sros_tool.keystore.known_keys import revoked_serials
 from sros_tool.keystore.layout import (
@@ -75,7 +73,7 @@ from sros_tool.keystore.layout import (
     similar_keystores,
 )
 from sros_tool.keystore.ledger import RESTORED, certificate_entry, document_entry
-from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
+from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.replaced import (
     ReplacedRights,
     Superseded,
@@ -154,33 +152,29 @@ def create_keystore(
     *,
     template: Template,
     domains: DomainSet | None = None,
-    now: datetime,
-    keyring: Keyring = IN_KEYSTORE,
     imported_cas: Mapping[str, bytes] = _NONE_IMPORTED,
-    dry_run: bool = False,
+    **options: Unpack[ChangeOptions],
 ) -> Creation:
     """Create a keystore for ``domains`` (default: 0) from ``template``.
 
     ``imported_cas`` maps roles ("identity", "permissions") to PEM certificates of existing CAs,
-    whose keys the ``keyring`` opens.
+    whose keys the keyring of the ``options`` opens.
 
     Raises:
         KeystoreError: ``root`` has a keystore or parts of one: enclaves of an older CA would not
             work with a new CA.
     """
-    if not dry_run:
+    if not options.get("dry_run"):
         recover_keystore(root)
     _check_free(root)
-    with KeystoreChange(
-        root, now=now, keyring=keyring, dry_run=dry_run, new_keystore=True
-    ) as change:
+    with KeystoreChange(root, new_keystore=True, **options) as change:
         domains = domains or DomainSet.of((0, 0))
         _write_keystore(change, template, domains, imported_cas)
         change.record()
         change.notes += change.authorities.notes
         if imported_cas and not change.identity.service:  # which would issue for the example
             change.notes += imported_notes(
-                change.transaction, template, change.authorities, domains, now
+                change.transaction, template, change.authorities, domains, change.now
             )
             if IDENTITY in imported_cas:
                 change.notes.append(_OWN_LIST)
@@ -200,12 +194,10 @@ def create_enclaves(
     root: Path,
     names: Sequence[str],
     *,
-    now: datetime,
     domain: int | None = None,
     key: str = "",
-    keyring: Keyring = IN_KEYSTORE,
-    dry_run: bool = False,
     progress: Progress | None = None,
+    **options: Unpack[ChangeOptions],
 ) -> Creation:
     """Create enclaves with the default permissions of the keystore's template.
 
@@ -217,12 +209,10 @@ def create_enclaves(
     return generate_artifacts(
         root,
         enclaves=names,
-        now=now,
         domain=domain,
         key=key,
-        keyring=keyring,
-        dry_run=dry_run,
         progress=progress,
+        **options,
     )
 
 
@@ -231,26 +221,21 @@ def create_permission(
     names: Sequence[str],
     policy: Policy,
     *,
-    now: datetime,
     domain: int | None = None,
     revoke_old: bool = False,
     keep_same: bool = False,
-    allow_refusal: Sequence[Vendor] = (),
-    keyring: Keyring = IN_KEYSTORE,
-    dry_run: bool = False,
+    **options: Unpack[ChangeOptions],
 ) -> Creation:
     """Replace the permissions of existing enclaves with their rights in ``policy``, all or none.
 
     Whoever kept the replaced permissions can use them until they expire.  ``revoke_old`` prevents
     that: the enclaves get new certificates for the same keys, and all earlier certificates are
     revoked.  With ``keep_same``, permissions that state the same rights are kept, as by
-    `generate_artifacts`.  The nodes of the vendors in ``allow_refusal`` may stop working.
+    `generate_artifacts`.
     """
     for name in names:
         check_enclave_name(name)
-    change = KeystoreChange(
-        root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
-    )
+    change = KeystoreChange(root, **options)
     with change:
         existing = frozenset(change.names)
         for name in names:
@@ -268,16 +253,13 @@ def generate_artifacts(
     *,
     enclaves: Sequence[str] = (),
     policies: Sequence[Policy | FleetPolicy] = (),
-    now: datetime,
     domain: int | None = None,
     create: Template | None = None,
     domains: DomainSet | None = None,
     revoke_old: bool = False,
-    allow_refusal: Sequence[Vendor] = (),
     key: str = "",
-    keyring: Keyring = IN_KEYSTORE,
-    dry_run: bool = False,
     progress: Progress | None = None,
+    **options: Unpack[ChangeOptions],
 ) -> Creation:
     """Create the named enclaves and the enclaves of policies, with permissions, all or nothing.
 
@@ -301,20 +283,13 @@ def generate_artifacts(
     fleet = for_fleet[0].fleet if for_fleet else None
     patterns = [pattern for policy in for_fleet for pattern in policy.patterns]
     places = token_places(key, list(wanted)) if key else {}
-    if not dry_run:
+    if not options.get("dry_run"):
         recover_keystore(root)
     new_keystore = create is not None and not is_keystore(root)
     if new_keystore:
         _check_typo(root)
         _check_free(root)
-    change = KeystoreChange(
-        root,
-        now=now,
-        keyring=keyring,
-        allow_refusal=allow_refusal,
-        dry_run=dry_run,
-        new_keystore=new_keystore,
-    )
+    change = KeystoreChange(root, new_keystore=new_keystore, **options)
     if create is None or not new_keystore:
         with change:
             _prepare_change(change, domain, fleet, patterns, wanted, protections)

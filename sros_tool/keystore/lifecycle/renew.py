@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterator, Sequence
 from contextlib import suppress
-from datetime import datetime
 from pathlib import Path
 from shlex import quote
+from typing import Unpack
 
-from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.keystore.expiry import (
     Credentials,
@@ -25,10 +24,9 @@ from sros_tool.keystore.issuing.enclave import (
     Issuance,
     NewIdentity,
 )
-from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.issuing.tokens import EnclaveTokens, token_notes, token_places
 from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path, has_key
-from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
+from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.replaced import Superseded, certificates_until, lacks_some
 from sros_tool.keystore.rights import RecordedRights, SignedRights
 from sros_tool.keystore.selection import missing_enclave_error
@@ -49,15 +47,12 @@ def renew(
     root: Path,
     names: Sequence[str] = (),
     *,
-    now: datetime,
     expiring: Threshold | None = None,
     new_key: bool = False,
     key: str = "",
     revoke_old: bool = False,
-    allow_refusal: Sequence[Vendor] = (),
-    keyring: Keyring = IN_KEYSTORE,
-    dry_run: bool = False,
     progress: Progress | None = None,
+    **options: Unpack[ChangeOptions],
 ) -> Changed:
     """Renew the named enclaves, and the enclaves that are due by ``expiring``, all or nothing.
 
@@ -65,8 +60,7 @@ def renew(
     key on a token, as in `create_enclaves`.  The signed rights do not change.  All files are
     replaced at once.  Whoever has the key can use a replaced certificate until it or its last
     permissions expire, or it is revoked; ``revoke_old`` revokes all earlier certificates of the
-    renewed enclaves, and gives them subjects that no earlier permissions fit.  The nodes of the
-    vendors in ``allow_refusal`` may stop working.
+    renewed enclaves, and gives them subjects that no earlier permissions fit.
 
     Raises:
         KeystoreError: enclaves cannot be renewed (the error names all of them), or vendors would
@@ -79,9 +73,7 @@ def renew(
             "Name the enclaves, and leave the other options out.",
         )
     places = token_places(key, names) if key else {}
-    change = KeystoreChange(
-        root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
-    )
+    change = KeystoreChange(root, **options)
     with change:
         for name in names:
             if not change.keystore.has_enclave(check_enclave_name(name)):
@@ -98,7 +90,7 @@ def renew(
                 text = f"short-lived, and renewed only if named: {first_few(short_lived, 3)}"
                 change.notes.append(Note("renew.short-lived", text))
         if not wanted:  # no CA key is asked for
-            change.notes += change.keystore.ledger_file.clock_notes(now)
+            change.notes += change.keystore.ledger_file.clock_notes(change.now)
             with suppress(SrosError):
                 change.notes += change.edit_notes()
             return change.result(Changed)
@@ -113,7 +105,7 @@ def renew(
         replaced = renewer.renew(tuple(wanted), progress)
         renewed = tuple(certificate.name for certificate in replaced)
         change.notes += (*writer.notes, *renewer.notes) if replaced else ()
-        left = writer.expiry - now
+        left = writer.expiry - change.now
         if replaced and expiring and expiring.remaining and left <= expiring.remaining:
             text = f"the new files expire within {duration_text(expiring.remaining)} again, "
             text += (
@@ -137,7 +129,7 @@ def renew(
     return change.result(
         Changed,
         outcomes=dict.fromkeys(renewed, "renewed"),
-        works_until=until if until and until >= now else None,
+        works_until=until if until and until >= change.now else None,
         may_work_longer=may_work_longer,
     )
 

@@ -10,10 +10,9 @@ from datetime import datetime
 from itertools import count
 from pathlib import Path
 from shlex import quote
+from typing import Unpack
 
-from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
-from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.known_keys import revoked_serials
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -26,7 +25,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
 )
 from sros_tool.keystore.ledger import RESTORED, Entry, certificate_entry
-from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
+from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import Forgotten
 from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.names import check_enclave_name
@@ -67,13 +66,10 @@ def revoke(
     root: Path,
     names: Sequence[str],
     *,
-    now: datetime,
     reason: str = "unspecified",
-    keyring: Keyring = IN_KEYSTORE,
     until_retired: bool = False,
     crl: bytes = b"",
-    allow_refusal: Sequence[Vendor] = (),
-    dry_run: bool = False,
+    **options: Unpack[ChangeOptions],
 ) -> Revocation:
     """Revoke the certificates of enclaves and move their files to ``revoked`` in the keystore.
 
@@ -82,8 +78,8 @@ def revoke(
     certificate, too.  If the ledger may lack certificates, a remark says so.  The other enclaves
     get ``crl.pem``, a link to the list.  During a rotation of the identity CA, both CAs sign a
     list; if the key of the old CA is missing, ``until_retired`` accepts that Fast DDS trusts its
-    certificates until that CA is retired.  The nodes of the vendors in ``allow_refusal`` may stop
-    to work.  If a CA service is the identity CA, ``crl`` is the list (PEM) that it signed.
+    certificates until that CA is retired.  If a CA service is the identity CA, ``crl`` is the list
+    (PEM) that it signed.
 
     Raises:
         KeystoreError: an enclave does not exist, the identity CA did not issue its certificate, the
@@ -102,9 +98,7 @@ def revoke(
             "Choose another reason, such as cessation_of_operation; or replace the certificate "
             "with `sros renew --revoke-old`.",
         )
-    change = KeystoreChange(
-        root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
-    )
+    change = KeystoreChange(root, **options)
     change.crl = crl
     with change:
         _check_names(change, names)
@@ -133,10 +127,7 @@ def revoke(
 def restore_revocations(
     root: Path,
     forgotten_lists: Forgotten,
-    *,
-    now: datetime,
-    keyring: Keyring = IN_KEYSTORE,
-    dry_run: bool = False,
+    **options: Unpack[ChangeOptions],
 ) -> Changed:
     """Revoke again all certificates on revocation lists that the keystore signed and lost.
 
@@ -150,7 +141,7 @@ def restore_revocations(
     Raises:
         KeystoreError: as `revoke`.
     """
-    change = KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run)
+    change = KeystoreChange(root, **options)
     with change:
         lists, known = change.revocation_lists(), revoked_serials(change.keystore)
         reasons = {
@@ -190,7 +181,7 @@ def restore_revocations(
         for serial, reason in reasons.items():
             if serial not in done:
                 # Without the enclave, which may be there with another certificate.
-                entry = Entry(iso(now), "revocation", serial=serial, reason=reason)
+                entry = Entry(iso(change.now), "revocation", serial=serial, reason=reason)
                 of = issued.get(serial)
                 if of and (reason != SUPERSEDED or (of.enclave, of.key) in replaced_keys):
                     entry = entry._replace(subject=of.subject, key=of.key)
@@ -198,8 +189,8 @@ def restore_revocations(
                         entry = entry._replace(enclave=of.enclave, not_after=of.not_after)
                 revocations.append(entry)
         gone = frozenset(lost_revocations)
-        number = max(change.keystore.ledger_file.next_number(), int(now.timestamp()))
-        change.entries = [Entry(iso(now), RESTORED, number=number), *unknown.values()]
+        number = max(change.keystore.ledger_file.next_number(), int(change.now.timestamp()))
+        change.entries = [Entry(iso(change.now), RESTORED, number=number), *unknown.values()]
         if revocations or forgotten_lists.lists:
             change.restart = tuple(name for name in change.names if name not in gone)
             _, entries = lists.sign(
@@ -314,20 +305,15 @@ def restored_note(restored: Changed, lists_from: str) -> Note:
 def refresh_crl(
     root: Path,
     *,
-    now: datetime,
-    keyring: Keyring = IN_KEYSTORE,
     crl: bytes = b"",
-    allow_refusal: Sequence[Vendor] = (),
-    dry_run: bool = False,
+    **options: Unpack[ChangeOptions],
 ) -> Revocation:
     """Sign the revocation list again, so that it is valid for longer.
 
     Its entries are kept, except certificates that expired before the current list was signed.  If
     a CA service is the identity CA, its new list ``crl`` (PEM) replaces the current list.
     """
-    change = KeystoreChange(
-        root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
-    )
+    change = KeystoreChange(root, **options)
     change.crl = crl
     with change:
         lists = change.revocation_lists()

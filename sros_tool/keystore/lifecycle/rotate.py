@@ -15,11 +15,10 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
-from typing import Any
+from typing import Any, Unpack
 
 from cryptography import x509
 
-from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.fleet.robots import robot_of
@@ -65,7 +64,7 @@ from sros_tool.keystore.ledger import (
     certificate_entry,
     document_entry,
 )
-from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
+from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import sign_list
 from sros_tool.keystore.lifecycle.rotation import (
     Replacement,
@@ -134,28 +133,24 @@ def rotate_ca(
     to: RotationStage | None = None,
     *,
     roles: Sequence[str] = (),
-    now: datetime,
     finish: bool = False,
-    keyring: Keyring = IN_KEYSTORE,
     new_keys: Keyring = IN_KEYSTORE,
     existing: Mapping[str, bytes] = {},
     validity: Span | None = None,
     delete_old_key: bool = False,
     allow_unconfirmed: bool = False,
-    allow_refusal: Sequence[Vendor] = (),
-    dry_run: bool = False,
     progress: Progress | None = None,
+    **options: Unpack[ChangeOptions],
 ) -> RotationStep:
     """Rotate the CAs to the stage ``to`` (default: the next stage), or with ``finish`` to the end.
 
     If the keystore is already at the stage ``to``, nothing is changed.  ``roles`` ("identity",
     "permissions"; default: both) and the ``validity`` of the new CAs are only used when a rotation
-    begins.  ``keyring`` opens the current keys; ``new_keys`` names the places of new keys outside
+    begins.  ``new_keys`` names the places of new keys outside
     of the keystore.  ``existing`` has the certificates (PEM) of CAs that exist already, by role:
     their keys are at these places.  ``delete_old_key`` deletes old keys that are in the keystore.
     In a keystore with a fleet, a stage that cuts off robots, because they have not confirmed the
-    previous stage, needs ``allow_unconfirmed``.  The nodes of the vendors in ``allow_refusal`` may
-    stop working.
+    previous stage, needs ``allow_unconfirmed``.
 
     Raises:
         KeystoreError: a key is missing, an enclave cannot be moved to the new CA, robots would be
@@ -163,9 +158,7 @@ def rotate_ca(
         UsageError: the stage ``to`` is over, or is not the next stage, or has no old key that
             ``delete_old_key`` could delete; or a rotation that goes on has ``existing`` CAs.
     """
-    change = KeystoreChange(
-        root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
-    )
+    change = KeystoreChange(root, **options)
     with change:
         rotation = read_rotation(change.keystore)
         if existing and rotation.stage is not RotationStage.NONE:
@@ -180,7 +173,7 @@ def rotate_ca(
         if finish or stage not in (rotation.stage, RotationStage.NONE):
             if rotation.stage is not RotationStage.REISSUE:  # the last stage signs nothing
                 _refuse_edited(change.keystore)
-            cut_off = robots_cut_off(change.keystore, rotation, stage, now)
+            cut_off = robots_cut_off(change.keystore, rotation, stage, change.now)
             if cut_off and not allow_unconfirmed:
                 raise _cut_off_error(change.keystore, rotation, stage, cut_off, roles)
             stage = rotator.go_to(stage, roles, new_keys, existing, validity, progress)
@@ -361,12 +354,9 @@ def _target_stage(
 def renew_identity_ca(
     root: Path,
     *,
-    now: datetime,
-    keyring: Keyring = IN_KEYSTORE,
     validity: Span | None = None,
     issued: bytes = b"",
-    allow_refusal: Sequence[Vendor] = (),
-    dry_run: bool = False,
+    **options: Unpack[ChangeOptions],
 ) -> RotationStep:
     """Issue a new certificate for the identity CA, with the same name and key and a later expiry.
 
@@ -381,9 +371,7 @@ def renew_identity_ca(
             self-signed, or its key is weak or missing, or ``issued`` is of another CA.
         UsageError: the new certificate would expire before the current one, or is missing.
     """
-    change = KeystoreChange(
-        root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
-    )
+    change = KeystoreChange(root, **options)
     with change:
         if len(change.keystore.authority_files) == 1:
             raise KeystoreError(
@@ -399,11 +387,11 @@ def renew_identity_ca(
                 f"Finish it first with `sros rotate_ca {quote(str(root))} --next`.",
             )
         old, *above = change.keystore.certificates_of("identity_ca")
-        if issued or keyring.ca_service(root, IDENTITY, change.template):
+        if issued or change.keyring.ca_service(root, IDENTITY, change.template):
             renewed = _renewed_by_service(change, old, issued)
             new, bundle, signer = renewed.certificate, renewed.bundle, change.permissions
         else:
-            key = keyring.open(change.keystore, IDENTITY, change.template)
+            key = change.keyring.open(change.keystore, IDENTITY, change.template)
             if above or not same_key(old, key):
                 raise KeystoreError(
                     "the identity CA cannot be renewed with the same key",
@@ -417,13 +405,13 @@ def renew_identity_ca(
                     "Rotate it without --same-key.",
                 )
             new = issue_ca(
-                key, old.subject, window(now, validity or change.template.authority_validity)
+                key, old.subject, window(change.now, validity or change.template.authority_validity)
             )
             bundle, signer = pem(new), Authority(new, key)
         _check_later(old, new)
         write_bundle(change.transaction, "identity_ca", (IDENTITY,), bundle, change.names)
         change.transaction.write(f"{RETIRED}/{old.serial_number:x}.cert.pem", pem(old))
-        change.entries.append(certificate_entry(now, "ca", new, reason=SAME_KEY))
+        change.entries.append(certificate_entry(change.now, "ca", new, reason=SAME_KEY))
         change.record(signer)
         change.finish()
     return _step(change, stage=RotationStage.NONE, files=("identity_ca",))

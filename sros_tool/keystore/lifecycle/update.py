@@ -12,12 +12,11 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
 from shlex import quote
+from typing import Unpack
 
-from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Grant
@@ -43,7 +42,6 @@ from sros_tool.keystore.issuing.enclave import (
     StatedRights,
     default_rights,
 )
-from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import (
     GOVERNANCE_XML,
     PERMISSIONS,
@@ -58,7 +56,12 @@ from sros_tool.keystore.layout import (
     waits_for_answer,
 )
 from sros_tool.keystore.ledger import Entry
-from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange, remove_zenoh
+from sros_tool.keystore.lifecycle.change import (
+    Changed,
+    ChangeOptions,
+    KeystoreChange,
+    remove_zenoh,
+)
 from sros_tool.keystore.lifecycle.create import (
     Creation,
     creation,
@@ -249,16 +252,13 @@ def update_keystore(
     target: Template,
     domains: DomainSet | None = None,
     *,
-    now: datetime,
     next_stage: bool = False,
     allow_looser: bool = False,
     revoke_old: bool = False,
-    allow_refusal: Sequence[Vendor] = (),
     replace_edits: bool = False,
     seen_settings: PresentSettings | None = None,
-    keyring: Keyring = IN_KEYSTORE,
-    dry_run: bool = False,
     progress: Progress | None = None,
+    **options: Unpack[ChangeOptions],
 ) -> KeystoreUpdate:
     """Change a keystore to the settings ``target`` and to ``domains`` (None: unchanged).
 
@@ -266,18 +266,15 @@ def update_keystore(
         root: the keystore.
         target: its new settings; the places of its CA keys stay.
         domains: its new domains.
-        now: the time from which validities count.
         next_stage: do only the first stage that is left.
         allow_looser: accept settings that allow more than before.
         revoke_old: issue all certificates again, with subjects that no earlier permissions fit, and
             revoke all earlier certificates.
-        allow_refusal: vendors whose nodes may stop working.
         replace_edits: accept that ``target`` replaces edits by hand in the settings or the
             governance, because it contains or undoes them.
         seen_settings: the settings that ``target`` was made from.
-        keyring: opens the keys of the CAs.
-        dry_run: report the changes without making them.
         progress: called with the name of each enclave that is done.
+        options: those of every change of a keystore.
 
     Raises:
         UsageError: more would be allowed without ``allow_looser``, or the keystore cannot be
@@ -286,9 +283,7 @@ def update_keystore(
             are no longer ``seen_settings``, or vendors would refuse enclaves that they
             accept today.
     """
-    change = KeystoreChange(
-        root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
-    )
+    change = KeystoreChange(root, **options)
     with change:
         present = present_settings(change.keystore)
         if seen_settings is not None and seen_settings != present:
@@ -324,7 +319,7 @@ def update_keystore(
             done, pending[len(done) :], progress
         )
         change.remarks += _signed_payloads(present.settings.protection, goal.settings.protection)
-        if not dry_run and not allow_looser and (looser := update().looser):
+        if not change.dry_run and not allow_looser and (looser := update().looser):
             raise UsageError(
                 f"the update would make keystore '{root}' looser: {'; '.join(looser)}",
                 "Nothing was changed.",
@@ -711,9 +706,7 @@ class _Updater:
 # ── rights that only an old ledger has ─────────────────────────────────────────────────────
 
 
-def trust_records(
-    root: Path, *, now: datetime, keyring: Keyring = IN_KEYSTORE, dry_run: bool = False
-) -> KeystoreUpdate:
+def trust_records(root: Path, **options: Unpack[ChangeOptions]) -> KeystoreUpdate:
     """Record permissions again that sros 0.1 recorded without a chain of ledger lines.
 
     Permissions are recorded only if the permissions CA signed them, and they are the last ones of
@@ -723,7 +716,7 @@ def trust_records(
         KeystoreError: the ledger is damaged, no enclave needs this, or an enclave has permissions
             other than the last ones in the ledger.
     """
-    with KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run) as change:
+    with KeystoreChange(root, **options) as change:
         ledger = change.ledger
         if ledger.gaps:
             raise KeystoreError(
@@ -740,11 +733,11 @@ def trust_records(
         entries: list[Entry] = []
         other_names: list[str] = []
         for name in names:
-            state = change.keystore.enclave(name, now=now)
+            state = change.keystore.enclave(name, now=change.now)
             message = state.files.get(PERMISSIONS_FILE, b"")
             if state.grant and hashlib.sha256(message).hexdigest() == last[name].sha256:
                 entries.append(
-                    last[name]._replace(time=iso(now), reason="taken on trust", previous="")
+                    last[name]._replace(time=iso(change.now), reason="taken on trust", previous="")
                 )
             else:
                 other_names.append(name)
@@ -772,10 +765,7 @@ def trust_records(
 def set_zenoh(
     root: Path,
     network: ZenohNetwork | None,
-    *,
-    now: datetime,
-    keyring: Keyring = IN_KEYSTORE,
-    dry_run: bool = False,
+    **options: Unpack[ChangeOptions],
 ) -> Creation:
     """Set or remove (None) the Zenoh network of a keystore: its settings, and all enclaves' files.
 
@@ -788,7 +778,7 @@ def set_zenoh(
         UsageError: the network cannot work, is not for the domains of the keystore, or the router's
             enclave has rights of its own.
     """
-    with KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run) as change:
+    with KeystoreChange(root, **options) as change:
         change.begin_issuing(None)
         _check_settings(change, edited=bool(change.notes))
         before = change.template.zenoh
@@ -803,7 +793,7 @@ def set_zenoh(
                 _check_router(change, router)
         if template != change.template:
             change.template = template
-            change.entries.append(write_settings(change.transaction, template, now))
+            change.entries.append(write_settings(change.transaction, template, change.now))
         removed = () if network else remove_zenoh(change.transaction)
         write_enclaves(change, {})
         change.notes += (
