@@ -262,10 +262,9 @@ class CommitFiles:
         places: dict[str, list[str]] = {}
         for where, tree_entry in plain.items():
             places.setdefault(tree_entry.id, []).append(where)
-        for part in self.repository.contents_in_parts(places, _MOST_BYTES):
-            for digits, content in part.items():
-                for where in places[digits]:
-                    self._write(where, plain[where], content)
+        for digits, content in self.repository.contents_in_batches(places, _MOST_BYTES):
+            for where in places[digits]:
+                self._write(where, plain[where], content)
         contents = self.repository.contents(link.id for link in links.values())
         for where, link in links.items():
             if b"\0" in contents[link.id]:

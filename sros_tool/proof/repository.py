@@ -327,8 +327,12 @@ class Repository:
             gone.append(part)
         return entry
 
-    def contents_in_parts(self, ids: Iterable[str], maximum: int) -> Iterator[dict[str, bytes]]:
-        """Yield the contents of files by id, in batches that fit into memory.
+    def contents_in_batches(
+        self, ids: Iterable[str], maximum: int, *, largest: int | None = None
+    ) -> Iterator[tuple[str, bytes]]:
+        """Yield ids and contents of files, which are read in batches that fit into memory.
+
+        Files of more than ``largest`` bytes are left out.
 
         Raises:
             DocumentError: a file is missing, damaged or too large, or all files together have more
@@ -337,17 +341,19 @@ class Repository:
         known = self.sizes(wanted := dict.fromkeys(ids))
         # A missing object is an error below.
         sizes = {object_id: known.get(object_id, 0) for object_id in wanted}
+        if largest is not None:
+            sizes = {object_id: size for object_id, size in sizes.items() if size <= largest}
         if sum(sizes.values()) > maximum:
             raise DocumentError(f"the files of the commit have more than {maximum} bytes")
         part: list[str] = []
         room = _AT_ONCE
         for object_id, size in sizes.items():
             if part and size > room:
-                yield _contents_of_kind("blob", part, self._read(part, sizes))
+                yield from _contents_of_kind("blob", part, self._read(part, sizes)).items()
                 part, room = [], _AT_ONCE
             part.append(object_id)
             room -= size
-        yield _contents_of_kind("blob", part, self._read(part, sizes))
+        yield from _contents_of_kind("blob", part, self._read(part, sizes)).items()
 
     def content(self, digits: str) -> bytes:
         """Return the content of one file, by its id; repeated calls use a cache.

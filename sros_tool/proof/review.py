@@ -608,12 +608,17 @@ class _Review:
                     lines.append((text, file))
         return (_FOUND, Facts(tuple(lines))) if lines else None
 
+    def _contents(
+        self, ids: Iterable[str], largest: int = _MOST_OUTSIDE
+    ) -> Iterator[tuple[str, bytes]]:
+        """Yield ids and contents of files that need not be policies; large ones are left out."""
+        return self.request.repository.contents_in_batches(ids, _MOST_BYTES, largest=largest)
+
     def _keys_step(self) -> tuple[int, Content] | None:
         """Return the step on private keys in keystores of HEAD, and in files that change.
 
         Whether options allow new access does not matter: whoever reads the repository has them.
         """
-        repository = self.request.repository
         entries = dict(self._changed_files(self.head, self.base)) if self.base else {}
         entries |= {
             path: entry
@@ -621,12 +626,9 @@ class _Review:
             if _is_below(path, self.request.keystores)
         }
         files = {path: entry.id for path, entry in entries.items() if entry.mode in FILES}
-        sizes = repository.sizes(dict.fromkeys(files.values()))
-        small = [digits for digits in files.values() if sizes.get(digits, 0) <= _MOST_OUTSIDE]
         keys = {
             digits
-            for part in repository.contents_in_parts(small, _MOST_BYTES)
-            for digits, content in part.items()
+            for digits, content in self._contents(files.values())
             if _PRIVATE_KEY.search(content)
         }
         lines = [
@@ -752,15 +754,9 @@ class _Review:
                 excluded = (*self.request.left_out, *self.request.keystores)
                 if may_include and tree_entry.mode in FILES and not _is_below(path, excluded):
                     ids[path] = tree_entry.id
-        sizes = repository.sizes(dict.fromkeys(ids.values()))
-        ids = {
-            path: object_id
-            for path, object_id in ids.items()
-            if sizes.get(object_id, 0) <= _MOST_OUTSIDE
+        contents = {
+            digits: data for digits, data in self._contents(ids.values()) if includes_files(data)
         }
-        contents: dict[str, bytes] = {}
-        for part in repository.contents_in_parts(ids.values(), _MOST_BYTES):
-            contents |= {digits: data for digits, data in part.items() if includes_files(data)}
         contents_by_path = {
             path: contents[object_id] for path, object_id in ids.items() if object_id in contents
         }
@@ -804,15 +800,12 @@ class _Review:
             and not (known and path in side.files)
             and not _is_below(path, self.request.left_out)
         }
-        sizes = side.repository.sizes(dict.fromkeys(entry.id for entry in wanted.values()))
-        small = {p: e.id for p, e in wanted.items() if sizes.get(e.id, 0) <= _MOST_OUTSIDE}
         of_policies = {
             digits
-            for part in side.repository.contents_in_parts(small.values(), _MOST_BYTES)
-            for digits, content in part.items()
+            for digits, content in self._contents(entry.id for entry in wanted.values())
             if may_be_policy(content)
         }
-        return sorted(path for path, digits in small.items() if digits in of_policies)
+        return sorted(path for path, entry in wanted.items() if entry.id in of_policies)
 
     def left_out(self) -> Iterator[str]:
         """Yield clauses on the parts that were not reviewed."""
@@ -873,13 +866,9 @@ class _Review:
                 for path, entry in changed
                 if path.endswith(".toml") and path not in self.head.files and entry.mode in FILES
             }
-            sizes = self.request.repository.sizes(dict.fromkeys(files.values()))
-            return sorted(
-                path
-                for path, digits in files.items()
-                if sizes.get(digits, 0) <= _LARGEST_SETTINGS
-                and _SETTINGS.search(self.request.repository.content(digits))
-            )
+            contents = self._contents(files.values(), _LARGEST_SETTINGS)
+            settings = {digits for digits, content in contents if _SETTINGS.search(content)}
+            return sorted(path for path, digits in files.items() if digits in settings)
         return []
 
     # ── policies ───────────────────────────────────────────────────────────────────────────
