@@ -14,12 +14,13 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import wraps
 from inspect import cleandoc
 from itertools import chain
 from pathlib import Path
 from shlex import quote
 from types import FrameType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import click
 from click.core import ParameterSource
@@ -295,7 +296,10 @@ def enclave_filter_options(when: str = "Only") -> Callable[[Decorated], Decorate
 
 
 def several_enclaves(function: Decorated) -> Decorated:
-    """Add ``--all``, ``--match PATTERN`` and ``--robot NAME`` to a verb for several enclaves."""
+    """Add ``--all``, ``--match PATTERN`` and ``--robot NAME`` to a verb for several enclaves.
+
+    ``--all`` is the pattern ``*``.
+    """
     function = robot_option("All enclaves of this robot of the fleet.")(function)
     function = click.option(
         "--match",
@@ -304,16 +308,19 @@ def several_enclaves(function: Decorated) -> Decorated:
         metavar="PATTERN",
         help="Enclaves whose names match, such as '/arm/*'; * also matches '/'.  Can be repeated.",
     )(function)
+
+    @wraps(function)
+    def with_all(*, all_enclaves: bool, patterns: Sequence[str], **more: Any) -> Any:
+        return function(patterns=("*",) if all_enclaves else patterns, **more)
+
     return click.option(
         "--all", "all_enclaves", is_flag=True, help="All enclaves of the keystore."
-    )(function)
+    )(cast("Decorated", with_all))
 
 
-def check_chosen(
-    names: Sequence[str], patterns: Sequence[str], robots: Sequence[str], *, all_enclaves: bool
-) -> None:
+def check_chosen(names: Sequence[str], patterns: Sequence[str], robots: Sequence[str]) -> None:
     """Raise `UsageError` if the arguments and the options of `several_enclaves` name no enclave."""
-    if not (names or patterns or robots or all_enclaves):
+    if not (names or patterns or robots):
         raise UsageError(
             "no enclave is named",
             "",
@@ -326,27 +333,18 @@ def chosen_enclaves(
     names: Sequence[str],
     patterns: Sequence[str],
     robots: Sequence[str],
-    *,
-    all_enclaves: bool,
 ) -> tuple[str, ...]:
     """Return the enclaves that the arguments and the options of `several_enclaves` name.
 
     Raises: UsageError: no enclave is named. KeystoreError: a pattern matches no enclave, or a robot
     has none.
     """
-    check_chosen(names, patterns, robots, all_enclaves=all_enclaves)
-    if not (patterns or robots or all_enclaves):
+    check_chosen(names, patterns, robots)
+    if not (patterns or robots):
         return tuple(names)  # the verb says what is wrong with a name
     from sros_tool.keystore.selection import select_enclaves
 
-    return select_enclaves(
-        keystore,
-        names,
-        patterns,
-        robots=robots,
-        all_enclaves=all_enclaves,
-        checked=True,
-    )
+    return select_enclaves(keystore, names, patterns, robots=robots, checked=True)
 
 
 def output_option(help_text: str) -> Callable[[Decorated], Decorated]:

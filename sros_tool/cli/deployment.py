@@ -69,7 +69,6 @@ _STREAM = Path("-")
 @json_option
 def distribute_key(
     arguments: tuple[str, ...],
-    all_enclaves: bool,
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
     force: bool,
@@ -98,12 +97,12 @@ def distribute_key(
 
     root, rest = split_root(arguments)
     names = rest[:-1]
-    if not rest or not (names or all_enclaves or patterns or robots):
+    if not rest or not (names or patterns or robots):
         raise UsageError("distribute_key takes a keystore, one or more enclaves and a target")
     target = PATH.convert(rest[-1], None, None)
     keystore = OpenedKeystore(root)
     _check_target(keystore, rest[-1])
-    chosen = chosen_enclaves(keystore, names, patterns, robots, all_enclaves=all_enclaves)
+    chosen = chosen_enclaves(keystore, names, patterns, robots)
     selection = with_keys_here(keystore, chosen, names, keyless=keyless)
     notes: tuple[Note, ...] = ()
     if target == _STREAM:

@@ -110,7 +110,6 @@ _revoke_old_option = click.option(
 @json_option
 def create_permission(
     arguments: tuple[str, ...],
-    all_enclaves: bool,
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
     fleet_file: Path | None,
@@ -138,7 +137,7 @@ def create_permission(
     from sros_tool.policy.document import read_policy
 
     root, rest = split_root(arguments)
-    if len(rest) < (1 if all_enclaves or patterns or robots else 2):
+    if len(rest) < (1 if patterns or robots else 2):
         raise UsageError(
             "create_permission takes a keystore, one or more enclaves and a policy", "", _ORDER
         )
@@ -148,7 +147,7 @@ def create_permission(
     for_fleet = fleet_policies([file], fleet_file)[0] if fleet_file else None
     policy = for_fleet.policy() if for_fleet else read_policy(file)
     keystore = OpenedKeystore(root)
-    chosen = chosen_enclaves(keystore, given, patterns, robots, all_enclaves=all_enclaves)
+    chosen = chosen_enclaves(keystore, given, patterns, robots)
     result = create(
         root,
         chosen,

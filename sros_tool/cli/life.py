@@ -77,7 +77,6 @@ _crl_option = click.option(
 @json_option
 def renew(
     arguments: tuple[str, ...],
-    all_enclaves: bool,
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
     all_expiring: str | None,
@@ -111,8 +110,8 @@ def renew(
 
     root, names = split_root(arguments)
     keystore = OpenedKeystore(root)
-    if names or patterns or robots or all_enclaves or all_expiring is None:
-        names = chosen_enclaves(keystore, names, patterns, robots, all_enclaves=all_enclaves)
+    if names or patterns or robots or all_expiring is None:
+        names = chosen_enclaves(keystore, names, patterns, robots)
     threshold = parse_threshold(all_expiring, keystore) if all_expiring is not None else None
     with progress("renewing") as step:
         result = work(
@@ -203,7 +202,6 @@ def _complete_reason(
 @json_option
 def revoke(
     arguments: tuple[str, ...],
-    all_enclaves: bool,
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
     reason: str,
@@ -232,10 +230,8 @@ def revoke(
     from sros_tool.keystore.selection import select_to_revoke
 
     root, given = split_root(arguments)
-    check_chosen(given, patterns, robots, all_enclaves=all_enclaves)
-    names, selection_notes = select_to_revoke(
-        OpenedKeystore(root), given, patterns, robots, all_enclaves=all_enclaves
-    )
+    check_chosen(given, patterns, robots)
+    names, selection_notes = select_to_revoke(OpenedKeystore(root), given, patterns, robots)
     words_of_rfc = reason.replace("-", "_").split("_")
     reason_text = words_of_rfc[0] + "".join(word.capitalize() for word in words_of_rfc[1:])
     with progress("revoking"):

@@ -486,7 +486,6 @@ class _WithCommandAfterDashes(_WithCommand):
 def units(
     ctx: click.Context,
     arguments: tuple[str, ...],
-    all_enclaves: bool,
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
     jobs: tuple[str, ...],
@@ -529,7 +528,7 @@ def units(
 
     root, rest = split_root(arguments)
     command = tuple(ctx.meta[_COMMAND])
-    several = bool(all_enclaves or patterns or robots)
+    several = bool(patterns or robots)
     if not rest or not (rest[1:] or several or jobs):
         raise UsageError("units takes a keystore, enclaves or --job, and a folder")
     folder = PATH.convert(rest[-1], None, None)
@@ -555,7 +554,7 @@ def units(
     names: Sequence[str] = ()
     if rest[1:] or several:
         keystore = OpenedKeystore(root)
-        names = chosen_enclaves(keystore, rest[:-1], patterns, robots, all_enclaves=all_enclaves)
+        names = chosen_enclaves(keystore, rest[:-1], patterns, robots)
         place = target or Path(INSTALLED)
 
         def secure(name: str) -> EnclaveEnvironment:

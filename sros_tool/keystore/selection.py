@@ -66,23 +66,19 @@ def select_enclaves(
     patterns: Sequence[str] = (),
     *,
     robots: Sequence[str] = (),
-    all_enclaves: bool = False,
     checked: bool = False,
 ) -> tuple[str, ...]:
     """Return ``names``, then the enclaves that match ``patterns``, then those of ``robots``.
 
     Each enclave is returned once.  In a pattern ``*`` stands for any part of a name, "/" included,
-    as in policies.  ``all_enclaves`` selects all.  With ``checked``, ``robots`` are only accepted
-    if nobody edited the fleet file.
+    as in policies.  With ``checked``, ``robots`` are only accepted if nobody edited the fleet file.
 
     Raises:
-        KeystoreError: a pattern matches no enclave, a robot has none, or ``all_enclaves`` is given
-            and there are none.
+        KeystoreError: a pattern matches no enclave, or a robot has none.
         DocumentError: the fleet of the keystore has no such robot; the error names similar robots.
     """
     keystore.check()
     chosen = dict.fromkeys(names)
-    patterns = ("*",) if all_enclaves else patterns
     root, existing = keystore.root, keystore.names if patterns else ()
     for pattern in patterns:
         fitting = [name for name in existing if fnmatchcase(name, pattern)]
@@ -101,8 +97,6 @@ def select_to_revoke(
     names: Sequence[str],
     patterns: Sequence[str],
     robots: Sequence[str],
-    *,
-    all_enclaves: bool,
 ) -> tuple[tuple[str, ...], tuple[Note, ...]]:
     """Return the enclaves to revoke, and notes on enclaves of ``robots`` that the fleet lacks.
 
@@ -112,9 +106,9 @@ def select_to_revoke(
         KeystoreError: as `select_enclaves`.
         DocumentError: as `select_enclaves`.
     """
-    if not (patterns or robots or all_enclaves):
+    if not (patterns or robots):
         return tuple(names), ()  # the verb says what is wrong with a name
-    chosen = dict.fromkeys(select_enclaves(keystore, names, patterns, all_enclaves=all_enclaves))
+    chosen = dict.fromkeys(select_enclaves(keystore, names, patterns))
     unrecorded: dict[str, Unrecorded] = {}
     if fleet := checked_fleet(keystore) if robots else None:
         possible = _possible_enclaves(keystore, fleet, robots)

@@ -83,7 +83,7 @@ def test_an_older_list_does_not_replace_a_newer_one(fleet: Path, tmp_path: Path)
 
 def select(root: Path, names: list[str], patterns: list[str], every: bool) -> ExportSelection:
     keystore = OpenedKeystore(root)
-    chosen = chosen_enclaves(keystore, names, patterns, [], all_enclaves=every)
+    chosen = chosen_enclaves(keystore, names, ["*"] if every else patterns, [])
     return with_keys_here(keystore, chosen, names, keyless=False)
 
 
