@@ -339,7 +339,7 @@ class ZenohChange:
     recorded: Sequence[Entry] = ()
 
 
-NO_CHANGE = ZenohChange()
+_NO_CHANGE = ZenohChange()
 
 
 class Drift(StrEnum):
@@ -460,7 +460,7 @@ def zenoh_documents(
     domains: DomainSet,
     authority: x509.Certificate,
     now: datetime | None,
-    change: ZenohChange = NO_CHANGE,
+    change: ZenohChange = _NO_CHANGE,
     *,
     existing: tuple[str, ...] | None = None,
     only_enclaves: Collection[str] = (),
