@@ -6,9 +6,11 @@ import os
 import stat
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from sros_tool import folders
 from sros_tool.errors import KeystoreError
 from sros_tool.files import new_files, replace_file, write_new_file, write_new_folder
 
@@ -51,6 +53,37 @@ def test_a_device_is_never_replaced(tmp_path: Path) -> None:
 
 
 FILES = {"a.xml": b"a", "common/node/b.xml": b"b"}
+
+
+def test_content_is_on_the_disk_before_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A power failure leaves the whole old file or the whole new one."""
+    calls: list[str] = []
+
+    def note(module: object, name: str) -> None:
+        real = getattr(module, name)
+
+        def noting(*arguments: Any, **options: Any) -> None:
+            is_file = name == "fsync" and stat.S_ISREG(os.fstat(arguments[0]).st_mode)
+            calls.append(f"{name} of the file" if is_file else name)
+            real(*arguments, **options)
+
+        monkeypatch.setattr(module, name, noting)
+
+    for module, name in (
+        *((os, name) for name in ("fsync", "replace", "rename")),
+        (folders, "flush_file_system"),
+    ):
+        note(module, name)
+    replace_file(tmp_path / "file", b"new")
+    assert calls == ["fsync of the file", "replace", "fsync"]
+    calls.clear()
+    write_new_file(tmp_path / "secret", b"secret")
+    assert calls == ["fsync of the file"]
+    calls.clear()
+    write_new_folder(tmp_path / "folder", FILES)
+    assert calls[:2] == ["flush_file_system", "rename"]
 
 
 def test_only_its_owner_can_read_a_new_file_that_is_never_one_of_before(
