@@ -223,15 +223,13 @@ class IssuedEarlier:
         """
         last: defaultdict[str, str] = defaultdict(str)
         for entry in self._permissions[replaced.enclave]:
-            # Those that ros2/sros2 signed are recorded without subject and expiry.
-            last[entry.subject] = max(last[entry.subject], entry.not_after or _NEVER)
+            last[entry.subject] = max(last[entry.subject], entry.not_after)
         certificates = self._certificates[replaced.enclave].items()
         return parse_iso(
             max(
                 min(expiry, last[subject])
                 if last[subject]
                 and signed_for not in (None, subject)
-                and not last[""]
                 and _UNIQUE_PART.search(subject)
                 else expiry
                 for subject, expiry in [*certificates, (replaced.subject, replaced.not_after)]
@@ -240,8 +238,6 @@ class IssuedEarlier:
 
 
 _UNIQUE_PART = re.compile(r"(?:^|,)OU=[0-9a-f]{16}(?:,|$)")
-_NEVER = "9999"
-"""A moment after every moment of the ledger."""
 _MOST_NAMES = 200
 """Number of enclaves up to which keys are looked up one by one; for more, the files of all enclaves
 are read.

@@ -243,6 +243,9 @@ def test_a_server_that_refuses_one_certificate_of_the_robot(
 
 def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None:
     r1.round()
+    (r1.folder / ".agent/release.p7s").write_bytes(b"damaged")
+    (r1.folder / "enclaves/r1/c/permissions.p7s").unlink()
+    assert r1.round().changed == ("/r1/c",), "also without the list of what is installed"
     (r1.folder / "enclaves/r1/a/permissions.p7s").unlink()
     shutil.rmtree(r1.folder / "enclaves/r1/b")
     done = r1.round()

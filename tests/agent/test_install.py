@@ -16,16 +16,21 @@ import pytest
 from sros_tool.agent.install import Installation, install_release
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.delivery.release import Release
+from sros_tool.keystore.layout import ca_certificate, ca_key
+from sros_tool.keystore.lifecycle.create import create_permission
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
+from sros_tool.keystore.reader import read_certificate
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import digest, make_request
-from sros_tool.pki.keys import generate_key
+from sros_tool.pki.crl import load_crl, sign_crl
+from sros_tool.pki.keys import generate_key, load_key
+from sros_tool.policy.document import read_policy
 from tests.agent.releases import NAMES, Home, authority_of, files_of, moment, release_of
 from tests.keystore.test_transaction import DIED, in_child, run_out_of_space
 from tests.keystore.test_transaction import REFUSED as GIVEN_UP
 from tests.support.children import LONG, apart, some_steps
-from tests.support.harness import copy_of, sros
+from tests.support.harness import copy_of, policy_text, publish, sros
 
 A, B, C = (f"enclaves{name}" for name in NAMES)
 
@@ -148,7 +153,24 @@ REFUSED: dict[str, tuple[Callable[[Home], Release], str]] = {
         "is not sealed by a CA that this robot trusts",
     ),
     "an older list": (lambda home: home.release(home.renewed.files), "is older than the list here"),
+    "another list of the same number": (
+        lambda home: home.release({**home.revoked.files, f"{A}/crl.pem": list_of_nobody(home)}),
+        "is older than the list here",
+    ),
 }
+
+
+def list_of_nobody(home: Home) -> bytes:
+    """Return a list that revokes nobody, as a keystore from before the revocation signs it."""
+    present = load_crl(home.revoked.files[f"{A}/crl.pem"], "of /r1/a")
+    return sign_crl(
+        read_certificate(home.root / ca_certificate("identity")),
+        load_key((home.root / ca_key("identity")).read_bytes(), "CA"),
+        (),
+        number=present.number,
+        this_update=present.this_update,
+        next_update=present.next_update,
+    )
 
 
 @pytest.mark.parametrize("name", REFUSED)
@@ -284,15 +306,16 @@ def test_files_of_another_user_keep_nothing_from_the_others(home: Home, robot: P
 
 def test_an_enclave_that_home_could_not_mean_keeps_its_files(home: Home, robot: Path) -> None:
     """Sealed, but not usable: what would not start is not installed."""
+    before, later = content(robot), moment() + timedelta(days=3650)
+    late = install_release(robot, home.release(home.revoked.files), "r1", now=later)
+    assert set(late.kept) == set(NAMES), "nothing of it is valid then"
+    assert content(robot) == before, "nor is its list"
     files = dict(home.revoked.files)
     files[f"{B}/permissions.p7s"] = files[f"{C}/permissions.p7s"]
     del files[f"{C}/governance.p7s"]
     done = install(robot, home.release(files))
     assert set(done.kept) == {"/r1/b", "/r1/c"}
     assert has(robot, home.revoked, ("/r1/a",))
-    later = moment() + timedelta(days=3650)
-    late = install_release(robot, home.release(home.revoked.files), "r1", now=later)
-    assert set(late.kept) == set(NAMES), "nothing of it is valid then"
     assert not install(robot, home.release(home.revoked.files)).kept
 
 
@@ -315,6 +338,21 @@ def test_what_a_play_brought_meanwhile_is_not_taken_back(home: Home, robot: Path
     (robot / A / "permissions.p7s").write_text("mine")
     done = install(robot, home.release({**home.revoked.files, **older_a(home)}))
     assert done.changed == ("/r1/a",), "files that no process can load are not newer"
+
+
+def test_permissions_that_a_play_brought_are_not_taken_back(
+    home: Home, robot: Path, tmp_path: Path
+) -> None:
+    """They fit the same certificate, and may have lost a right since."""
+    root, later = copy_of(home.root, tmp_path / "home"), moment() + timedelta(hours=2)
+    policy = tmp_path / "policy.xml"
+    policy.write_text(policy_text({"/r1/b": publish("x")}))
+    create_permission(root, ["/r1/b"], read_policy(policy), now=later)
+    brought = release_of(files_of(root), 4, home.authority)
+    assert install_release(robot, brought, "r1", now=later).changed == NAMES
+    done = install_release(robot, home.release(home.revoked.files), "r1", now=later)
+    assert set(done.kept) == {"/r1/b"} and "the grant in the release" in done.kept["/r1/b"]
+    assert has(robot, brought)
 
 
 def test_an_enclave_does_not_trust_a_replaced_ca_again(

@@ -40,8 +40,8 @@ from sros_tool.keystore.delivery.release import (
 from sros_tool.keystore.delivery.repository import Composer, Roots, load_signer, read_present
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.keyring import Keyring
+from sros_tool.keystore.layout import CRL, ca_key
 from sros_tool.keystore.layout import ROLES as ROLES_OF_CAS
-from sros_tool.keystore.layout import ca_key
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
@@ -182,13 +182,21 @@ def test_what_else_changed_with_a_revocation_is_evaluated(
 
 
 def test_a_revoked_enclave_that_is_put_back_is_refused(publisher: Home) -> None:
-    kept = publisher.copy(publisher.folder.with_name("kept")).root / "enclaves/r2"
-    publisher.run("revoke", "ks", "--robot", "r2")
-    copy_of(kept, publisher.root / "enclaves/r2")
-    (publisher.root / "enclaves/r2/base/crl.pem").symlink_to("../../../public/identity_ca.crl.pem")
+    """Its files were evaluated before, and the list with another enclave."""
+    kept = publisher.copy(publisher.folder.with_name("kept")).root / "enclaves/r5"
+    publisher.run("revoke", "ks", "--robot", "r5")
+    copy_of(kept, publisher.root / "enclaves/r5")
+    (publisher.root / "enclaves/r5/base/crl.pem").symlink_to("../../../public/identity_ca.crl.pem")
     result = publisher.publish()
-    assert (result.names("published"), result.names("refused")) == (["r1", "r5"], ["r2"])
+    assert (result.names("published"), result.names("refused")) == (["r1", "r2"], ["r5"])
     assert "revoked" in next(robot.why for robot in result.robots if robot.why)
+
+
+def test_an_earlier_revocation_list_is_not_published(publisher: Home) -> None:
+    publisher.run("revoke", "ks", "--robot", "r5")
+    (publisher.root / CRL).unlink()
+    result = publisher.publish()
+    assert (result.names("published"), result.names("refused")) == ([], ["r1", "r2"])
 
 
 @pytest.mark.parametrize("missing", [False, True])

@@ -23,6 +23,9 @@ from tests.support.harness import certificate, copy_of, snapshot
 NOW = datetime.now(UTC) + timedelta(hours=1)  # later than the keystore that is copied
 
 
+LEDGER = ("ledger.jsonl", "ledger.p7s")
+
+
 def sign(keystore: Path, key: bytes, name: str, *, again: bool = False) -> Signed:
     return sign_request(
         keystore, make_request(load_key(key, "of the test"), name), now=NOW, renew=again
@@ -67,11 +70,15 @@ CERTIFIED: dict[str, Callable[[Path, bytes], object]] = {
 }
 
 
-def test_a_revoked_key_is_known_without_the_ledger(keystore: Path) -> None:
+@pytest.mark.parametrize("put_back", [True, False], ids=["older", "none"])
+def test_a_revoked_key_is_known_without_the_ledger(put_back: bool, keystore: Path) -> None:
     key = (keystore / "enclaves/a/key.pem").read_bytes()
+    older = {keystore / file: (keystore / file).read_bytes() for file in LEDGER}
     revoke(keystore, ["/a"], now=NOW)
-    for file in ("ledger.jsonl", "ledger.p7s"):
-        (keystore / file).unlink()
+    for file, content in older.items():
+        file.write_bytes(content) if put_back else file.unlink()
+    if put_back:  # the list has the certificate, and the ledger its key
+        shutil.rmtree(keystore / "revoked")
     with pytest.raises(KeystoreError, match="was revoked"):
         sign(keystore, key, "/new")
 

@@ -23,6 +23,7 @@ from sros_tool.keystore import transaction as transactions
 from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.layout import (
     CRL,
+    LOCK,
     REQUIRED_FILES,
     REVOKED,
     STAGE,
@@ -39,7 +40,7 @@ from sros_tool.keystore.lifecycle.create import (
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.transaction import Change, Changes, Transaction
+from sros_tool.keystore.transaction import Change, Changes, KeystoreLock, Transaction
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
 from tests.support.children import some_steps
@@ -576,6 +577,26 @@ def test_a_busy_keystore_is_told(keystore: Path, monkeypatch: pytest.MonkeyPatch
     assert not remains(keystore)
 
 
+def test_a_lock_file_that_was_removed_before_it_was_locked_is_no_lock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The process that held the lock removes the file, and a third process makes another one."""
+    lock, file = transactions._locked, tmp_path / LOCK
+    removed: list[Path] = []
+
+    def lose_the_first(handle: int) -> bool:
+        if not removed:
+            removed.append(file)
+            file.unlink()
+        return lock(handle)
+
+    monkeypatch.setattr(transactions, "_locked", lose_the_first)
+    with Folder(tmp_path) as folder:
+        held = KeystoreLock(folder).acquire()
+        assert (removed, file.exists()) == ([file], True)
+        held.release()
+
+
 def test_stale_stages_beside_a_keystore_are_removed_and_those_in_use_are_not(
     tmp_path: Path,
 ) -> None:
@@ -725,18 +746,22 @@ def test_a_list_of_files_that_a_stranger_made_up_moves_nothing(
 
 
 @pytest.mark.parametrize(
-    ("path", "to"),
+    ("path", "target", "to", "why"),
     [
-        ("enclaves/a/cert.pem", "enclaves/b"),
-        ("enclaves/a/cert.pem", "revoked/../private"),
-        ("enclaves/a/key.pem", "revoked/1a"),
-        ("private/cert.pem", "revoked/1a"),
+        ("enclaves/a/cert.pem", None, "enclaves/b", "would move to"),
+        ("enclaves/a/cert.pem", None, "revoked/../private", "would move to"),
+        ("enclaves/a/key.pem", None, "revoked/1a", "would move to"),
+        ("private/cert.pem", None, "revoked/1a", "would move to"),
+        ("enclaves/a/cert.pem", "../../../outside.pem", "", "lead out of the keystore"),
+        ("enclaves/a/cert.pem", "/etc/outside.pem", "", "lead out of the keystore"),
     ],
 )
-def test_a_list_of_files_moves_no_folder_elsewhere(path: str, to: str, keystore: Path) -> None:
-    made_up_stage(keystore, "after", [[path, "", None, to]])
+def test_a_list_of_files_moves_no_folder_elsewhere_and_makes_no_link_that_leads_out(
+    path: str, target: str | None, to: str, why: str, keystore: Path
+) -> None:
+    made_up_stage(keystore, "after", [[path, "", target, to]])
     before = snapshot(keystore)
-    with pytest.raises(KeystoreError, match=r"would move to.*restore"):
+    with pytest.raises(KeystoreError, match=rf"{why}.*restore"):
         create_enclaves(keystore, ["/new"], now=NOW)
     assert snapshot(keystore) == before
 

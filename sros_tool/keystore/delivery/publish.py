@@ -861,7 +861,7 @@ class _Run:
         """
         root, fleet = self.keystore.root, recorded_fleet(self.keystore)
         changed_robots, wanted = [], set()
-        looked_at = fleet.robots.keys() if among is None else {robot.robot for robot in among}
+        looked_at = (fleet.robots if among is None else {e.robot: e for e in among}).keys()
         for robot in looked_at:
             names = self._enclaves(fleet, robot)
             if not names:
