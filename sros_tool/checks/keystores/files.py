@@ -184,9 +184,10 @@ HOME_OR_ROBOT = FindingKind(
     "create any enclave, with any rights. The files do not show whether this folder is on a "
     "robot.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
-    "On the keystore machine, keep the CA keys, and run `sros check KEYSTORE`. On a robot, replace "
-    "the folder by an export (`sros distribute_key KEYSTORE ENCLAVE TARGET`); if others had "
-    "access, run `sros rotate_ca`.",
+    "On the keystore machine, keep the CA keys, and run `sros check KEYSTORE`; if that finds the "
+    "same, the keystore was copied without its links: copy it with them (`cp -a`), or add "
+    "`--exclude keystore.home-or-robot`. On a robot, replace the folder by an export (`sros "
+    "distribute_key KEYSTORE ENCLAVE TARGET`); if others had access, run `sros rotate_ca`.",
 )
 UNREADABLE = FindingKind(
     "keystore.file-unreadable",
