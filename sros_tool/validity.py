@@ -37,17 +37,19 @@ def time_of_file(seconds: float) -> datetime:
         return datetime.max.replace(tzinfo=UTC) if seconds > 0 else _EPOCH
 
 
-SOON = timedelta(days=30)
+_SOON = timedelta(days=30)
 """How long before it expires a document counts as expiring soon, unless its validity is short."""
+AUTHORITY_SOON = timedelta(days=90)
+"""The same for a CA, whose replacement takes several stages."""
 
 
-def soon_limit(lifetime: timedelta) -> timedelta:
+def soon_limit(lifetime: timedelta, longest: timedelta = _SOON) -> timedelta:
     """Return how long before it expires a document with this lifetime counts as expiring soon.
 
-    This is 30 days, or a third of the lifetime if that is shorter, in whole days if possible, so
-    that nothing is renewed each day.
+    This is ``longest``, or a third of the lifetime if that is shorter, in whole days if possible,
+    so that nothing is renewed each day.
     """
-    limit = min(SOON, lifetime / 3)
+    limit = min(longest, lifetime / 3)
     unit = timedelta(days=1) if limit >= timedelta(days=1) else timedelta(seconds=1)
     return limit // unit * unit
 
@@ -74,9 +76,9 @@ class Window:
         """Return whether ``moment`` is within the window."""
         return self.not_before <= moment <= self.not_after
 
-    def expires_soon_from(self) -> datetime:
+    def expires_soon_from(self, longest: timedelta = _SOON) -> datetime:
         """Return the time from which the window counts as expiring soon; see `soon_limit`."""
-        return self.not_after - soon_limit(self.lifetime())
+        return self.not_after - soon_limit(self.lifetime(), longest)
 
     def lifetime(self, made_at: datetime | None = None) -> timedelta:
         """Return how long a document with this validity is valid after it was made.

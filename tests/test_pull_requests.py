@@ -192,7 +192,7 @@ def test_a_checkout_below_the_workspace_is_reviewed(origin: Origin, tmp_path: Pa
         ({"base": ""}, "the base is empty. Nothing would be compared."),
         ({"base": "main"}, "neither the full id of a commit nor a full reference"),
         ({"base": "refs/heads/none"}, "git finds no reference 'refs/heads/none'"),
-        ({"renew-within": "soon"}, "soon"),
+        ({"renew-within": "later"}, "later"),
         ({"policy": "robot/none.xml"}, "'robot/none.xml' is not in the commit"),
         ({"policy": "../robot.xml"}, "is not a path from the top of the repository"),
         ({"policy": "/robot.xml"}, "is not a path from the top of the repository"),

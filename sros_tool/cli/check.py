@@ -209,8 +209,8 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
     "--needs-renewal",
     metavar="DURATION|PERCENT|soon",
     help="List only the enclaves that expire within DURATION (30d) or have used PERCENT of their "
-    "validity (66%). `soon`: within 30 days, or within a third of the validity that the keystore "
-    "gives, if that is shorter.",
+    "validity (66%). `soon`: of which a file expires within 30 days, or within a third of its "
+    "validity, if that is shorter.",
 )
 @advisories_option
 def check(
@@ -685,7 +685,7 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
     from sros_tool.keystore.reader import OpenedKeystore
 
     keystore = OpenedKeystore(root)
-    threshold = parse_threshold(text, keystore)
+    threshold = parse_threshold(text)
     expiring = due_enclaves(keystore, threshold, moment, keystore.template)
     if form == "json":
         print_json(expiring_enclaves(expiring))

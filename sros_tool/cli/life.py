@@ -62,8 +62,8 @@ _crl_option = click.option(
     "--all-expiring",
     metavar="DURATION|PERCENT|soon",
     help="Renew the named enclaves, and all that expire within DURATION (30d) or have used PERCENT "
-    "of their validity (66%). `soon`: within 30 days, or a third of the validity that the "
-    "keystore gives, if that is shorter. Short-lived enclaves are renewed only if named.",
+    "of their validity (66%). `soon`: of which a file expires within 30 days, or within a third of "
+    "its validity, if that is shorter. Short-lived enclaves are renewed only if named.",
 )
 @click.option("--new-key", is_flag=True, help="Also create new private keys.")
 @key_option
@@ -112,7 +112,7 @@ def renew(
     keystore = OpenedKeystore(root)
     if names or patterns or robots or all_expiring is None:
         names = chosen_enclaves(keystore, names, patterns, robots)
-    threshold = parse_threshold(all_expiring, keystore) if all_expiring is not None else None
+    threshold = parse_threshold(all_expiring) if all_expiring is not None else None
     with progress("renewing") as step:
         result = work(
             root,
@@ -271,7 +271,7 @@ def crl(
     """Show the revocation list of KEYSTORE, or sign it again.
 
     DDS refuses every participant once the list has expired, so the exit status is 1 if it expires
-    within 30 days.
+    within 30 days, or within a third of its validity, if that is shorter.
 
     Example:
       $ sros crl keystore
@@ -279,7 +279,6 @@ def crl(
         69aa94992b4cf7d761cf3c3e06f16849896e24a3  2026-11-21T07:00:00Z  ...
       $ sros crl keystore --refresh
     """
-    from datetime import timedelta
 
     from sros_tool.keystore.layout import PUBLIC, list_enclaves
     from sros_tool.keystore.lifecycle.revoke import refresh_crl
@@ -307,9 +306,7 @@ def crl(
             "The revocation list is in the folder of each enclave.",
             f"Look at it: `sros inspect {quote(str(root / 'enclaves'))}/ENCLAVE/crl.pem`.",
         )
-    soon = bool(lists) and min(revoked.next_update for revoked in lists) - now() < timedelta(
-        days=30
-    )
+    soon = any(revoked.expires_soon_from() < now() for revoked in lists)
     if as_json:
         from sros_tool.keystore.lifecycle.shown import shown_lists
 

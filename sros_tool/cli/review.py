@@ -151,9 +151,9 @@ def _paths_option(name: str, help_text: str) -> Callable[[Decorated], Decorated]
     "--renew-within",
     default="30d",
     show_default=True,
-    metavar="DURATION|PERCENT",
-    help="Fail if an enclave of a keystore expires within DURATION, or has used "
-    "PERCENT of its validity.",
+    metavar="DURATION|PERCENT|soon",
+    help="Fail if an enclave of a keystore expires within DURATION, has used PERCENT of its "
+    "validity, or expires soon, as by `sros renew --all-expiring soon`.",
 )
 @click.option(
     "--repository",

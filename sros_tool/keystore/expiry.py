@@ -27,8 +27,9 @@ from sros_tool.wording import counted, first_few
 class Threshold(NamedTuple):
     """The limit from which an enclave is due for renewal.
 
-    Exactly one field is set: ``remaining``, the time until expiry, or ``elapsed``, the fraction of
-    the validity (0 to 1) that is over.
+    At most one field is set: ``remaining``, the time until expiry, or ``elapsed``, the fraction of
+    the validity (0 to 1) that is over.  With neither, an enclave is due when one of its files
+    expires soon (`Window.expires_soon_from`).
     """
 
     remaining: timedelta | None = None
@@ -58,7 +59,9 @@ class Lifetime(NamedTuple):
         """Return whether the enclave is due for renewal at ``now``."""
         if threshold.remaining is not None:
             return self.expires() - now <= threshold.remaining
-        assert threshold.elapsed is not None
+        if threshold.elapsed is None:
+            validities = self.certificate, self.permissions
+            return any(validity.expires_soon_from() < now for validity in validities)
         return any(
             _elapsed(validity, now, made) >= threshold.elapsed
             for validity, made in ((self.certificate, self.came), (self.permissions, None))
@@ -140,16 +143,14 @@ def expiring_enclaves(renewals: ExpiryCheck) -> ExpiringEnclaves:
     )
 
 
-def parse_threshold(text: str, keystore: OpenedKeystore | None = None) -> Threshold:
-    """Parse a threshold: ``30d`` of remaining time, or ``66%`` of elapsed validity.
-
-    For a ``keystore``, it may also be ``soon``: the `Template.renewal_limit` that it has now.
+def parse_threshold(text: str) -> Threshold:
+    """Parse a threshold: ``30d`` of remaining time, ``66%`` of elapsed validity, or ``soon``.
 
     Raises:
-        UsageError: ``text`` is neither a duration nor a percentage up to 100.
+        UsageError: ``text`` is neither "soon", a duration nor a percentage up to 100.
     """
-    if keystore and text.strip() == "soon":
-        return Threshold(remaining=keystore.template.renewal_limit)
+    if text.strip() == "soon":
+        return Threshold()
     match = re.fullmatch(r"(\d{1,3})%", text.strip(), re.ASCII)
     if not match:
         return Threshold(remaining=parse_duration(text))

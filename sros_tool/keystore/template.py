@@ -29,12 +29,10 @@ from sros_tool.pki.token import refuse_pin
 from sros_tool.policy.model import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.policy.patterns import covers, matches
 from sros_tool.validity import (
-    SOON,
     Span,
     duration_text,
     parse_duration,
     parse_span,
-    soon_limit,
     span_text,
 )
 from sros_tool.xml import read_bytes
@@ -92,13 +90,6 @@ class Template:
     def key_place(self, role: str) -> str:
         """Return the URI of the key of the identity or permissions CA; "" in the keystore."""
         return self.identity_key if role == IDENTITY else self.permissions_key
-
-    @property
-    def renewal_limit(self) -> timedelta:
-        """How long before it expires an enclave is renewed: the shortest `soon_limit`."""
-        validities = (self.certificate_validity, self.permissions_validity)
-        lengths = (span if isinstance(span, timedelta) else span.length for span in validities)
-        return min((SOON, *(soon_limit(length) for length in lengths if length)))
 
     def longest_validity(self, enclave: str) -> timedelta | None:
         """Return the longest validity of a short-lived enclave; None for all others."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
-from datetime import datetime
+from datetime import datetime, timedelta
 from enum import Enum
 from functools import lru_cache
 from typing import NamedTuple, cast
@@ -36,7 +36,7 @@ from sros_tool.pki.distinguished_names import (
 from sros_tool.pki.keys import PrivateKey
 from sros_tool.pki.pem import kind_of
 from sros_tool.pki.tolerant import ContradictoryPoint
-from sros_tool.validity import iso
+from sros_tool.validity import iso, soon_limit
 
 CRL_MARK = b"-----BEGIN X509 CRL-----"
 """The first line of a PEM revocation list."""
@@ -73,6 +73,11 @@ class RevocationList(NamedTuple):
     next_update: datetime
     revoked: tuple[Revoked, ...]
     list: x509.CertificateRevocationList
+
+    def expires_soon_from(self) -> datetime:
+        """Return the time from which the list counts as expiring soon, or has expired."""
+        lifetime = max(self.next_update - self.this_update, timedelta())
+        return self.next_update - soon_limit(lifetime)
 
     def revokes(self, serial: int) -> bool:
         """Return whether the list revokes the certificate with the serial number ``serial``."""

@@ -180,7 +180,7 @@ CASES |= {
         "identity", b.new_authority(IS_CA, digest=hashes.SHA384())[0]
     ),
     "keystore.clock-behind": lambda b: at(b, -1),
-    "keystore.revocation-list-ends": lambda b: b.revoke(end=b.now + 29 * DAY),
+    "keystore.revocation-list-ends": lambda b: b.revoke(end=b.now + DAY / 4),
     "keystore.revocation-list-issuer": lambda b: b.revoke(by=b.foreign()),
     "keystore.enclave-removed": lambda b: shutil.rmtree(b.path("enclaves/base")),
     "keystore.unknown-authority": lambda b: also_trusted(b, "public/permissions_ca.cert.pem"),

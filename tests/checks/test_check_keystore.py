@@ -109,6 +109,10 @@ def test_a_revocation_list_that_ends(tmp_path: Path) -> None:
     sros("revoke", root, "/b").ok()
     assert ids(root) == []
     assert "keystore.revocation-list-ends" in ids(root, NOW + timedelta(days=3649))
+    sros("update_keystore", root, "--set", "revocation.validity=21d").ok()
+    sros("crl", root, "--refresh").ok()
+    ends = [day for day in (0, 12, 16, 22) if ids(root, NOW + timedelta(days=day))]
+    assert ends == [16, 22], "nothing is wrong with the list that the remedy makes"
 
 
 def test_files_that_expire_soon_are_one_finding(tmp_path: Path) -> None:

@@ -251,7 +251,7 @@ def test_the_keystore_of_another_user_does_not_name_the_service(site: Path) -> N
     assert renew(site, ["/talker"], now=now(), keyring=SERVICE).names("renewed")
 
 
-def listed(*serials: int, number: int = 1, key: Any = CA_KEY, days: int = 30) -> bytes:
+def listed(*serials: int, number: int = 1, key: Any = CA_KEY, days: float = 30) -> bytes:
     revoked = [Revoked(serial, now()) for serial in serials]
     end = now() + days * DAY
     return sign_crl(CA, key, revoked, number=number, this_update=now() - 2 * DAY, next_update=end)
@@ -281,7 +281,7 @@ def test_the_service_signs_the_revocation_list(site: Path) -> None:
     mine = certificate(site / "enclaves/listener/cert.pem").serial_number
     with pytest.raises(KeystoreError, match="no node could start in /listener"):
         refresh_crl(site, now=now(), crl=listed(serial, mine, number=6))
-    refresh_crl(site, now=now(), crl=listed(serial, number=6))
+    refresh_crl(site, now=now(), crl=listed(serial, number=6, days=0.5))
     present = OpenedKeystore(site).revocation_list
     assert present and present.number == 6
     (ends,) = (found for found in check(site) if found.id == "keystore.revocation-list-ends")

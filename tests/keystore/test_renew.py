@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from sros_tool import parallel
+from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.expiry import Threshold, parse_threshold, survey
@@ -188,19 +189,23 @@ def test_thresholds(text: str, expected: Threshold) -> None:
     assert parse_threshold(text) == expected
 
 
-def test_soon_goes_by_the_validity_that_the_keystore_gives_now(tmp_path: Path) -> None:
-    """So that a timer that was written before follows it."""
-    root, day = tmp_path / "ks", timedelta(days=1)
-    sros("create_keystore", root, "--template", "production").ok()
-    text = (root / "sros.toml").read_text()
-    for validity, limit in (("180d", 30 * day), ("21d", 7 * day), ("2d", day * 2 / 3)):
-        (root / "sros.toml").write_text(
-            text.replace('validity = "180d"', f'validity = "{validity}"')
-        )
-        assert parse_threshold("soon", OpenedKeystore(root)) == Threshold(remaining=limit)
-    with pytest.raises(UsageError):
-        parse_threshold("soon")
-    assert sros("renew", root, "--all-expiring", "soon").ok().out == ""
+@pytest.mark.parametrize(
+    ("validity", "days"), [(180, {150: False, 151: True}), (21, {14: False, 15: True})]
+)
+def test_what_check_says_expires_soon_is_what_soon_renews(
+    validity: int, days: dict[int, bool], tmp_path: Path
+) -> None:
+    """It goes by the files, whatever the keystore gives now."""
+    length = timedelta(days=validity)
+    root = made(tmp_path / "ks", "/a", certificate_validity=length, permissions_validity=length)
+    settings = root / "sros.toml"
+    settings.write_text(settings.read_text().replace(f'"{validity}d"', '"9d"'))
+    (life,), _ = survey(OpenedKeystore(root))
+    for day, due in days.items():
+        now = NOW + timedelta(days=day)
+        found = keystore_findings(OpenedKeystore(root), now=now)
+        assert any(finding.id == "enclave.ends-soon" for finding in found) is due
+        assert life.due(parse_threshold("soon"), now) is due
 
 
 @pytest.mark.parametrize("text", ["", "%", "101%", "-1%", "6.5%", "30", "d", "0d", "٣%", "1e1%"])

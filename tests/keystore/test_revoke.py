@@ -428,7 +428,7 @@ def test_the_program(tmp_path: Path) -> None:
 def test_a_list_that_ends_soon_is_an_alarm(tmp_path: Path) -> None:
     root = tmp_path / "ks"
     choices = replace(load_template("production"), revocation_validity=20 * DAY)
-    now = datetime.now(UTC)
+    now = datetime.now(UTC) - 15 * DAY
     create_keystore(root, template=choices, now=now)
     create_enclaves(root, ["/a", "/b"], now=now)
     revoke(root, ["/a"], now=now)
@@ -436,3 +436,4 @@ def test_a_list_that_ends_soon_is_an_alarm(tmp_path: Path) -> None:
     assert ended.status == 1
     assert "--refresh" in ended.err
     assert json.loads(sros("crl", root, "--json").out)["expires_soon"] is True
+    sros("crl", root, "--refresh").ok()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import suppress
-from datetime import datetime, timedelta
+from datetime import datetime
 from pathlib import Path
 from shlex import quote
 
@@ -47,7 +47,7 @@ from sros_tool.pki.chains import denies_issuing, purpose_faults
 from sros_tool.pki.crl import signed_by
 from sros_tool.pki.keys import algorithm, few_rounds, load_key
 from sros_tool.pki.token import is_token_uri
-from sros_tool.validity import iso
+from sros_tool.validity import AUTHORITY_SOON, iso
 from sros_tool.wording import first_few
 
 NOT_A_CA = FindingKind(
@@ -359,9 +359,6 @@ CRL_ISSUER = FindingKind(
     "Run `sros crl KEYSTORE --refresh`.",
 )
 
-_SOON = timedelta(days=90)
-_LIST_SOON = timedelta(days=30)
-
 
 def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
     """Yield findings about the certificates and keys of the CAs, and the revocation list."""
@@ -463,7 +460,7 @@ def _authority(
     if not validity.contains(keystore.now):
         text = f"{name} is valid from {begin} to {end}"
         yield CA_EXPIRED.found(subject, text, file, remedy=remedy)
-    elif validity.not_after - keystore.now < _SOON:
+    elif validity.expires_soon_from(AUTHORITY_SOON) < keystore.now:
         yield CA_EXPIRES_SOON.found(subject, f"{name} expires at {end}", file, remedy=remedy)
     for weak in filter(None, map(weakness, chain)):
         yield WEAK.found(subject, weak, file)
@@ -562,7 +559,7 @@ def _revocation_list_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
     if crl is None:
         return
     remedy = _NEXT_LIST if _is_served(keystore) else ""
-    if crl.next_update - keystore.now < _LIST_SOON:
+    if crl.expires_soon_from() < keystore.now:
         text = f"it expires at {iso(crl.next_update)}, and DDS then refuses every participant"
         yield CRL_EXPIRES_SOON.found("revocation list", text, file, remedy=remedy)
     identity = keystore.authorities.get(IDENTITY, ())

@@ -176,6 +176,14 @@ CA_KEY_ON_ROBOT = FindingKind(
     "Make sure that the keystore that made the export has the key, and remove the key here. If "
     "others had access, replace the CA in that keystore (`sros rotate_ca`).",
 )
+_ON_A_ROBOT = (
+    "On a robot, replace the folder by an export (`sros distribute_key KEYSTORE ENCLAVE TARGET`); "
+    "if others had access, run `sros rotate_ca`."
+)
+_WITHOUT_LINKS = (
+    "On the keystore machine, keep the CA keys, and copy the keystore again with its links (`cp "
+    f"-a`), or add `--exclude keystore.home-or-robot`. {_ON_A_ROBOT}"
+)
 HOME_OR_ROBOT = FindingKind(
     "keystore.home-or-robot",
     ERROR,
@@ -184,10 +192,7 @@ HOME_OR_ROBOT = FindingKind(
     "create any enclave, with any rights. The files do not show whether this folder is on a "
     "robot.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
-    "On the keystore machine, keep the CA keys, and run `sros check KEYSTORE`; if that finds the "
-    "same, the keystore was copied without its links: copy it with them (`cp -a`), or add "
-    "`--exclude keystore.home-or-robot`. On a robot, replace the folder by an export (`sros "
-    "distribute_key KEYSTORE ENCLAVE TARGET`); if others had access, run `sros rotate_ca`.",
+    f"On the keystore machine, keep the CA keys, and run `sros check KEYSTORE`. {_ON_A_ROBOT}",
 )
 UNREADABLE = FindingKind(
     "keystore.file-unreadable",
@@ -261,7 +266,8 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
         yield from _hidden_enclave_findings(keystore)
         yield from _folder_findings(root, keystore, links, trusted, kept)
         if kept and not (keystore.is_original and _has_links(keystore)):
-            yield HOME_OR_ROBOT.found(root, f"it has {names_text(kept)}", root)
+            remedy = _WITHOUT_LINKS if keystore.is_original else ""
+            yield HOME_OR_ROBOT.found(root, f"it has {names_text(kept)}", root, remedy=remedy)
         return
     passed: set[Path] = set()
     for name in names:

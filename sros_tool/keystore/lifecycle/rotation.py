@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -36,11 +36,8 @@ from sros_tool.pki.certificates import (
     subject_text,
     validity_of,
 )
-from sros_tool.validity import Window, iso
+from sros_tool.validity import AUTHORITY_SOON, Window, iso
 from sros_tool.values import Words, as_plain, parse_json, shows
-
-_SOON = timedelta(days=90)
-"""Remaining validity from which a remark advises to replace a CA."""
 
 
 class RotationStage(StrEnum):
@@ -250,7 +247,8 @@ def _expiry_remarks(authority_states: Sequence[AuthorityStatus], now: datetime) 
     """Return remarks on CAs that expire soon, or have expired."""
     remarks = []
     for state in authority_states:
-        if state.state != "issuing" or state.validity.not_after - now > _SOON:
+        expires_soon = state.validity.expires_soon_from(AUTHORITY_SOON) < now
+        if state.state != "issuing" or not expires_soon:
             continue
         name = "CA" if len(state.roles) > 1 else f"{state.roles[0]} CA"
         end = iso(state.validity.not_after)

@@ -410,7 +410,8 @@ class KeystoreLists(NamedTuple):
     next_update: datetime | None
     """Expiry of the list, in UTC; null if there is no list."""
     expires_soon: bool
-    """Whether the list expires within 30 days: the exit status is 1."""
+    """Whether the list expires within 30 days, or within a third of its validity, if that is
+    shorter: the exit status is 1."""
     revoked: Sequence[RevokedCertificate]
     """The revoked certificates."""
     other_lists: Sequence[OtherList]
