@@ -86,8 +86,8 @@ def inspect(
     key, a Zenoh configuration or a signed document (.p7s). The exit status is 1 if an enclave
     cannot run, a signature does not verify or is missing (in a .p7s file, or with --ca), or a Zenoh
     configuration does not fit its signature or its enclave. It is also 1 if the keystore's ledger
-    lacks a certificate or signed document, if lines of the ledger are missing or were changed, or,
-    with --policy, if nothing was signed from that file.
+    lacks a CA, a certificate or a signed document, if lines of the ledger are missing or were
+    changed, or, with --policy, if nothing was signed from that file.
 
     Example:
       $ sros inspect keystore/enclaves/talker/permissions.p7s
@@ -204,6 +204,7 @@ def _keystore_lines(keystore: DescribedKeystore) -> Iterator[str]:
     )
     for role, authority in keystore.authorities.items():
         yield from _authority_lines(role, authority)
+    yield from (f"  UNKNOWN {authority}" for authority in keystore.unknown_authorities)
     if isinstance(keystore.governance, UnreadableFile):
         yield f"  governance: {keystore.governance.error}"
     elif keystore.governance:

@@ -18,7 +18,7 @@ from cryptography import x509
 from sros_tool.dds.governance import DomainRule, TopicRule, parse_governance
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import DocumentError, SrosError
-from sros_tool.keystore.known_keys import known_authorities
+from sros_tool.keystore.known_keys import known_authorities, unknown_authorities
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL,
@@ -49,6 +49,7 @@ from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
 from sros_tool.keystore.reader import FilesReadOnce, OpenedEnclave, OpenedKeystore, open_enclave
 from sros_tool.keystore.zenoh_files import OpenedZenoh, ZenohFault, open_zenoh
 from sros_tool.pki.certificates import (
+    authority_text,
     common_name_of,
     digest,
     load_certificates,
@@ -378,6 +379,8 @@ class DescribedKeystore(NamedTuple):
     """Faults of the ledger."""
     authorities: Mapping[str, AuthorityFile | UnreadableFile]
     """CAs of the keystore, by role (``identity``, ``permissions``)."""
+    unknown_authorities: Sequence[str]
+    """CAs in the files of CAs that the ledger does not record, as text: somebody added them."""
     governance: DescribedGovernance | UnreadableFile | None
     """Governance of the keystore, or null."""
     zenoh: NetworkFacts | None
@@ -642,16 +645,24 @@ def _describe_keystore(keystore: OpenedKeystore, now: datetime) -> DescribedKeys
     except SrosError as error:
         gaps = [str(error)]
     problems += [f"ledger: {gap}" for gap in gaps]
+    strangers: list[str] = []
+    with suppress(SrosError):  # of the ledger, or of a file of CAs, as above
+        strangers += (
+            f"{role} CA: {authority_text(authority)} is not in the ledger"
+            for role in authorities
+            for authority in unknown_authorities(keystore, role)
+        )
     return DescribedKeystore(
         path=keystore.root,
         template=settings.name if settings else None,
         ledger=gaps,
         authorities=authorities,
+        unknown_authorities=strangers,
         governance=governance,
         zenoh=_describe_network(settings.zenoh) if settings and settings.zenoh else None,
         enclaves=enclaves,
         unreadable=unreadable,
-        problems=problems,
+        problems=problems + strangers,
     )
 
 

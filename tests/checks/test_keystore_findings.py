@@ -259,7 +259,10 @@ def test_a_ca_that_was_added_is_found_and_not_exported(
 
 
 def test_a_ca_that_was_added_is_noted_by_changes_and_replaced(bench: Bench) -> None:
+    assert sros("inspect", bench.root).ok()
     also_trusted(bench, "public/identity_ca.cert.pem")
+    shown = sros("inspect", bench.root)
+    assert shown.status == 1 and "UNKNOWN identity CA: " in shown.out
     secret = {"SROS_CA_PASSPHRASE": SECRET}
     assert "note [keystore.unknown-authority]" in sros("renew", bench.root, "/base", env=secret).err
     refused = sros("rotate_ca", bench.root, "--next", env=secret)
