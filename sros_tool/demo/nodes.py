@@ -32,13 +32,12 @@ class NodeOptions:
     """The options of a node.
 
     ``topic`` is the ROS name of the role's topic, service or action.  ``period`` is in seconds.
-    ``text`` is sent in messages, and identifies a server.  ``server`` is the text of the action
-    server that an action client uses ("": unknown).  ``also`` are further topics for an observer.
-    On Zenoh, messages of a talker have ``size`` bytes or more, and ``patience`` is how long a
-    process waits for its connection, in seconds.  A talker or listener ``by_hand`` needs no right
-    but that of its topic, and reports the types of other endpoints on the topic (`OtherTypes`).  A
-    talker on rclpy publishes messages of the ROS type ``type`` with default values, if it is not
-    `STRING`.
+    ``text`` is sent in messages, and identifies a server.  ``also`` are further topics for an
+    observer.  On Zenoh, messages of a talker have ``size`` bytes or more, and ``patience`` is how
+    long a process waits for its connection, in seconds.  A talker or listener ``by_hand`` needs no
+    right but that of its topic, and reports the types of other endpoints on the topic
+    (`OtherTypes`).  A talker on rclpy publishes messages of the ROS type ``type`` with default
+    values, if it is not `STRING`.
     """
 
     role: str
@@ -46,7 +45,6 @@ class NodeOptions:
     period: float = 0.5
     text: str = "Hello World"
     report: Path | None = None
-    server: str = ""
     also: tuple[str, ...] = ()
     size: int = 0
     patience: float = 60.0
@@ -84,9 +82,6 @@ def parse_options(module: str, roles: Collection[str], arguments: Sequence[str])
         "--text",
         default=NodeOptions.text,
         help="text of a talker or server, sent before a number (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--server", default="", help="text of the only action server, for an action client"
     )
     parser.add_argument(
         "--also",

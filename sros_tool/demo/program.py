@@ -693,9 +693,6 @@ class _Runner:
         text = self._text(index, party)
         if party.role in SPEAKING or (plan.backend.on_zenoh and party.role in CALLING):
             options += ["--text", text]
-        if party.role is Role.ACTION_CLIENT:
-            servers = [party for party in row.parties if party.role is Role.ACTION_SERVER]
-            options += ["--server", self._text(index, servers[0])] if len(servers) == 1 else []
         if party.role is Role.OBSERVER:
             for other_party in row.parties:
                 if other_party.role in (Role.TALKER, Role.SERVER) and (

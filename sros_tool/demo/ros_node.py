@@ -276,7 +276,11 @@ def _client(node: Any, options: NodeOptions, events: EventWriter) -> None:
 
 
 def _action_server(node: Any, options: NodeOptions, events: EventWriter) -> None:
-    """Compute the Fibonacci sequence for every goal, with feedback."""
+    """Compute the Fibonacci sequence for every goal, with feedback.
+
+    The bytes of ``options.text`` (UTF-8) follow the sequence in a result, which has no other field
+    that could name its server.
+    """
     from rclpy.action import ActionServer
 
     action = _fibonacci_action()
@@ -291,20 +295,16 @@ def _action_server(node: Any, options: NodeOptions, events: EventWriter) -> None
             setattr(feedback, field, fibonacci(length))
             goal.publish_feedback(feedback)
         goal.succeed()
-        result = action.Result()
-        result.sequence = fibonacci(goal.request.order)
-        node.get_logger().info(f"Result: {list(result.sequence)}")
-        events.report(EventKind.SENT, f"{options.text}: {list(result.sequence)}", count=done)
-        return result
+        sequence = fibonacci(goal.request.order)
+        node.get_logger().info(f"Result: {sequence}")
+        events.report(EventKind.SENT, f"{options.text}: {sequence}", count=done)
+        return action.Result(sequence=[*sequence, *options.text.encode()])
 
     node.action = ActionServer(node, action, options.topic, execute)
 
 
 def _action_client(node: Any, options: NodeOptions, events: EventWriter) -> None:
-    """Send goals periodically, and report correct results with complete feedback.
-
-    A result does not name its server, so ``options.server`` names the only one.
-    """
+    """Send goals periodically, and report correct results with complete feedback."""
     from rclpy.action import ActionClient
 
     action = _fibonacci_action()
@@ -330,13 +330,15 @@ def _action_client(node: Any, options: NodeOptions, events: EventWriter) -> None
 
     def check(future: Any) -> None:
         nonlocal right
-        sequence = _sequence_of(future.result().result)
+        numbers = _sequence_of(future.result().result)
+        sequence, text = numbers[: FIBONACCI_ORDER + 1], numbers[FIBONACCI_ORDER + 1 :]
         lengths = range(2, FIBONACCI_ORDER + 1)
         complete = {tuple(fibonacci(length)) for length in lengths} <= feedback
         if sequence == fibonacci(FIBONACCI_ORDER) and complete:
             right += 1
             node.get_logger().info(f"Result: {sequence}")
-            events.report(EventKind.HEARD, f"{options.server}: {sequence}", count=right)
+            server = bytes(number % 256 for number in text).decode(errors="replace")
+            events.report(EventKind.HEARD, f"{server}: {sequence}", count=right)
 
     node.create_timer(options.period, send)
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import MagicMock, Mock
 
 import pytest
@@ -161,6 +162,37 @@ def test_an_rclpy_node_by_hand_gives_up_its_own_type_to_hear_another(
     seen, heard = (event.text for event in read_events(tmp_path / "report")[1:])
     assert heard == "1 message of nav_msgs/msg/Odometry"
     assert "lost_msgs/msg/Other, which this listener cannot hear (No module named 'lost_" in seen
+
+
+def test_an_rclpy_action_result_names_its_server(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Any number of servers may answer one client, such as one that should be refused."""
+    actions, server, client, report = Mock(), Mock(), Mock(), tmp_path / "report"
+    actions.Fibonacci.Feedback = actions.Fibonacci.Result = SimpleNamespace
+    monkeypatch.setitem(sys.modules, "rclpy.action", Mock(ActionServer=server, ActionClient=client))
+    monkeypatch.setattr(ros_node, "_fibonacci_action", lambda: actions.Fibonacci)
+    goal = client.return_value.send_goal_async
+    ros_node._action_client(asks := Mock(), NodeOptions("action_client"), EventWriter(report))
+    asks.create_timer.call_args.args[1]()
+    keep = goal.call_args.kwargs["feedback_callback"]
+    fetch, accepted = goal.return_value.add_done_callback.call_args.args[0], Mock()
+    fetch(Mock(**{"result.return_value": accepted}))
+    check = accepted.get_result_async.return_value.add_done_callback.call_args.args[0]
+    for text in ("of the robot", "eines Gastes (früh)"):
+        options = NodeOptions("action_server", text=text)
+        ros_node._action_server(Mock(), options, EventWriter(tmp_path / "server"))
+        asked = Mock(**{"request.order": 5})
+        asked.publish_feedback = lambda part: keep(SimpleNamespace(feedback=part))
+        result = server.call_args.args[3](asked)
+        check(Mock(**{"result.return_value.result": result}))
+    sent, *heard = read_events(report)
+    assert sent.text == "goal 1"
+    numbers = "[0, 1, 1, 2, 3, 5]"
+    assert [event.text for event in heard] == [
+        f"of the robot: {numbers}",
+        f"eines Gastes (früh): {numbers}",
+    ]
 
 
 @pytest.mark.parametrize("options", [["--json"], ["--scenario", "attacks"], ["--domain", "3"]])
