@@ -45,7 +45,7 @@ METRICS_FILE = "/var/lib/sros-metrics/sros.prom"
 FLEET_FILE = "/var/lib/sros-metrics/fleet.prom"
 
 _MADE = "# Made by `sros units`; change it with `systemctl edit`, and this file stays as it is."
-_PLAIN_PATH = re.compile(r"(/[A-Za-z0-9_][A-Za-z0-9._+-]*)+\Z")
+_PLAIN_PATH = re.compile(r"(/(?!\.\.?(/|\Z))[A-Za-z0-9_.][A-Za-z0-9._+-]*)+\Z")
 _USER = re.compile(r"[A-Za-z_][A-Za-z0-9_-]{0,30}\Z")
 
 _CLOSED = """\
@@ -122,7 +122,7 @@ def _check_path(path: str, kind: str, option: str = "") -> str:
             f"{kind} {path!r} cannot be written in a unit",
             "systemd reads spaces, '%', '$', ':' and quotes in paths in several ways.",
             f"{f'With {option}, name' if option else 'Name'} an absolute path of letters, digits "
-            "and /._+- only, without parts that begin with '.'.",
+            "and /._+- only, without '.' and '..' as parts.",
         )
     return path
 

@@ -153,7 +153,7 @@ def test_the_agent_is_of_the_owner_and_may_write_into_its_inbox(made: Path, tmp_
         (("/leg", "F", "--", "true"), "cannot be written in a unit"),
         (("/leg", "F", "--", "/bin/true", "a\nUser=root"), "cannot be written in a unit"),
         (("--job", "renew", "F", "--sros", "sros"), "cannot be written in a unit"),
-        (("--job", "agent", "F", "--sros", "/x/.venv/bin/sros"), "With --sros FILE, name"),
+        (("--job", "agent", "F", "--sros", "/x/../bin/sros"), "With --sros FILE, name"),
         (("--job", "guard", "F", "--user", "ros"), "Only root"),
     ],
 )
