@@ -30,6 +30,7 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.markdown import bounded_list, code, plain
 from sros_tool.pki.certificates import validity_of
 from sros_tool.pki.crl import load_crl
+from sros_tool.terminal import visible_line
 from sros_tool.wording import counted, first_few
 
 if TYPE_CHECKING:
@@ -259,8 +260,8 @@ def github_annotations(findings: Iterable[Finding]) -> str:
     """Return workflow commands of GitHub Actions, which show each finding at its line.
 
     The worst findings come first, because GitHub shows ten of each severity.  The text of a finding
-    is escaped, so that it cannot begin a command or a property (GitHub, actions/toolkit,
-    command.ts).
+    is escaped, so that it can neither begin a command, a property or a line (GitHub,
+    actions/toolkit, command.ts), nor control a terminal.
     """
 
     lines = []
@@ -273,8 +274,9 @@ def github_annotations(findings: Iterable[Finding]) -> str:
 
 
 def _escaped(text: str, characters: str = "") -> str:
-    """Return the text with line ends, "%" and ``characters`` as a workflow command has them."""
-    return "".join(f"%{ord(one):02X}" if one in f"%\r\n{characters}" else one for one in text)
+    """Return the text on one visible line, with "%" and ``characters`` as percent escapes."""
+    line = visible_line(text)
+    return "".join(f"%{ord(one):02X}" if one in f"%{characters}" else one for one in line)
 
 
 def _location(file: str, line: int | None, base: Path) -> dict[str, Any]:

@@ -173,10 +173,10 @@ def test_a_denial_that_is_gone_is_named_as_what_failed(change: Change) -> None:
 
 def test_no_name_becomes_a_command_of_the_runner() -> None:
     kind = next(iter(all_kinds().values()))
-    line = github_annotations([kind.found("a\n::error::b", "c%0A", "x,line=1:\r\ny")])
-    assert line.count("\n") == 1 and "\r" not in line
-    assert line.startswith(f"::{kind.severity.word} file=x%2Cline=1%3A%0D%0Ay,line=1,title=")
-    assert "::a%0A::error::b: c%250A." in line
+    line = github_annotations([kind.found("a\n::error::b", "c%0A\x1b[2J\u202e", "x,line=1:\r\ny")])
+    assert line.count("\n") == 1 and line.removesuffix("\n").isprintable()
+    assert line.startswith(rf"::{kind.severity.word} file=x%2Cline=1%3A\x0d\x0ay,line=1,title=")
+    assert r"::a\x0a::error::b: c%250A\x1b[2J\u202e." in line
 
 
 # ── what is compared ───────────────────────────────────────────────────────────────────────
