@@ -45,6 +45,7 @@ from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
 from sros_tool.keystore.protection import contradictions
 from sros_tool.keystore.template import Template
 from sros_tool.names import (
+    ACTION_PARTS,
     ACTION_SEPARATOR,
     ACTION_SERVICES,
     ACTION_TOPICS,
@@ -1080,12 +1081,16 @@ def _statement_findings(statement: _Statement, rules: Rules) -> Iterator[Finding
         else:
             yield statement.found(UNREACHABLE, f"{statement.right.describe()} is denied by {shown}")
         return
-    if statement.name.endswith(GOAL) and statement.right.right in WHOLE:
-        action = statement.name.removesuffix(GOAL)
-        whole = WHOLE[statement.right.right]
-        if not rules.allow(statement.right.enclave, whole, action):
-            text = f"{statement.name} is allowed, but not everything needed to {whole} {action}"
+    enclave, _, right, name = statement.right
+    if name.endswith(GOAL) and right in WHOLE:
+        whole, action = WHOLE[right], name.removesuffix(GOAL)
+        if not rules.allow(enclave, whole, action):
+            text = f"{name} is allowed, but not everything needed to {whole} {action}"
             yield statement.found(HALF_ACTION, text)
+    elif right in ACTION_PARTS and not is_expression(name) and rules.overlaps(denial):
+        shown = ", ".join(f"{by.right} {by.name}" for by in rules.overlapping(denial))
+        text = f"{right} {name} is allowed, but a part of the action is denied by {shown}"
+        yield statement.found(HALF_ACTION, text, "Remove the DENY of the part, or the ALLOW.")
 
 
 def _redundancy_findings(checked_policy: _CheckedPolicy) -> Iterator[Finding]:

@@ -29,6 +29,7 @@ from sros_tool.keystore.participant import (
     loaded_enclave,
 )
 from sros_tool.keystore.reader import OpenedKeystore, open_enclave
+from sros_tool.names import action_part
 from sros_tool.values import Words, shows
 
 if TYPE_CHECKING:
@@ -327,11 +328,15 @@ def taken_for_action(question: Question, action: Question) -> tuple[Note, ...]:
 def note_on_action(
     question: Question, kind: str | None, decide: Callable[[Question], tuple[bool, Sequence[str]]]
 ) -> Iterator[Note]:
-    """Yield a note if an enclave that is denied a service may call an action with its name.
+    """Yield a note if what an enclave is denied is a part of an action, or the name of one it may.
 
     ``kind`` is the kind of the name if the user gave it; ``decide`` returns whether the enclave may
     do it, or else the parts that it may do.
     """
+    if name := action_part(question.name)[0]:
+        word = "execute" if question.right in ("publish", "reply") else "call"
+        text = f"this {question.type} is a part of action {name}, which a node needs as a whole: "
+        yield Note("explain.part-of-action", f"{text}ask about `{word} {name} --type action`.")
     if (question.word, question.type, kind) == ("call", "service", None):
         action = ask("call", question.name, "action")
         whole, parts = decide(action)

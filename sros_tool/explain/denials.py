@@ -32,9 +32,7 @@ from sros_tool.graph.learn import (
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.names import (
     ACTION_SEPARATOR,
-    ACTION_SERVICES,
     ACTION_TOPICS,
-    action_part,
     check_enclave_name,
     expression_problem,
     is_expression,
@@ -45,7 +43,7 @@ from sros_tool.names import (
 )
 from sros_tool.policy.model import ALLOW, Policy
 from sros_tool.policy.patterns import covers
-from sros_tool.policy.rights import Right, Rules, profile_rights
+from sros_tool.policy.rights import Right, Rules, of_whole_action, profile_rights
 from sros_tool.runtime.vendor_log import (
     ENDPOINT_KINDS,
     REMOTE_ENDPOINT,
@@ -203,19 +201,15 @@ def _is_ros(topic: str) -> bool:
 
 def _right(denial: Denial) -> NodeRight:
     right, name = right_to_use(denial.topic, writes=denial.direction == PUBLISH)
-    action, part = action_part(name)
-    if right in ("request", "reply") and action and part in ACTION_SERVICES:
-        return NodeRight("call" if right == "request" else "execute", action)
-    return NodeRight(right, name)
+    return NodeRight(*of_whole_action(right, name))
 
 
 def _without_parts(rights: set[NodeRight]) -> frozenset[NodeRight]:
-    """Return the rights without topics and services of an action that is among the rights."""
+    """Return the rights without the topics of an action that is among the rights."""
     parts = {
-        NodeRight(way, f"{right.name}{ACTION_SEPARATOR}{topic}")
+        NodeRight(SUBSCRIBE, f"{right.name}{ACTION_SEPARATOR}{topic}")
         for right in rights
-        for way in ({"call": SUBSCRIBE, "execute": PUBLISH}.get(right.right),)
-        if way
+        if right.right == "call"
         for topic in ACTION_TOPICS
     }
     return frozenset(rights - parts)

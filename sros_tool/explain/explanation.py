@@ -53,7 +53,7 @@ from sros_tool.names import (
     nodes_served,
 )
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source
-from sros_tool.policy.rights import Right, order, profile_rights
+from sros_tool.policy.rights import Right, of_whole_action, order, profile_rights
 from sros_tool.terminal import log_step
 
 
@@ -266,7 +266,7 @@ def _smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | Non
         governance = enclave.plain_governance or parse_governance(enclave.governance)
     except SrosError:
         return None
-    wanted = question.allowed(enclave.name)
+    wanted = Right(enclave.name, ALLOW, *of_whole_action(question.right, question.name))
     present = _present_rights(enclave.policy, enclave.name, answer)
     add: list[Right] = []
     lift: list[Right] = []

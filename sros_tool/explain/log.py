@@ -47,10 +47,10 @@ from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.selection import likely_names as likely_enclaves
 from sros_tool.names import (
     ACTION_PARTS,
-    ACTION_SEPARATOR,
-    SERVICE_ENDS,
+    action_part,
     check_enclave_name,
     nodes_served,
+    right_to_use,
 )
 from sros_tool.pki.certificates import IDENTITY_DIGITS
 from sros_tool.policy.model import ALLOW, Enclave, Policy, policy_in_namespace
@@ -786,8 +786,11 @@ class _Examiner:
         ``ns`` is the namespace that the whole process lacks, or "".
         """
         line, text = named[0][0], " ".join(named[0][1].split())
-        right, name, _ = _in_ros_terms(denial)
+        right, name, kind = _in_ros_terms(denial)
+        denied = f"action {name}, of which {denial.topic} is a part" if kind == "action" else name
         who = "a peer" if denial.remote else denial.enclave or "the process"
+        if enclave := None if denial.remote else self._find(denial.enclave):
+            denial = replace(denial, enclave=enclave.name)
         by = {
             True: "a rule of the policy denies it",
             False: "no rule allows it",
@@ -803,10 +806,9 @@ class _Examiner:
             text,
             denial.process,
             denial.enclave,
-            f"{who} may not {right} {name}: {by}",
+            f"{who} may not {right} {denied}: {by}",
             self._how_to_ask(denial, name),
         )
-        enclave = None if denial.remote else self._find(denial.enclave)
         if enclave is None:
             return finding
         directions = (denial.direction,) if denial.direction else (PUBLISH, SUBSCRIBE)
@@ -846,10 +848,7 @@ class _Examiner:
                 other, better = self._similar_name_cause(denial, name, enclave, finding.remedy)
             facts = [answer.decision.text, *other]
             remedy = better or finding.remedy
-        remedy = remedy.replace("ENCLAVE", enclave.name)
-        return replace(
-            finding, enclave=enclave.name, found=tuple(facts), checked=True, remedy=remedy
-        )
+        return replace(finding, found=tuple(facts), checked=True, remedy=remedy)
 
     def _other_folder_cause(self, denial: Denial, enclave: LoadedEnclave) -> tuple[list[str], str]:
         """Return cause and remedy if the process runs from another folder than the enclave's."""
@@ -887,8 +886,8 @@ class _Examiner:
         if not nodes and (node or denial.topic in _TOPICS_OF_EVERY_NODE):
             return [f"the permissions lack {_EVERY_NODE}"], (
                 'Add <xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/> to the '
-                "node's profile, or run `sros generate_policy POLICY --enclave ENCLAVE --from-log "
-                "LOG`."
+                "node's profile, or run `sros generate_policy POLICY --enclave "
+                f"{quote(denial.enclave)} --from-log LOG`."
             )
         return [], ""
 
@@ -1080,25 +1079,27 @@ def _nothing_found(enclave: LoadedEnclave) -> str:
     )
 
 
-_HALVES = {
-    ("rq", "publish"): "call",
-    ("rq", "subscribe"): "serve",
-    ("rr", "publish"): "serve",
-    ("rr", "subscribe"): "call",
-}
-
-
 def _in_ros_terms(denial: Denial) -> tuple[str, str, str]:
-    """Return the denied operation (one of `answer.WORDS`, or "use"), the ROS name, and its type."""
-    prefix, topic = denial.topic[:2], denial.topic[2:]
-    if prefix in SERVICE_ENDS and topic.endswith(SERVICE_ENDS[prefix]):
-        name, part, _ = topic.removesuffix(SERVICE_ENDS[prefix]).partition(ACTION_SEPARATOR)
-        word = _HALVES.get((prefix, denial.direction), "use")
-        if part:
-            return "execute" if word == "serve" else word, name, "action"
-        return word, name, "service"
-    is_topic = prefix == "rt" and topic.startswith("/")
-    return denial.direction or "use", topic if is_topic else denial.topic, "topic"
+    """Return the denied operation (one of `answer.WORDS`, or "use"), the ROS name, and its type.
+
+    A topic or a service of an action is told as the action.
+    """
+    right, name = right_to_use(denial.topic, writes=denial.direction == PUBLISH)
+    if not name.startswith("/"):
+        return denial.direction or "use", denial.topic, "topic"
+    action, _ = action_part(name)
+    word, kind = _TOLD_AS[right]
+    if action:
+        word, kind = "execute" if right in ("publish", "reply") else "call", "action"
+    return word if denial.direction else "use", action or name, kind
+
+
+_TOLD_AS = {
+    "publish": (PUBLISH, "topic"),
+    "subscribe": (SUBSCRIBE, "topic"),
+    "request": ("call", "service"),
+    "reply": ("serve", "service"),
+}
 
 
 _WORDS_OF_TYPES = {

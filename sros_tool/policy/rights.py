@@ -13,9 +13,11 @@ from typing import Annotated, NamedTuple
 
 from sros_tool.names import (
     ACTION_PARTS,
+    ACTION_SEPARATOR,
     GOAL,
     NODE_SERVICES,
     DdsNames,
+    action_part,
     dds_names,
     expand,
     is_expression,
@@ -162,6 +164,18 @@ def parts(right: Right) -> tuple[Right, ...]:
     return tuple(
         Right(right.enclave, right.qualifier, part, right.name + end) for part, end in part_rights
     )
+
+
+def of_whole_action(right: str, name: str) -> tuple[str, str]:
+    """Return the right to the action of which ``right`` to ``name`` is a part, and its name.
+
+    Other rights stay. So does a subscription: who only watches an action need not command it.
+    """
+    action, part = action_part(name)
+    for whole, of in ACTION_PARTS.items():
+        if right != "subscribe" and (right, f"{ACTION_SEPARATOR}{part}") in of:
+            return whole, action
+    return right, name
 
 
 def unfolded(rights: Iterable[Right]) -> frozenset[Right]:

@@ -48,6 +48,7 @@ EVENTS = topics("publish", "/parameter_events")
 BASICS = f"{LOG}{EVENTS}{services('reply', TYPES, *PARAMETERS)}"
 OTHER = '</profile><profile ns="/" node="m">' + BASICS
 GOAL = "dock/_action/send_goal"
+DOCK = '<actions call="ALLOW"><action>dock</action></actions>'
 MANY = tuple(f"{'very_' * 8}long_{index}" for index in range(1200))
 
 CASES = [
@@ -60,7 +61,9 @@ CASES = [
     Case("policy.redundant-rule", topics("publish", "/x/*", "/x/a"),
          topics("publish", "/x/*", "/y/a")),
     Case("policy.action-in-part", services("request", GOAL),
-         '<actions call="ALLOW"><action>dock</action></actions>'),
+         DOCK),
+    Case("policy.action-in-part", f"{DOCK}\n{deny('subscribe', 'dock/_action/feedback')}",
+         f"{DOCK}\n{deny('subscribe', 'mow/_action/feedback')}"),
     Case("policy.no-type-description", f"{LOG}{EVENTS}{services('reply', *PARAMETERS)}", BASICS,
          line=0, basics=False),
     Case("policy.no-rosout", f"{EVENTS}{services('reply', TYPES, *PARAMETERS)}", BASICS,

@@ -647,6 +647,20 @@ def test_a_topic_that_is_an_action_is_noted(fibonacci: Path) -> None:
     assert "no-topic" not in explain(fibonacci, CLIENT, "publish", "/nothing").err
 
 
+def test_a_part_of_an_action_is_told_as_the_action(fibonacci: Path) -> None:
+    """A subscription alone does not give the right to command the server."""
+    for enclave, word, part, added, asked in (
+        (CLIENT, "publish", "feedback", '<actions execute="ALLOW">', "execute"),
+        (SERVER, "call", "send_goal", '<actions call="ALLOW">', "call"),
+        (SERVER, "subscribe", "status", '<topics subscribe="ALLOW">', "call"),
+    ):
+        found = explain(fibonacci, enclave, word, f"/fibonacci/_action/{part}")
+        assert found.status == 1 and added in found.out
+        assert f"ask about `{asked} /fibonacci --type action`" in found.err
+    allowed = explain(fibonacci, CLIENT, "subscribe", "/fibonacci/_action/status")
+    assert allowed.status == 0 and "part-of-action" not in allowed.err
+
+
 def test_an_action_is_one_where_wildcards_allow_services(tmp_path: Path) -> None:
     root = tmp_path / "ks"
     sros("create_keystore", root).ok()

@@ -1032,6 +1032,15 @@ def test_a_forgotten_remapping_is_shown(keystore: Path, tmp_path: Path) -> None:
         assert f"`sros explain {keystore} {ENCLAVE} publish /{topic}`" in found
 
 
+def test_a_topic_without_a_ros_name_is_looked_up_in_the_folder_of_the_enclave(
+    keystore: Path, tmp_path: Path
+) -> None:
+    log = tmp_path / "robot.log"
+    log.write_text("rt/x;y topic not found in allow rule. -> Function check_create_datareader\n")
+    found = sros("explain", keystore, ENCLAVE, "--log", log).out
+    assert f"`sros inspect {keystore}/enclaves{ENCLAVE}`" in found
+
+
 def test_an_action_is_no_service(keystore: Path, tmp_path: Path) -> None:
     """Neither the advised command nor a proposed name is about a service."""
     log, policy = tmp_path / "robot.log", tmp_path / "robot.xml"
@@ -1103,12 +1112,16 @@ def test_each_cause_of_a_topic_has_its_own_lines(tmp_path: Path) -> None:
         assert all(each["text"] in lines[each["line"] - 1] for each in found)
 
 
-def test_halves_of_services_are_told_as_services() -> None:
+def test_halves_of_services_and_parts_of_actions_are_told_as_these() -> None:
     texts = {
         "rq/addRequest topic not found in allow rule. -> check_create_datawriter": "call /add",
         "rr/addReply topic not found in allow rule. -> check_create_datawriter": "serve /add",
         "rq/go/_action/send_goalRequest topic not found in allow rule. "
-        "-> check_create_datareader": "execute /go",
+        "-> check_create_datareader": "execute action /go, of which "
+        "rq/go/_action/send_goalRequest is a part",
+        "rt/go/_action/status topic not found in allow rule. -> check_create_datareader": "call action /go, of which rt/go/_action/status is a part",
+        "rt/go/_action/feedback topic not found in allow rule. -> check_create_datawriter": "execute action /go, of which rt/go/_action/feedback is a part",
+        "rt/go/_action/path topic not found in allow rule. -> check_create_datawriter": "publish /go/_action/path",
     }
     for text, told in texts.items():
         (found,) = explained(text)
