@@ -71,7 +71,13 @@ if TYPE_CHECKING:
 @click.option(
     "--partial",
     is_flag=True,
-    help="Exit with 0 if nothing is denied, even if some nodes were not seen or not judged.",
+    help="Exit with 0 if nothing is denied, even if some nodes were not seen.",
+)
+@click.option(
+    "--unjudged",
+    is_flag=True,
+    help="Exit with 0 if nothing is denied, even if something that was seen was not judged, or the "
+    "graph kept changing.",
 )
 @fleet_option("The robots that the placeholders of POLICY stand for.")
 @force_option
@@ -88,6 +94,7 @@ def audit(
     distro: Distribution | None,
     patch: Path | None,
     partial: bool,
+    unjudged: bool,
     fleet_file: Path | None,
     force: bool,
     dry_run: bool,
@@ -115,8 +122,9 @@ def audit(
       $ sros audit keystore --distro lyrical
 
     Exit status: 0 if nothing would be denied and every node of POLICY or KEYSTORE was seen; 1 if
-    something would be denied; also 1, unless --partial is given, if a node was not seen, something
-    could not be judged, or the graph kept changing; 2 if the audit could not be done.
+    something would be denied; also 1 if a node was not seen (unless --partial is given), and if
+    something was not judged or the graph kept changing (unless --unjudged is given); 2 if the audit
+    could not be done.
     """
     from sros_tool.explain import audit as audits
     from sros_tool.fleet.fleet_file import read_fleet
@@ -161,14 +169,23 @@ def audit(
     snapshot, rmw = observe(environment, watch, spin_time, report, at_end=at_end)
     audited = judge(snapshot.everything)
     kept_changing = snapshot.seconds if not snapshot.settled else 0
-    fine = audited.allowed and (partial or (audited.complete and not kept_changing))
+    left_out = [
+        text
+        for is_left_out, text in (
+            (audited.unseen and not partial, _UNSEEN),
+            ((audited.unjudged or kept_changing) and not unjudged, _UNJUDGED),
+        )
+        if is_left_out
+    ]
+    fine = audited.allowed and not left_out
     if not audited.observation.nodes:
         raise UnavailableError(
             "there is nothing to audit: no node was observed",
             why_no_node_was_observed(environment, snapshot.seconds, rmw, enclave),
         )
-    if rmw == RMW_ZENOH:
-        audited = replace(audited, notes=(*audited.notes, audits.ON_ZENOH))
+    ended = audits.notes_on_ended(snapshot.gone)
+    on_zenoh = (audits.ON_ZENOH,) if rmw == RMW_ZENOH else ()
+    audited = replace(audited, notes=(*audited.notes, *ended, *on_zenoh))
     existed = patch is not None and patch.exists()
     written = _write_patch(audited, patch, dry_run=dry_run)
     if as_json:
@@ -190,6 +207,7 @@ def audit(
                 observation=audited.observation,
                 settled=snapshot.settled,
                 partial=partial,
+                unjudged_accepted=unjudged,
                 patch=patch if written else None,
                 dry_run=dry_run,
                 changes=file_change(patch, existed=existed) if patch and written else (),
@@ -199,8 +217,8 @@ def audit(
     else:
         _show(audited, enclaves, kept_changing, on_zenoh=rmw == RMW_ZENOH)
     print_notes((*audited.notes, *audited.missing.notes))
-    if audited.allowed and not fine:
-        echo(_NOT_ALL, err=True)
+    if audited.allowed and left_out:
+        echo(f"the exit status is 1: {'; '.join(left_out)}", err=True)
     if written:
         one_policy = enclaves.what == "policy" and len(sources) == 1
         policy = shlex.quote(str(sources[0])) if one_policy else "POLICY"
@@ -218,10 +236,8 @@ def audit(
     return 0 if fine else 1
 
 
-_NOT_ALL = (
-    "the exit status is 1, because something was not seen or could not be decided: --watch finds "
-    "nodes that start later, and --partial accepts this"
-)
+_UNSEEN = "nodes were not seen (--watch finds nodes that start later, --partial accepts this)"
+_UNJUDGED = "something was not judged, or the graph kept changing (--unjudged accepts this)"
 _TO_ALLOW = (
     "to allow what is denied, add --patch missing.xml to this command: it writes missing rights "
     "as a policy, and names the command that adds them"

@@ -278,8 +278,8 @@ class AuditResult(NamedTuple):
     domain: int
     """The ROS domain."""
     allowed: bool
-    """Whether the exit status is 0: nothing would be denied, and ``--partial`` accepts everything
-    that was left out.
+    """Whether the exit status is 0: nothing would be denied, and ``--partial`` and ``--unjudged``
+    accept everything that was left out.
     """
     denied: Sequence[DeniedRight]
     """The rights that would be denied."""
@@ -294,7 +294,10 @@ class AuditResult(NamedTuple):
     settled: bool
     """Whether the ROS graph stopped changing before the result."""
     partial: bool
-    """Whether ``--partial`` accepted nodes and things that were not seen or not judged."""
+    """Whether ``--partial`` accepted nodes that were not seen."""
+    unjudged_accepted: bool
+    """Whether ``--unjudged`` accepted things that were not judged, and a graph that kept changing.
+    """
     patch: Path | None
     """The policy with the rights to add that was written (``--patch``), or null."""
     dry_run: DryRun
@@ -322,13 +325,8 @@ class Audit:
 
     @property
     def allowed(self) -> bool:
-        """Whether every judged node would be allowed everything; see `complete` for the others."""
+        """Whether every judged node would be allowed everything."""
         return not (self.denied or self.refused)
-
-    @property
-    def complete(self) -> bool:
-        """Whether every expected node was seen, and every observed thing was judged."""
-        return not (self.unseen or self.unjudged)
 
     def lines(self) -> dict[str, str]:
         """Return a line for each refused enclave, denied right and node without an enclave.
@@ -452,6 +450,10 @@ _TOOLS = (
     "left out, because these nodes are tools that observe the robot; on the secured robot they "
     "need an enclave such as the one in operator_look.xml (`sros policies --copy`)"
 )
+_ENDED = (
+    "judged as well, although these nodes ended while the graph was observed; on a robot without "
+    "security, anyone on the network can show such nodes"
+)
 _SILENT = "not judged, because these nodes were announced but had no endpoint"
 _STRAYS = "not judged, because the writers or readers of these topics belong to no ROS node"
 
@@ -485,6 +487,12 @@ def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
         for note, words, names in notes
         if note
     ]
+
+
+def notes_on_ended(nodes: Iterable[str]) -> tuple[Note, ...]:
+    """Return a note on nodes, by full name, that ended while the graph was observed."""
+    note = _note("ended", _ENDED, (n for n in nodes if not is_tool_name(_base_name(n))))
+    return (note,) if note else ()
 
 
 def _note(kind: str, text: str, subjects: Iterable[str]) -> Note | None:

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from sros_tool.cli import audit
 from sros_tool.cli.observing import observe
+from sros_tool.graph.observation import Observation
+from sros_tool.graph.observe import Snapshot
 from sros_tool.runtime.environment import RMW_ZENOH
 from tests.graph.fake_graph import Beside, graph
 from tests.support.harness import Ended, sros
@@ -46,13 +50,16 @@ def test_nothing_would_be_denied(program: Program, tmp_path: Path) -> None:
     assert ended == Ended(0, "", summary)
 
 
-def test_an_audit_on_zenoh_says_by_whose_rules_it_decides(
+def test_an_audit_says_by_whose_rules_it_decides_and_which_nodes_ended(
     program: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    on_zenoh = lambda *asked, **more: (observe(*asked, **more)[0], RMW_ZENOH)  # noqa: E731
+    def on_zenoh(*asked: Any, **more: Any) -> tuple[Snapshot, str]:
+        return replace(observe(*asked, **more)[0], observation=Observation()), RMW_ZENOH
+
     monkeypatch.setattr(audit, "observe", on_zenoh)
     ended = program(graph(FINE), "robot.xml", *SHORT)
-    assert "with 1 endpoint, by the rules of Fast DDS 2.14\nnote [audit.on-zenoh]: " in ended.err
+    assert "with 1 endpoint, by the rules of Fast DDS 2.14\nnote [audit.ended]: " in ended.err
+    assert "such nodes: /talker\nnote [audit.on-zenoh]: " in ended.err
 
 
 TO_ALLOW = (
@@ -111,6 +118,19 @@ def test_the_verdict_says_what_was_not_seen(
     assert ("--partial accepts this" in ended.err) is not accepted
 
 
+def test_nodes_that_were_not_seen_are_accepted_apart_from_what_was_not_judged(
+    program: Program, tmp_path: Path
+) -> None:
+    (tmp_path / "robot.xml").write_text(TWO)
+    options = "--partial", "--unjudged"
+    seen = graph(FINE, ("/", "/", "_NODE_NAME_UNKNOWN_", "09", ["publish rt/cmd_vel"]))
+    for option, other in (options, options[::-1]):
+        ended = program(seen, "robot.xml", *SHORT, option)
+        assert ended.status == 1
+        assert f"{other} accepts this" in ended.err and f"{option} accepts" not in ended.err
+    assert program(seen, "robot.xml", *SHORT, *options).status == 0
+
+
 @pytest.mark.parametrize("name", some(["_sros_observer", "OBSERVER"], 1))
 def test_another_node_with_the_name_of_the_observer_is_shown(name: str, program: Program) -> None:
     """OBSERVER stands for the name that the observer gives itself."""
@@ -160,6 +180,7 @@ def test_json_has_a_stable_shape(program: Program) -> None:
         "unjudged": [],
         "settled": True,
         "partial": False,
+        "unjudged_accepted": False,
         "nodes": [
             {
                 "enclaves": ["/t"],

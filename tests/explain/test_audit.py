@@ -233,7 +233,7 @@ def test_tools_and_strays_are_said(tmp_path: Path) -> None:
 def test_a_tool_that_only_observes_leaves_nothing_open(tmp_path: Path) -> None:
     seen = graph(talks(), node("/_ros2cli_daemon", like="c++", enclave="/", participant="p2"))
     found = audited(tmp_path, TALKER, seen)
-    assert (ids(found), found.complete) == (["audit.tool"], True)
+    assert (ids(found), found.unjudged) == (["audit.tool"], ())
 
 
 def test_a_node_without_an_endpoint_is_not_judged(tmp_path: Path) -> None:
@@ -241,7 +241,7 @@ def test_a_node_without_an_endpoint_is_not_judged(tmp_path: Path) -> None:
     found = audited(tmp_path, TALKER, seen)
     assert ids(found) == ["audit.tool", "audit.silent"]
     assert found.unjudged == ("1 node without endpoint (/mute)",)
-    assert found.allowed and not found.complete
+    assert found.allowed and found.unjudged
 
 
 HALL = {"/t": {"/talker": ["publish chatter"], "/hall/a": []}, "/h": {"/hall/[ab]*": []}}
@@ -273,7 +273,7 @@ def test_nodes_that_were_not_seen(
 ) -> None:
     found = audited(tmp_path, enclaves, graph(*nodes))
     assert list(map(str, found.unseen)) == unseen
-    assert found.complete is not bool(unseen)
+    assert not found.unjudged
 
 
 def test_topics_without_a_ros_name_are_judged_and_never_added(tmp_path: Path) -> None:
@@ -377,7 +377,7 @@ def test_permissions_know_their_nodes_by_the_services_that_these_offer(
     )
     found = audit(seen, of_keystore(keystore))
     assert [line.partition(":")[0] for line in said(found)] == denied
-    assert found.complete
+    assert not (found.unseen or found.unjudged)
 
 
 def test_a_keystore_tells_which_of_its_nodes_were_not_seen(keystore: Path, tmp_path: Path) -> None:
