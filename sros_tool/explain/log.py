@@ -1082,7 +1082,7 @@ def _nothing_found(enclave: LoadedEnclave) -> str:
 def _in_ros_terms(denial: Denial) -> tuple[str, str, str]:
     """Return the denied operation (one of `answer.WORDS`, or "use"), the ROS name, and its type.
 
-    A topic or a service of an action is told as the action.
+    A topic or a service of an action counts as the action.
     """
     right, name = right_to_use(denial.topic, writes=denial.direction == PUBLISH)
     if not name.startswith("/"):

@@ -1113,19 +1113,17 @@ def test_each_cause_of_a_topic_has_its_own_lines(tmp_path: Path) -> None:
 
 
 def test_halves_of_services_and_parts_of_actions_are_told_as_these() -> None:
-    texts = {
-        "rq/addRequest topic not found in allow rule. -> check_create_datawriter": "call /add",
-        "rr/addReply topic not found in allow rule. -> check_create_datawriter": "serve /add",
-        "rq/go/_action/send_goalRequest topic not found in allow rule. "
-        "-> check_create_datareader": "execute action /go, of which "
-        "rq/go/_action/send_goalRequest is a part",
-        "rt/go/_action/status topic not found in allow rule. -> check_create_datareader": "call action /go, of which rt/go/_action/status is a part",
-        "rt/go/_action/feedback topic not found in allow rule. -> check_create_datawriter": "execute action /go, of which rt/go/_action/feedback is a part",
-        "rt/go/_action/path topic not found in allow rule. -> check_create_datawriter": "publish /go/_action/path",
-    }
-    for text, told in texts.items():
-        (found,) = explained(text)
-        assert f"may not {told}: " in found.cause, found
+    denied = "{} topic not found in allow rule. -> check_create_data{}"
+    for topic, creates, told in (
+        ("rq/addRequest", "writer", "call /add"),
+        ("rr/addReply", "writer", "serve /add"),
+        ("rq/go/_action/send_goalRequest", "reader", "execute action /go, of which {} is a part"),
+        ("rt/go/_action/status", "reader", "call action /go, of which {} is a part"),
+        ("rt/go/_action/feedback", "writer", "execute action /go, of which {} is a part"),
+        ("rt/go/_action/path", "writer", "publish /go/_action/path"),
+    ):
+        (found,) = explained(denied.format(topic, creates))
+        assert f"may not {told.format(topic)}: " in found.cause, found
 
 
 def test_json(tmp_path: Path) -> None:
