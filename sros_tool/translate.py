@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Set
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sros_tool.dds.decision.matching import ExpressionIndex
+from sros_tool.dds.decision.expressions import ExpressionIndex
 from sros_tool.dds.decision.vendors import Style
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes

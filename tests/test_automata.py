@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from sros_tool import automata
 from sros_tool.automata import ANY_LETTER, Automaton, Letters, NameSet, SearchLimit
-from sros_tool.dds.decision.expressions import names_of
-from sros_tool.dds.decision.matching import matches
+from sros_tool.dds.decision.expressions import matches, names_of
 from sros_tool.dds.decision.vendors import Style
 from sros_tool.errors import DocumentError
 from sros_tool.zenoh.key_expressions import expression_problem, includes

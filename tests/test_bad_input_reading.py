@@ -18,7 +18,7 @@ import pytest
 from lxml import etree
 
 from sros_tool.cli.common import MAX_LOG
-from sros_tool.dds.decision.matching import matches
+from sros_tool.dds.decision.expressions import matches
 from sros_tool.dds.decision.vendors import Style
 from sros_tool.terminal import visible, visible_json
 from tests.support.children import PATIENCE

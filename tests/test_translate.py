@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sros_tool.dds.decision.access import Access, AccessVerb, GovernedDomain, Outcome
-from sros_tool.dds.decision.matching import matches
+from sros_tool.dds.decision.expressions import matches
 from sros_tool.dds.decision.vendors import Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, TopicRule, attributes

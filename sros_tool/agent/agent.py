@@ -35,7 +35,7 @@ from sros_tool.agent.running import (
 )
 from sros_tool.agent.settings import AgentSettings, agent_folder
 from sros_tool.agent.state import mark_outdated, read_seal, read_state, write_seal, write_state
-from sros_tool.checks.keystores.installed import (
+from sros_tool.checks.keystores.arrival import (
     InstalledEnclave,
     exposed_keys,
     exposed_sentences,

@@ -130,7 +130,7 @@ def _report(folder: Path, robot: str) -> None:
             sros fleet confirm keystore --robot r7 -
     """
     from sros_tool.agent.state import read_state
-    from sros_tool.checks.keystores.installed import installed_sentences
+    from sros_tool.checks.keystores.arrival import installed_sentences
     from sros_tool.keystore.confirmation import (
         make_confirmation,
         render_confirmation,

@@ -23,14 +23,13 @@ from typing import Annotated, NamedTuple
 
 from sros_tool.automata import NameSet, SearchLimit
 from sros_tool.dds.decision.access import Access, AccessVerb, GovernedDomain
-from sros_tool.dds.decision.expressions import names_of
+from sros_tool.dds.decision.expressions import ExpressionIndex, matches, names_of
 from sros_tool.dds.decision.grants import (
     ComparisonCrash,
     certified_text,
     other_fitting_enclaves,
     same_subject,
 )
-from sros_tool.dds.decision.matching import ExpressionIndex, matches
 from sros_tool.dds.decision.vendors import TESTED, Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance

@@ -16,8 +16,8 @@ from shlex import quote
 
 from sros_tool.automata import NameSet
 from sros_tool.dds.decision.access import Access, AccessVerb, GovernedDomain
+from sros_tool.dds.decision.expressions import matches
 from sros_tool.dds.decision.grants import other_fitting_enclaves
-from sros_tool.dds.decision.matching import matches
 from sros_tool.dds.decision.vendors import TESTED, Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, TopicRule, parse_governance

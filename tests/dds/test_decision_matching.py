@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sros_tool.automata import Letters
 from sros_tool.dds.decision import expressions as vendor_expressions
-from sros_tool.dds.decision.matching import ExpressionIndex, matches
+from sros_tool.dds.decision.expressions import ExpressionIndex, matches
 from sros_tool.dds.decision.vendors import Style
 from tests.support.children import LONG
 

@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from sros_tool.dds.decision.access import Access, AccessVerb, GovernedDomain
-from sros_tool.dds.decision.matching import matches
+from sros_tool.dds.decision.expressions import matches
 from sros_tool.dds.decision.vendors import CYCLONE_DDS, Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import (

@@ -18,7 +18,7 @@ from random import Random
 import pytest
 
 from sros_tool.dds.decision.access import AccessVerb
-from sros_tool.dds.decision.matching import matches
+from sros_tool.dds.decision.expressions import matches
 from sros_tool.dds.decision.vendors import TESTED, Style
 from sros_tool.errors import DocumentError, UsageError
 from sros_tool.fleet.fleet_file import read_fleet

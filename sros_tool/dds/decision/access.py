@@ -16,8 +16,8 @@ from itertools import groupby, takewhile
 from string import ascii_letters, digits
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
+from sros_tool.dds.decision.expressions import ExpressionIndex, matches
 from sros_tool.dds.decision.grants import ComparisonCrash, certified_text, read_moment, same_subject
-from sros_tool.dds.decision.matching import ExpressionIndex, matches
 from sros_tool.dds.decision.vendors import (
     DenyPartitions,
     Moments,

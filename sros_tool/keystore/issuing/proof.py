@@ -27,8 +27,8 @@ from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 
 from sros_tool.dds.decision.access import Access, AccessVerb, GovernedDomain, Outcome
-from sros_tool.dds.decision.matching import ExpressionIndex
-from sros_tool.dds.decision.matching import matches as dds_matches
+from sros_tool.dds.decision.expressions import ExpressionIndex
+from sros_tool.dds.decision.expressions import matches as dds_matches
 from sros_tool.dds.decision.vendors import Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule, settings
