@@ -17,6 +17,7 @@ Figure = tuple[str, float, str, bool]
 def checking(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Figure]:
     """Measure the checks of a keystore with this number of enclaves, and of rules in each."""
     from sros_tool.checks.keystores.keystore import keystore_findings
+    from sros_tool.checks.keystores.opened import Circumstances
     from sros_tool.checks.kind import WARNING
     from sros_tool.checks.policies import policy_file_findings
     from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
@@ -32,11 +33,11 @@ def checking(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Figur
     generate_artifacts(root, policies=[policy], now=now)
 
     def keystore() -> None:
-        found = keystore_findings(OpenedKeystore(root), now=now)
+        found = keystore_findings(OpenedKeystore(root), Circumstances(now))
         assert not [each for each in found if each.severity >= WARNING]
 
     def with_policy() -> None:
-        found = keystore_findings(OpenedKeystore(root), now=now, policies=(policy,))
+        found = keystore_findings(OpenedKeystore(root), Circumstances(now, policies=(policy,)))
         assert not [each for each in found if each.severity >= WARNING]
 
     measured = (

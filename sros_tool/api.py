@@ -764,8 +764,9 @@ def check(
         >>> for finding in sros_tool.check("ks"):
         ...     print(finding.place, finding.id, finding.text, finding.remedy)
     """
+    from sros_tool.checks.keystores.opened import Circumstances
     from sros_tool.checks.kind import FindingFilter, Severity
-    from sros_tool.checks.targets import Circumstances, path_findings
+    from sros_tool.checks.targets import path_findings
     from sros_tool.distributions import find_distribution
     from sros_tool.fleet.expansion import read_policy_for
     from sros_tool.fleet.fleet_file import read_fleet

@@ -27,6 +27,7 @@ import pytest
 import sros_tool
 from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.files import _follow_own_links, replace_file, staged_file
 from sros_tool.folders import Folder
@@ -198,7 +199,7 @@ def test_no_verb_is_recommended_over_a_made_up_stage(
     name: str, keystore: Path, outside: Path
 ) -> None:
     MADE_UP[name](stage(keystore), outside)
-    found = keystore_findings(OpenedKeystore(keystore), now=NOW)
+    found = keystore_findings(OpenedKeystore(keystore), Circumstances(NOW))
     (of_stage,) = [each for each in found if Path(each.file).name == STAGE]
     assert of_stage.kind.id == "keystore.transaction-not-ours"
     assert "create_enclave" not in of_stage.kind.remedy
@@ -805,7 +806,7 @@ def test_the_name_of_a_file_becomes_no_command_in_a_remedy(keystore: Path) -> No
         (odd / "enclaves/a" / name).write_bytes(damage)
     (odd / "public/identity_ca.cert.pem").unlink()
     found_there = [
-        *keystore_findings(OpenedKeystore(odd), now=NOW),
+        *keystore_findings(OpenedKeystore(odd), Circumstances(NOW)),
         *verify_arrival(odd, now=NOW).findings,
     ]
     commands = [each for found in found_there for each in re.findall("`(.+?)`", found.remedy)]
@@ -821,7 +822,9 @@ def test_a_file_of_the_kernel_is_not_read(keystore: Path) -> None:
     certificate = keystore / "enclaves/a/cert.pem"
     certificate.unlink()
     certificate.symlink_to("/proc/kmsg")
-    found = {each.kind.id for each in keystore_findings(OpenedKeystore(keystore), now=NOW)}
+    found = {
+        each.kind.id for each in keystore_findings(OpenedKeystore(keystore), Circumstances(NOW))
+    }
     assert {"enclave.file-empty", "enclave.file-unreadable"} & found
 
 

@@ -12,6 +12,7 @@ from datetime import datetime, tzinfo
 from pathlib import Path
 
 from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.checks.zenoh import MALFORMED, document_findings
 from sros_tool.dds.domains import DomainSet
@@ -306,7 +307,7 @@ def _enclave_findings(
     if sourced and stated and sourced not in stated:
         text = f"{value_text(environment, ROS_DISTRO)}; {name} is for {', '.join(stated)}"
         yield OTHER_DISTRIBUTION.found(ROS_DISTRO, text)
-    findings = keystore_findings(keystore, now=now, zone=zone, domain=domain, only_enclaves=(name,))
+    findings = keystore_findings(keystore, Circumstances(now, zone, domain), only_enclaves=(name,))
     for finding in findings:
         if finding.id == "enclave.governance-domain":
             yield DOMAIN_NOT_GOVERNED.found(DOMAIN, finding.text, finding.file)

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 
 from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.kind import Finding
-from sros_tool.dds.advisories import Advisory
 from sros_tool.dds.decision.vendors import ZENOH
 from sros_tool.errors import DocumentError
-from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.layout import (
     KEY_URI_FILE,
     PERMISSIONS_FILE,
@@ -23,38 +20,9 @@ from sros_tool.keystore.layout import (
     refuse_earlier,
 )
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.policy.model import Policy
 from sros_tool.xml import read_bytes
 
 _ENCLAVE_FILES = (*REQUIRED_FILES, KEY_URI_FILE, "permissions.xml", "crl.pem", "request.pem")
-
-
-@dataclass(frozen=True, slots=True)
-class Circumstances:
-    """The moment, time zone and other conditions of a check; see `keystore_findings`.
-
-    ``distribution`` is the ROS 2 distribution of the nodes of policies; "" is the latest.
-    ``vendors`` are the DDS vendors of the nodes, or ``zenoh``; () if they may use any.
-    ``fleet`` has the robots that placeholders in policies stand for.  ``opened`` has the
-    keystores that are already open, by path.  ``advisories`` are known DDS vulnerabilities; None
-    for those that ship with sros.  ``sample`` are the enclaves of a keystore that are checked with
-    the keystore itself; None for all.
-    """
-
-    now: datetime
-    zone: tzinfo = UTC
-    domain: int | None = None
-    policies: tuple[Policy, ...] = ()
-    distribution: str = ""
-    vendors: tuple[str, ...] = ()
-    fleet: Fleet | None = None
-    advisories: tuple[Advisory, ...] | None = None
-    sample: Sequence[str] | None = None
-    opened: dict[Path, OpenedKeystore] = field(default_factory=dict, repr=False, compare=False)
-
-    def keystore(self, root: Path) -> OpenedKeystore:
-        """Return the keystore at a path; opened once and used for all checks of it."""
-        return self.opened.setdefault(root, OpenedKeystore(root))
 
 
 def path_findings(paths: Iterable[Path], circumstances: Circumstances) -> list[Finding]:
@@ -152,15 +120,5 @@ def findings_in_keystore(
     root: Path, circumstances: Circumstances, only: str | None = None
 ) -> list[Finding]:
     """Return findings about a keystore or an export, or about one enclave of it."""
-    return keystore_findings(
-        circumstances.keystore(root),
-        now=circumstances.now,
-        zone=circumstances.zone,
-        domain=circumstances.domain,
-        policies=circumstances.policies,
-        fleet=circumstances.fleet,
-        distribution=circumstances.distribution,
-        vendors=circumstances.vendors,
-        only_enclaves=None if only is None else (only,),
-        sample=circumstances.sample,
-    )
+    enclaves = None if only is None else (only,)
+    return keystore_findings(circumstances.keystore(root), circumstances, only_enclaves=enclaves)

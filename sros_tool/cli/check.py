@@ -61,8 +61,8 @@ from sros_tool.values import file_change, shows, versioned
 from sros_tool.wording import counted
 
 if TYPE_CHECKING:
+    from sros_tool.checks.keystores.opened import Circumstances
     from sros_tool.checks.kind import ChosenFindings, Finding, FindingFilter
-    from sros_tool.checks.targets import Circumstances
     from sros_tool.dds.advisories import Advisory
     from sros_tool.demo.doctor import Diagnosis, SecurityProvider
     from sros_tool.distributions import Distribution
@@ -507,7 +507,7 @@ def _circumstances(
 
     Without --fleet, the fleet of the only keystore counts, if there are policies.
     """
-    from sros_tool.checks.targets import Circumstances
+    from sros_tool.checks.keystores.opened import Circumstances
     from sros_tool.cli.common import local_zone
     from sros_tool.keystore.layout import is_keystore
 
@@ -548,12 +548,7 @@ def _stated_differences(paths: Sequence[Path], circumstances: Circumstances) -> 
         if enclaves_of_several_distributions(keystore):
             from sros_tool.proof.upgrade import check_distributions
 
-            yield from check_distributions(
-                keystore,
-                moment=circumstances.now,
-                zone=circumstances.zone,
-                domain=circumstances.domain,
-            )
+            yield from check_distributions(keystore, circumstances)
 
 
 def _nodes_of(distro: Distribution | None, *, all_distros: bool) -> str:
@@ -1016,6 +1011,7 @@ def metrics(
     """
     from sros_tool.checks.formats import keystore_metrics
     from sros_tool.checks.keystores.keystore import keystore_findings
+    from sros_tool.checks.keystores.opened import Circumstances
     from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.prometheus import KeystoreMetrics, render_metrics
 
@@ -1031,9 +1027,8 @@ def metrics(
     wanted = tuple(policy_for(policy, fleet_file) for policy in policies)
     with progress("examining"):
         keystore = OpenedKeystore(root)
-        findings = keystore_findings(
-            keystore, now=moment, zone=local_zone(os.environ), policies=wanted
-        )
+        circumstances = Circumstances(moment, local_zone(os.environ), policies=wanted)
+        findings = keystore_findings(keystore, circumstances)
         gauges = keystore_metrics(keystore, findings, now=moment, each_enclave=not earliest)
         gauges += _process_metrics(moment, known) if runtime else ()
     text = render_metrics(gauges)

@@ -27,10 +27,11 @@ from sros_tool.checks.keystores.issued import (
     NOT_IN_POLICY,
     STALE,
 )
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.kind import WARNING, ChosenFindings, Finding, FindingFilter
 from sros_tool.checks.policies import is_mended_by
 from sros_tool.checks.requirements import DROPPED, VACUOUS
-from sros_tool.checks.targets import Circumstances, path_findings, policy_findings
+from sros_tool.checks.targets import path_findings, policy_findings
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
 from sros_tool.files import policies_dir

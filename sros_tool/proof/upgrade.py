@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, tzinfo
+from datetime import UTC
 from pathlib import Path
 from typing import NamedTuple
 
 from sros_tool.checks.keystores.enclaves import fault_remedy
 from sros_tool.checks.keystores.keystore import with_joined_findings
-from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
+from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore, Circumstances
 from sros_tool.checks.keystores.topic_names import names_without_wildcards
 from sros_tool.checks.keystores.vendors import (
     evaluate,
@@ -23,7 +23,7 @@ from sros_tool.checks.keystores.vendors import (
     with_start_finding,
 )
 from sros_tool.checks.kind import Finding, FindingKind
-from sros_tool.checks.targets import Circumstances, policy_findings
+from sros_tool.checks.targets import policy_findings
 from sros_tool.checks.upgrade import (
     ACCEPTED,
     BUFFERS,
@@ -88,25 +88,23 @@ _ZENOH = "zenoh"
 class DecidedFiles:
     """The enclaves of a keystore or policy, with what is needed to decide on them.
 
-    ``domains`` are the ROS domains to decide for; None for example domains from the documents of
-    each enclave.  ``keystore`` is None for a policy, whose file is ``file``.  ``chosen`` are the
+    Without a ROS domain in ``at``, example domains from the documents of each enclave count.
+    ``keystore`` is None for a policy, whose file is ``file``.  ``chosen`` are the
     enclaves to decide on; None for all.
     """
 
     file: str
     enclaves: Mapping[str, LoadedEnclave]
     source: AccessSource
-    at: datetime
-    zone: tzinfo = UTC
-    domain: int | None = None
+    at: Circumstances
     keystore: OpenedKeystore | None = None
     unique_subjects: bool = False
     chosen: frozenset[str] | None = None
 
     def domains(self, enclave: LoadedEnclave) -> tuple[int, ...]:
         """Return the ROS domains for which to decide on an enclave."""
-        if self.domain is not None:
-            return (self.domain,)
+        if self.at.domain is not None:
+            return (self.at.domain,)
         return example_domains(enclave.state) if enclave.state else (0,)
 
     def fitting_others(self, vendor: Vendor) -> Mapping[str, tuple[str, ...]]:
@@ -140,9 +138,7 @@ class DecidedFiles:
         return f"{self.keystore.folder(enclave)}/{file}" if self.keystore else self.file
 
 
-def signed_files(
-    keystore: OpenedKeystore, *, moment: datetime, zone: tzinfo = UTC, domain: int | None = None
-) -> DecidedFiles:
+def signed_files(keystore: OpenedKeystore, at: Circumstances) -> DecidedFiles:
     """Return the enclaves of a keystore with their signed files.
 
     Raises:
@@ -152,28 +148,25 @@ def signed_files(
     keystore.check()
     names = enclave_names(keystore.root, hidden=True)
     source = load_rights(keystore, hidden=True)
-    enclaves = {name: deciding_enclave(keystore, name, moment=moment) for name in names}
+    enclaves = {name: deciding_enclave(keystore, name, moment=at.now) for name in names}
     side = AccessSource(str(keystore.root), "keystore", source.rights, source.documents)
-    return DecidedFiles(str(keystore.root), enclaves, side, moment, zone, domain, keystore)
+    return DecidedFiles(str(keystore.root), enclaves, side, at, keystore)
 
 
-def _planned_files(policy: Policy, *, moment: datetime, domain: int | None = None) -> DecidedFiles:
+def _planned_files(policy: Policy, at: Circumstances) -> DecidedFiles:
     """Return the enclaves of a policy as they would be signed, with the default template."""
-    template = load_template(DEFAULT_TEMPLATE)
-    domains = DomainSet.of((domain or 0, domain or 0))
+    template, domain = load_template(DEFAULT_TEMPLATE), at.domain or 0
+    domains = DomainSet.of((domain, domain))
     protection = with_stated(template.protection, stated_protections(policy.enclaves))
     governance = governance_for(protection, domains)
     enclaves = {
-        enclave.path: plan_enclave(enclave, governance, moment=moment)
+        enclave.path: plan_enclave(enclave, governance, moment=at.now)
         for enclave in policy.enclaves
     }
     permissions = {name: loaded.portable for name, loaded in enclaves.items() if loaded.portable}
     side = AccessSource(policy.file, "policy", policy_rights(policy), permissions)
-    return DecidedFiles(
-        *(policy.file, enclaves, side, moment),
-        domain=domain,
-        unique_subjects=template.unique_subject,
-    )
+    at = replace(at, zone=UTC)
+    return DecidedFiles(policy.file, enclaves, side, at, unique_subjects=template.unique_subject)
 
 
 # ── the update ─────────────────────────────────────────────────────────────────────────────
@@ -215,18 +208,9 @@ def check_upgrade(
         DocumentError: a file cannot be read, or there are too many wildcards to decide.
     """
     if is_keystore(path):
-        files = signed_files(
-            circumstances.keystore(path),
-            moment=circumstances.now,
-            zone=circumstances.zone,
-            domain=circumstances.domain,
-        )
+        files = signed_files(circumstances.keystore(path), circumstances)
     else:
-        files = _planned_files(
-            read_policy_for(path, circumstances.fleet),
-            moment=circumstances.now,
-            domain=circumstances.domain,
-        )
+        files = _planned_files(read_policy_for(path, circumstances.fleet), circumstances)
     findings: list[Finding] = []
     by_distribution = _present_distributions(files, present, here, later)
     for before, enclaves in by_distribution.items():
@@ -334,9 +318,7 @@ def _rights_needed_after(
     yield from (finding for finding in then if finding not in now)
 
 
-def check_distributions(
-    keystore: OpenedKeystore, *, moment: datetime, zone: tzinfo = UTC, domain: int | None = None
-) -> list[Finding]:
+def check_distributions(keystore: OpenedKeystore, at: Circumstances) -> list[Finding]:
     """Return findings on enclaves whose distributions decide differently.
 
     Raises:
@@ -344,7 +326,7 @@ def check_distributions(
     """
     if not (of_several := enclaves_of_several_distributions(keystore)):
         return []
-    files = signed_files(keystore, moment=moment, zone=zone, domain=domain)
+    files = signed_files(keystore, at)
     findings = []
     for names, enclaves in of_several.items():
         for before, after in _pairs([find_distribution(name) for name in names]):
@@ -401,7 +383,7 @@ def changes(files: DecidedFiles, before: Shipped, after: Shipped) -> Iterator[De
     for name, enclave in files.loaded_enclaves():
         numbers = files.domains(enclave)
         for number in numbers:
-            context = JoinContext(number, files.at, files.zone)
+            context = JoinContext(number, files.at.now, files.at.zone)
             where = f"on domain {number}, " if len(numbers) > 1 else ""
             sides = [
                 _Decided(
@@ -508,7 +490,7 @@ def _refusal(
     remedy = ""
     state, fault = files.enclaves[name].state, FAULTS.get(cause.reason)
     if files.keystore and state and fault:
-        view = CheckedKeystore(files.keystore, now=files.at, zone=files.zone)
+        view = CheckedKeystore(files.keystore, files.at)
         remedy = fault_remedy(CheckedEnclave(view, name, state), fault, cause.file)
     return DecisionChange(kind, name, text, files.place(name, cause.file), remedy)
 
@@ -533,11 +515,12 @@ def _nodes(files: DecidedFiles, before: Distribution, after: Distribution) -> It
             continue
         starting = []
         for distribution in (before, after):
-            view = CheckedKeystore(
-                files.keystore, now=files.at, zone=files.zone, distribution=distribution.name
-            )
+            at = replace(files.at, distribution=distribution.name)
+            view = CheckedKeystore(files.keystore, at)
             checked = CheckedEnclave(view, name, enclave.state)
-            starting.append(with_start_finding(evaluate(checked, after.vendors, files.domain), ()))
+            starting.append(
+                with_start_finding(evaluate(checked, after.vendors, files.at.domain), ())
+            )
         if not starting[0]:
             for finding in starting[1]:
                 text = f"in ROS 2 {after.title}, {finding.text}"

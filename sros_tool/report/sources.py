@@ -231,8 +231,9 @@ def _read(path: Path, fleet: Fleet | None, drawing: Drawing, title: str) -> Pict
     if source.origin.kind == "observation":
         text = "`sros check` does not check what was observed."
         return replace(source, findings=(*source.findings, _not_checked(text)))
+    from sros_tool.checks.keystores.opened import Circumstances
     from sros_tool.checks.policies import policy_file_findings
-    from sros_tool.checks.targets import Circumstances, path_findings
+    from sros_tool.checks.targets import path_findings
 
     at = Circumstances(
         drawing.now, drawing.zone, fleet=fleet, sample=sample.enclaves if sample else None

@@ -13,6 +13,7 @@ import pytest
 from cryptography import x509
 
 from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import make_request, pem
@@ -127,10 +128,11 @@ def _(bench: Bench) -> None:
 def test_the_cause_is_said(text: str, bench: Bench) -> None:
     finding, work = CAUSES[text]
     assert not any(
-        text in each.text for each in keystore_findings(OpenedKeystore(bench.root), now=bench.now)
+        text in each.text
+        for each in keystore_findings(OpenedKeystore(bench.root), Circumstances(bench.now))
     )
     work(bench)
-    found = keystore_findings(OpenedKeystore(bench.root), now=bench.now)
+    found = keystore_findings(OpenedKeystore(bench.root), Circumstances(bench.now))
     assert [each for each in found if each.id == finding and text in each.text], found
 
 
@@ -142,7 +144,9 @@ def test_only_the_name_of_another_enclave_is_a_wrong_name(
 ) -> None:
     """Other PKIs name enclaves in their own way, which no vendor compares with anything."""
     bench.issue(subject=name_of(("CN", said), ("OU", "1f")))
-    found = {each.id for each in keystore_findings(OpenedKeystore(bench.root), now=bench.now)}
+    found = {
+        each.id for each in keystore_findings(OpenedKeystore(bench.root), Circumstances(bench.now))
+    }
     assert ("enclave.name-mismatch" in found) == wrong
 
 
@@ -153,10 +157,10 @@ def test_an_archive_where_others_read_is_named(file: str, bench: Bench) -> None:
     """Twin: in the folder of the keys of CAs, a copy of them is where it belongs."""
     for folder, named in (("public", True), ("private", False)):
         bench.path(f"{folder}/{file}").write_bytes(b"\x1f\x8b")
-        found = keystore_findings(OpenedKeystore(bench.root), now=bench.now)
+        found = keystore_findings(OpenedKeystore(bench.root), Circumstances(bench.now))
         assert any(each.id == "keystore.archive" and folder in each.file for each in found) == named
     (bench.export() / file).write_bytes(b"\x1f\x8b")
-    found = keystore_findings(OpenedKeystore(bench.checked), now=bench.now)
+    found = keystore_findings(OpenedKeystore(bench.checked), Circumstances(bench.now))
     assert "keystore.archive" in {each.id for each in found}
 
 
@@ -166,7 +170,7 @@ def test_one_authority_is_named_where_no_file_of_a_ca_is(bench: Bench) -> None:
     (bench.export() / "private").mkdir(mode=0o700)
     found = [
         each
-        for each in keystore_findings(OpenedKeystore(bench.checked), now=bench.now)
+        for each in keystore_findings(OpenedKeystore(bench.checked), Circumstances(bench.now))
         if each.id == "keystore.one-authority" and not each.accepted
     ]
     assert found and all("In the keystore that has the CA keys" in each.remedy for each in found)
@@ -187,7 +191,7 @@ def test_a_folder_of_an_enclave_alone_can_be_checked_as_the_message_says(
 
 def test_enclaves_without_the_revocation_list_share_one_finding(bench: Bench) -> None:
     bench.revoke(linked=False)
-    found = keystore_findings(OpenedKeystore(bench.root), now=bench.now)
+    found = keystore_findings(OpenedKeystore(bench.root), Circumstances(bench.now))
     assert [finding.subject for finding in found if finding.id == "enclave.crl-missing"] == [
         "/arm, /base"
     ]

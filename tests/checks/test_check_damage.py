@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.policies import policy_file_findings
 from sros_tool.errors import KeystoreError
 from sros_tool.files import policies_dir
@@ -59,7 +60,7 @@ def test_damaged_keystores(seed: int, bench: Bench, tmp_path: Path) -> None:
         for path in chance.sample(files, chance.choice([1, 1, 2, 4])):
             damage(path, chance)
         try:
-            found = keystore_findings(OpenedKeystore(copy), now=bench.now)
+            found = keystore_findings(OpenedKeystore(copy), Circumstances(bench.now))
         except KeystoreError as error:
             assert "is not a valid keystore" in str(error)
             continue
@@ -104,8 +105,8 @@ PERMISSIONS = (
 @pytest.mark.parametrize("changes", PERMISSIONS)
 def test_odd_permissions(changes: tuple[tuple[str, str], ...], bench: Bench) -> None:
     bench.permissions(*changes)
-    assert keystore_findings(OpenedKeystore(bench.root), now=bench.now)
-    assert keystore_findings(OpenedKeystore(bench.root), now=bench.now + 9999 * DAY)
+    assert keystore_findings(OpenedKeystore(bench.root), Circumstances(bench.now))
+    assert keystore_findings(OpenedKeystore(bench.root), Circumstances(bench.now + 9999 * DAY))
 
 
 @pytest.mark.parametrize(
@@ -118,4 +119,4 @@ def test_odd_permissions(changes: tuple[tuple[str, str], ...], bench: Bench) -> 
 )
 def test_odd_governance(changes: tuple[tuple[str, str], ...], bench: Bench) -> None:
     bench.governance(*changes)
-    assert keystore_findings(OpenedKeystore(bench.root), now=bench.now)
+    assert keystore_findings(OpenedKeystore(bench.root), Circumstances(bench.now))

@@ -10,6 +10,7 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.kind import FindingFilter, group_by_cause
 from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.vendors import TESTED, Signers, Vendor, joined_titles
@@ -27,7 +28,7 @@ NOW = datetime.now(UTC)
 
 def ids(root: Path, now: datetime = NOW) -> list[str]:
     selection = FindingFilter(exclude=("enclave.node-cannot-start",))
-    chosen = selection.choose(keystore_findings(OpenedKeystore(root), now=now))
+    chosen = selection.choose(keystore_findings(OpenedKeystore(root), Circumstances(now)))
     return [each.id for each in chosen.shown]
 
 
@@ -119,7 +120,7 @@ def test_files_that_expire_soon_are_one_finding(tmp_path: Path) -> None:
     root = tmp_path / "ks"
     sros("create_keystore", root, "--template", "production").ok()
     sros("create_enclave", root, "/a", "/b").ok()
-    found = keystore_findings(OpenedKeystore(root), now=NOW + timedelta(days=160))
+    found = keystore_findings(OpenedKeystore(root), Circumstances(NOW + timedelta(days=160)))
     (soon,) = (group for group in group_by_cause(found) if group[0].id == "enclave.ends-soon")
     cause = soon[0].cause
     assert len(soon) == 2 and cause and "2 files of 2 enclaves, the first of /a" in cause.text
@@ -212,5 +213,7 @@ def test_local_time_is_standard_time_in_summer_too(
     )
     assert cyclone.join().outcome.ok
     assert fast.join().outcome.ok is not found
-    told = {each.id for each in keystore_findings(OpenedKeystore(root), now=at, zone=zone)}
+    told = {
+        each.id for each in keystore_findings(OpenedKeystore(root), Circumstances(at, zone=zone))
+    }
     assert ("enclave.permissions-local-time" in told) is found

@@ -13,6 +13,7 @@ import pytest
 
 from sros_tool.checks.keystores.issued import OLD_PERMISSIONS
 from sros_tool.checks.keystores.keystore import keystore_findings, with_joined_findings
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.kind import NOTE, Finding
 from sros_tool.dds.decision.vendors import FAST_DDS, joined_titles
 from sros_tool.keystore.issuing.keyring import Keyring
@@ -37,7 +38,11 @@ as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can act as sev
 
 def ids(bench: Bench) -> set[str]:
     options = {"now": bench.now, **bench.options}
-    return {each.id for each in keystore_findings(OpenedKeystore(bench.checked), **options)}
+    only = options.pop("only_enclaves", None)
+    found = keystore_findings(
+        OpenedKeystore(bench.checked), Circumstances(**options), only_enclaves=only
+    )
+    return {each.id for each in found}
 
 
 def test_nothing_in_a_sound_keystore(bench: Bench) -> None:
@@ -75,7 +80,7 @@ def test_a_remedy_that_needs_ca_keys_is_for_the_original_keystore(bench: Bench) 
 
     def remedy() -> str:
         options = {"now": bench.now, **bench.options}
-        found = keystore_findings(OpenedKeystore(bench.checked), **options)
+        found = keystore_findings(OpenedKeystore(bench.checked), Circumstances(**options))
         return next(each.remedy for each in found if each.id == "enclave.stale-permissions")
 
     assert f"`sros generate_artifacts -k {bench.root} -p POLICY_FILE`" in remedy()
@@ -163,7 +168,9 @@ def test_a_ca_key_elsewhere_that_others_can_read(mode: int, found: bool, tmp_pat
     root = tmp_path / "ks"
     create_keystore(root, template=template, now=NOW, keyring=Keyring(places=places))
     (tmp_path / "permissions.pem").chmod(mode)
-    shown = {(each.id, each.file) for each in keystore_findings(OpenedKeystore(root), now=NOW)}
+    shown = {
+        (each.id, each.file) for each in keystore_findings(OpenedKeystore(root), Circumstances(NOW))
+    }
     wanted = {("keystore.key-readable", str(tmp_path / "permissions.pem"))} if found else set()
     plain = {("keystore.ca-key-plain", place.removeprefix("file:")) for place in places.values()}
     assert shown == wanted | plain
@@ -209,7 +216,7 @@ def test_what_strangers_reach_is_said(
 ) -> None:
     bench.governance(("participants>false", "participants>true"))
     bench.sign("enclaves/governance.p7s", lambda text: _present(text, changes))
-    found = keystore_findings(OpenedKeystore(bench.checked), now=bench.now)
+    found = keystore_findings(OpenedKeystore(bench.checked), Circumstances(bench.now))
     assert words in next(each.text for each in found if each.id == "governance.unauthenticated")
 
 
@@ -307,7 +314,7 @@ def test_the_remedy_for_few_rounds_runs(elsewhere: bool, bench: Bench, tmp_path:
         key = moved_out(bench, tmp_path / "the key.pem")
     (found,) = (
         each
-        for each in keystore_findings(OpenedKeystore(bench.root), now=bench.now)
+        for each in keystore_findings(OpenedKeystore(bench.root), Circumstances(bench.now))
         if each.id == kind
     )
     command = found.remedy.removeprefix("Run `").removesuffix("`.")
@@ -345,14 +352,14 @@ def test_a_secret_that_kubernetes_mounts_hides_no_enclave(bench: Bench, tmp_path
     (mounted / "key.pem").chmod(0o600)
     assert [
         each
-        for each in keystore_findings(OpenedKeystore(robot), now=NOW)
+        for each in keystore_findings(OpenedKeystore(robot), Circumstances(NOW))
         if each.severity is not NOTE
     ] == []
     (enclave / "..2025_11_23_10_00_00.123").mkdir()
     (enclave / "..2025_11_23_10_00_00.123/cert.pem").write_bytes(b"")
     listed = sros("list_enclaves", robot).ok()
     assert "/base/..2025_11_23_10_00_00.123" in listed.err
-    found = keystore_findings(OpenedKeystore(robot), now=NOW)
+    found = keystore_findings(OpenedKeystore(robot), Circumstances(NOW))
     hidden = [each.subject for each in found if each.id == "keystore.hidden-enclave"]
     assert hidden == ["/base/..2025_11_23_10_00_00.123"]
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.keystores.topic_names import ros_name_problem
 from sros_tool.checks.kind import NOTE, Finding
 from sros_tool.dds.decision.vendors import TESTED, Vendor
@@ -38,7 +39,7 @@ UNCONTROLLED = (
 def found_in(bench: Bench, vendor: str = "") -> list[Finding]:
     """The findings about the changed permissions, but not that sros did not sign them."""
     found = keystore_findings(
-        OpenedKeystore(bench.checked), now=bench.now, vendors=vendor and (vendor,)
+        OpenedKeystore(bench.checked), Circumstances(bench.now, vendors=(vendor,) if vendor else ())
     )
     return [each for each in found if each.id != "keystore.not-in-ledger"]
 

@@ -18,6 +18,7 @@ import pytest
 
 from sros_tool import cli
 from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.kind import Finding, all_kinds
 from sros_tool.checks.policies import policy_file_findings
 from sros_tool.checks.runtime import RuntimeState, runtime_findings
@@ -97,7 +98,7 @@ def test_no_remedy_names_a_command_that_refuses(
     options = {"now": bench.now, **bench.options}
     found = [
         each
-        for each in keystore_findings(OpenedKeystore(bench.checked), **options)
+        for each in keystore_findings(OpenedKeystore(bench.checked), Circumstances(**options))
         if each.id == kind
     ]
     assert found

@@ -7,7 +7,8 @@ from itertools import combinations
 from pathlib import Path
 from shutil import rmtree
 
-from sros_tool.checks.targets import Circumstances, path_findings
+from sros_tool.checks.keystores.opened import Circumstances
+from sros_tool.checks.targets import path_findings
 from tests.support.harness import copy_of, sros
 
 FOUND = {

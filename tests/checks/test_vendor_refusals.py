@@ -15,6 +15,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.kind import ERROR, WARNING, Finding
 from sros_tool.dds.decision.vendors import TESTED, Signers, joined_titles
 from sros_tool.errors import PkiError
@@ -199,9 +200,10 @@ ABOUT_VENDORS = {"enclave.refused", "portable.refused"}
 
 def worst(bench: Bench, **options: object) -> list[Finding]:
     """The errors, or else the warnings, about what DDS loads, which the keystore did not issue."""
+    circumstances = Circumstances(bench.now, **options)  # type: ignore[arg-type]
     found = [
         each
-        for each in keystore_findings(OpenedKeystore(bench.checked), now=bench.now, **options)  # type: ignore[arg-type]
+        for each in keystore_findings(OpenedKeystore(bench.checked), circumstances)
         if each.severity >= WARNING
         and not each.id.startswith("keystore.")
         and each.id != "governance.not-as-settings"

@@ -15,6 +15,7 @@ import pytest
 
 from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.cli.common import chosen_enclaves
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
@@ -295,7 +296,7 @@ def test_keys_of_revoked_enclaves_are_kept_at_home(fleet: Path) -> None:
     (said,) = verify_arrival(fleet, now=NOW).findings
     assert "revoked/" in said.text
     assert "elete" not in said.remedy
-    kinds = {each.id for each in keystore_findings(OpenedKeystore(fleet), now=NOW)}
+    kinds = {each.id for each in keystore_findings(OpenedKeystore(fleet), Circumstances(NOW))}
     assert not kinds & {"keystore.home-or-robot", "keystore.ca-key-on-robot"}
 
 
@@ -311,7 +312,10 @@ def test_an_export_that_looks_like_home_is_found_with_its_ca_key(
             copy = shutil.copytree if source.is_dir() else shutil.copy
             copy(source, robot / name)
     verified = {each.id for each in verify_arrival(robot, now=NOW).findings}
-    checked = {each.id: each.remedy for each in keystore_findings(OpenedKeystore(robot), now=NOW)}
+    checked = {
+        each.id: each.remedy
+        for each in keystore_findings(OpenedKeystore(robot), Circumstances(NOW))
+    }
     assert "keystore.home-or-robot" in verified & set(checked)
     assert "keep the CA keys" in checked["keystore.home-or-robot"]
     if looks in ("public", "sros.toml", "whole"):

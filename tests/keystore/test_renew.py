@@ -14,6 +14,7 @@ import pytest
 
 from sros_tool import parallel
 from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.expiry import Threshold, parse_threshold, survey
@@ -203,7 +204,7 @@ def test_what_check_says_expires_soon_is_what_soon_renews(
     (life,), _ = survey(OpenedKeystore(root))
     for day, due in days.items():
         now = NOW + timedelta(days=day)
-        found = keystore_findings(OpenedKeystore(root), now=now)
+        found = keystore_findings(OpenedKeystore(root), Circumstances(now))
         assert any(finding.id == "enclave.ends-soon" for finding in found) is due
         assert life.due(parse_threshold("soon"), now) is due
 

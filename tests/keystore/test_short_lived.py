@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.files import policies_dir
 from sros_tool.keystore.expiry import survey
 from sros_tool.keystore.lifecycle.create import generate_artifacts
@@ -86,7 +87,7 @@ def test_its_expiry_is_accepted_and_that_of_others_is_found(days: float, tmp_pat
     at = datetime.now(UTC) + days * DAY
 
     def ids(*, accepted: bool) -> set[str]:
-        found = keystore_findings(OpenedKeystore(root), now=at)
+        found = keystore_findings(OpenedKeystore(root), Circumstances(at))
         return {each.id for each in found if bool(each.accepted) is accepted}
 
     late = ids(accepted=True)

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.kind import NOTE
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, SrosError, UsageError
@@ -117,7 +118,7 @@ def told(update: KeystoreUpdate) -> str:
 
 
 def found(root: Path) -> set[str]:
-    every = keystore_findings(OpenedKeystore(root), now=LATER)
+    every = keystore_findings(OpenedKeystore(root), Circumstances(LATER))
     return {each.id for each in every if each.kind.severity > NOTE} - {"enclave.node-cannot-start"}
 
 
@@ -293,7 +294,7 @@ def test_a_rule_that_would_never_apply_is_refused(root: Path, tmp_path: Path) ->
     sros("create_keystore", other := tmp_path / "other", "--template", template).ok()
     (finding,) = [
         each
-        for each in keystore_findings(OpenedKeystore(other), now=LATER)
+        for each in keystore_findings(OpenedKeystore(other), Circumstances(LATER))
         if each.id == "governance.unreachable-rule"
     ]
     assert not finding.accepted
@@ -458,7 +459,7 @@ def test_what_is_left_until_each_ca_has_its_own_key(tmp_path: Path) -> None:
         words = f"sros rotate_ca {root}{' --permissions' if stage == 'none' else ''} --next"
         (remedy,) = [
             each.remedy
-            for each in keystore_findings(OpenedKeystore(root), now=LATER)
+            for each in keystore_findings(OpenedKeystore(root), Circumstances(LATER))
             if each.id == "keystore.one-authority"
         ]
         assert re.findall("`(.+?)`", remedy) == [words]

@@ -14,7 +14,7 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 
-from sros_tool.checks.targets import Circumstances
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.cli.common import now
 from sros_tool.dds.advisories import parse_advisories
 from sros_tool.dds.decision.vendors import TESTED
@@ -245,7 +245,7 @@ def test_an_update_changes_nothing_of_shipped_policies(tmp_path: Path) -> None:
     first, *others = (
         Shipped(vendor.traits.product, vendor.release, vendor, SUPPORTED[0]) for vendor in TESTED
     )
-    files = signed_files(keystore, moment=now())
+    files = signed_files(keystore, Circumstances(now()))
     # Many wildcards take long, unless both vendors have the same style of them.
     few = files.only_for(name for name in keystore.names if not name.startswith("/operator"))
     for other in some(others, 1):
@@ -320,7 +320,7 @@ def test_nodes_of_a_later_distribution_need_more(bench: Bench) -> None:
 def test_a_keystore_says_for_which_distributions_it_is(bench: Bench) -> None:
     secret = {"SROS_CA_PASSPHRASE": SECRET}
     denied_status(bench, "base")
-    checked = partial(check_distributions, moment=bench.now)
+    checked = partial(check_distributions, at=Circumstances(bench.now))
     assert checked(OpenedKeystore(bench.root)) == []
     words = ("update_keystore", bench.root, "--set", "distributions=lyrical,jazzy")
     sros(*words, env=secret).ok()
@@ -340,9 +340,9 @@ def test_a_keystore_says_for_which_distributions_it_is(bench: Bench) -> None:
 def test_an_enclave_that_one_distribution_refuses(bench: Bench) -> None:
     words = ("update_keystore", bench.root, "--set", "distributions=jazzy,lyrical")
     sros(*words, env={"SROS_CA_PASSPHRASE": SECRET}).ok()
-    assert check_distributions(OpenedKeystore(bench.root), moment=bench.now) == []
+    assert check_distributions(OpenedKeystore(bench.root), Circumstances(bench.now)) == []
     expired_authority(bench)
-    (found,) = check_distributions(OpenedKeystore(bench.root), moment=bench.now)
+    (found,) = check_distributions(OpenedKeystore(bench.root), Circumstances(bench.now))
     assert found.id == "distribution.refused"
     assert found.text.startswith("Jazzy with Cyclone DDS 0.10 refuses it (permissions_ca.cert.pem")
 

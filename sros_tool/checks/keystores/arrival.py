@@ -18,7 +18,7 @@ from typing import Annotated, NamedTuple
 from sros_tool.checks.keystores.enclaves import WAITS
 from sros_tool.checks.keystores.files import KEY_READABLE, check_files
 from sros_tool.checks.keystores.keystore import keystore_findings
-from sros_tool.checks.keystores.opened import CheckedKeystore
+from sros_tool.checks.keystores.opened import CheckedKeystore, Circumstances
 from sros_tool.checks.kind import ERROR, Finding, FindingFilter, FindingKind
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
@@ -203,11 +203,10 @@ def verify_arrival(
         for enclave in enclaves
         if enclave.key_on_robot
     }
+    at = Circumstances(now, zone, domain, on_robot=True)
     findings = [
         finding
-        for finding in keystore_findings(
-            keystore, now=now, zone=zone, domain=domain, only_enclaves=only_enclaves, on_robot=True
-        )
+        for finding in keystore_findings(keystore, at, only_enclaves=only_enclaves)
         if not (finding.file in elsewhere and finding.id == _FILE_MISSING)
     ]
     if secrets:
@@ -316,11 +315,15 @@ def unusable_sentences(enclaves: Mapping[str, InstalledEnclave]) -> Iterator[str
             yield f"{name} {COULD_NOT_START}: {enclave.problem}."
 
 
+def _on_robot(folder: Path, now: datetime) -> CheckedKeystore:
+    return CheckedKeystore(OpenedKeystore(folder), Circumstances(now, on_robot=True))
+
+
 def exposed_sentences(folder: Path, now: datetime) -> Iterator[str]:
     """Yield sentences on files that others can read or change, as `sros verify` finds them."""
     paths: dict[tuple[str, str], list[str]] = {}
     try:
-        for finding in check_files(CheckedKeystore(OpenedKeystore(folder), now, on_robot=True)):
+        for finding in check_files(_on_robot(folder, now)):
             if finding.severity >= ERROR:
                 path = os.path.relpath(finding.file, folder)
                 paths.setdefault((finding.kind.title, finding.text), []).append(path)
@@ -334,7 +337,7 @@ def exposed_keys(folder: Path, now: datetime) -> frozenset[str]:
     """Return the paths, in ``folder``, of private keys that others can read, as far as known."""
     keys = set()
     with suppress(SrosError, OSError):
-        for finding in check_files(CheckedKeystore(OpenedKeystore(folder), now, on_robot=True)):
+        for finding in check_files(_on_robot(folder, now)):
             if finding.kind is KEY_READABLE:
                 keys.add(os.path.relpath(finding.file, folder))
     return frozenset(keys)

@@ -436,7 +436,7 @@ def _record_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
         yield NOT_AS_SETTINGS.found("settings", clause, file)
     file = keystore.shown(LEDGER)
     with suppress(SrosError):  # a ledger that cannot be read is unread
-        if behind := keystore.opened.ledger_file.clock_behind(keystore.now):
+        if behind := keystore.opened.ledger_file.clock_behind(keystore.at.now):
             yield CLOCK_BEHIND.found("clock", behind, file)
     for gap in keystore.ledger.gaps:
         yield LEDGER_DAMAGED.found("ledger", gap, file)
@@ -457,14 +457,14 @@ def _authority(
     name, validity = authority_text(certificate), validity_of(certificate)
     begin, end = iso(validity.not_before), iso(validity.not_after)
     remedy = _NEXT_CA if role == IDENTITY and _is_served(keystore) else ""
-    if not validity.contains(keystore.now):
+    if not validity.contains(keystore.at.now):
         text = f"{name} is valid from {begin} to {end}"
         yield CA_EXPIRED.found(subject, text, file, remedy=remedy)
-    elif validity.expires_soon_from(AUTHORITY_SOON) < keystore.now:
+    elif validity.expires_soon_from(AUTHORITY_SOON) < keystore.at.now:
         yield CA_EXPIRES_SOON.found(subject, f"{name} expires at {end}", file, remedy=remedy)
     for weak in filter(None, map(weakness, chain)):
         yield WEAK.found(subject, weak, file)
-    yield from _authority_findings(role, chain, keystore.now, subject, file)
+    yield from _authority_findings(role, chain, keystore.at.now, subject, file)
     yield from _ca_key_findings(keystore, role, certificate)
 
 
@@ -553,13 +553,13 @@ def _revocation_list_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
     crl, file = keystore.crl, keystore.shown(CRL)
     if keystore.is_original:
         with suppress(SrosError):  # a ledger or list that cannot be read is unread
-            if names := unlisted_revocations(keystore.opened, keystore.now):
+            if names := unlisted_revocations(keystore.opened, keystore.at.now):
                 text = f"it lacks certificates of {first_few(names, _SHOWN)}"
                 yield CRL_LACKS.found("revocation list", text, file)
     if crl is None:
         return
     remedy = _NEXT_LIST if _is_served(keystore) else ""
-    if crl.expires_soon_from() < keystore.now:
+    if crl.expires_soon_from() < keystore.at.now:
         text = f"it expires at {iso(crl.next_update)}, and DDS then refuses every participant"
         yield CRL_EXPIRES_SOON.found("revocation list", text, file, remedy=remedy)
     identity = keystore.authorities.get(IDENTITY, ())

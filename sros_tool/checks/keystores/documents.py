@@ -318,20 +318,19 @@ def _is_default(partition: str) -> bool:
 
 
 def _validity_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding]:
-    now, window = enclave.keystore.now, grant.validity
+    now, window = enclave.keystore.at.now, grant.validity
     if not window.contains(now):
         return
     text = f"they are valid from {grant.not_before} to {grant.not_after}"
     begin, end = (
-        read_moment(Moments.LOCAL, moment, enclave.keystore.zone)
+        read_moment(Moments.LOCAL, moment, enclave.keystore.at.zone)
         for moment in (grant.not_before, grant.not_after)
     )
     if begin is None or end is None:
         return  # TIME_FORMAT reports it
     if not begin <= int(now.timestamp()) <= end:
-        utc_dates = (
-            f"in {enclave.keystore.zone} Fast DDS reads these dates as {_utc(begin)} to {_utc(end)}"
-        )
+        zone, dates = enclave.keystore.at.zone, f"{_utc(begin)} to {_utc(end)}"
+        utc_dates = f"in {zone} Fast DDS reads these dates as {dates}"
         accepted = enclave.accepts_expiry if now.timestamp() > end else ""
         yield LOCAL_TIME.found(enclave.name, f"{text}, and {utc_dates}", file, accepted=accepted)
     elif now - _WEST < window.not_before or now + _EAST > window.not_after:

@@ -343,7 +343,7 @@ def _certificate_findings(
 def _expiry_findings(
     enclave: CheckedEnclave, certificate: x509.Certificate, grant: Grant | None
 ) -> Iterator[Finding]:
-    now, validity = enclave.keystore.now, validity_of(certificate)
+    now, validity = enclave.keystore.at.now, validity_of(certificate)
     windows = [("cert.pem", "the certificate", validity)]
     if grant:
         windows.append(("permissions.p7s", "the permissions", grant.validity))

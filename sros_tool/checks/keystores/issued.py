@@ -300,8 +300,8 @@ def check_issued(
     yield from _exported_governance_findings(keystore, summaries)
     yield from _revocation_list_findings(keystore, summaries)
     yield from _ledger_findings(keystore, summaries)
-    if keystore.policies:
-        wanted = {enclave.path for policy in keystore.policies for enclave in policy.enclaves}
+    if keystore.at.policies:
+        wanted = {enclave.path for policy in keystore.at.policies for enclave in policy.enclaves}
         root, missing = str(keystore.root), sorted(wanted.difference(keystore.names))
         if is_original_keystore(keystore.root):
             for name in missing:
@@ -315,7 +315,7 @@ def check_issued(
 def _lower_protection_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
     """Yield findings about names that the governance protects less than a policy demands."""
     stated = stated_protections(
-        enclave for policy in keystore.policies for enclave in policy.enclaves
+        enclave for policy in keystore.at.policies for enclave in policy.enclaves
     )
     if not stated:
         return
@@ -428,7 +428,7 @@ def _ledger_findings(
         if entry.what == "permissions":
             signed[entry.enclave].append(entry.sha256)
     with suppress(SrosError):  # as above
-        for name, expiry in sorted(removed_enclaves(keystore.opened, keystore.now).items()):
+        for name, expiry in sorted(removed_enclaves(keystore.opened, keystore.at.now).items()):
             text = f"the ledger has a certificate that is valid until {expiry}"
             yield REMOVED.found(name, text, keystore.shown(LEDGER))
     for summary in summaries:
@@ -469,7 +469,7 @@ def check_policy(
         return
     if grant is None:
         return
-    robot = robot_of(enclave.keystore.robots, name) if enclave.keystore.robots else None
+    robot = robot_of(enclave.keystore.at.fleet, name) if enclave.keystore.at.fleet else None
     if robot and robot.domain is not None:
         signed, stated = grant.domains().closed(), DomainSet.of((robot.domain, robot.domain))
         if signed != stated:
@@ -501,7 +501,7 @@ def _is_plain_router(enclave: CheckedEnclave, grant: Grant | None) -> bool:
 def wanted_rights(keystore: CheckedKeystore) -> dict[str, frozenset[Right]]:
     """Map each enclave of the given policies to its rights."""
     rights_by_enclave: dict[str, frozenset[Right]] = {}
-    for policy in keystore.policies:
+    for policy in keystore.at.policies:
         rights = defaultdict(set)
         for right in policy_rights(policy):
             rights[right.enclave].add(right)

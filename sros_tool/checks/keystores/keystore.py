@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from shlex import quote
 
@@ -41,7 +40,7 @@ from sros_tool.checks.keystores.issued import (
     summary_of,
     wanted_rights,
 )
-from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
+from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore, Circumstances
 from sros_tool.checks.keystores.topic_names import check_capitals, names_without_wildcards
 from sros_tool.checks.keystores.vendors import (
     REFUSED,
@@ -53,12 +52,11 @@ from sros_tool.checks.keystores.vendors import (
     with_start_finding,
 )
 from sros_tool.checks.kind import WARNING, Cause, Finding, names_text
-from sros_tool.dds.decision.vendors import TESTED, ZENOH, Vendor
+from sros_tool.dds.decision.vendors import TESTED, Vendor
 from sros_tool.dds.governance import parse_governance
 from sros_tool.distributions import Distribution, find_distribution
 from sros_tool.errors import SrosError
 from sros_tool.faults import NEEDS_CA_KEYS, ORIGINAL_KEYSTORE, remedy_in_original_keystore
-from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import publish_command, stated_distributions
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
@@ -69,7 +67,6 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.reader import OpenedKeystore, read_consistently
 from sros_tool.parallel import map_slices, tick
-from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import Right
 from sros_tool.wording import counted, first_few
 
@@ -90,55 +87,23 @@ _OF_SEVERAL_FILES = frozenset(
 
 @read_consistently
 def keystore_findings(
-    opened: OpenedKeystore,
-    *,
-    now: datetime,
-    zone: tzinfo = UTC,
-    domain: int | None = None,
-    policies: tuple[Policy, ...] = (),
-    fleet: Fleet | None = None,
-    only_enclaves: Sequence[str] | None = None,
-    sample: Sequence[str] | None = None,
-    on_robot: bool = False,
-    distribution: str = "",
-    vendors: Sequence[str] = (),
+    opened: OpenedKeystore, at: Circumstances, *, only_enclaves: Sequence[str] | None = None
 ) -> list[Finding]:
     """Return all findings in a keystore, or in some of its enclaves.
 
-    Args:
-        opened: the keystore.
-        now: the moment to check for.
-        zone: the time zone of the host on which its enclaves run.
-        domain: the ROS domain that its enclaves have to join.
-        policies: policies with which its permissions are compared.
-        fleet: the robots that the policies are for, whose domains are compared, too.
-        only_enclaves: the enclaves to check; None for all of them and the keystore itself.
-        sample: without ``only_enclaves``, the enclaves to check with the keystore itself; None for
-            all.
-        on_robot: whether the keystore is on a robot, where it must not have a CA key.
-        distribution: the ROS 2 distribution of its nodes, such as ``humble``; "" is the latest.
-        vendors: the DDS vendors of its nodes, or ``zenoh``; () if they may use any.
+    With ``only_enclaves``, only these are checked, and not the keystore itself.
 
     Raises:
         KeystoreError: the path of ``opened`` is not a keystore.
     """
     opened.check()
     root = opened.root
-    keystore = CheckedKeystore(
-        opened,
-        now=now,
-        zone=zone,
-        policies=policies,
-        robots=fleet,
-        on_robot=on_robot,
-        distribution=distribution,
-        on_zenoh=ZENOH in vendors,
-    )
-    checked = sample if only_enclaves is None else only_enclaves
+    keystore = CheckedKeystore(opened, at)
+    checked = at.sample if only_enclaves is None else only_enclaves
     names = keystore.names if checked is None else tuple(checked)
     wanted = wanted_rights(keystore)
-    asked = asked_vendors(vendors)
-    stated = {} if vendors else _stated_distributions(keystore, names)
+    asked = asked_vendors(at.vendors)
+    stated = {} if at.vendors else _stated_distributions(keystore, names)
     deciding = {
         name: _vendors_of(vendors_of_enclave) for name, vendors_of_enclave in stated.items()
     }
@@ -156,11 +121,11 @@ def keystore_findings(
         issued: list[EnclaveSummary] = []
         topics: dict[str, frozenset[str]] = {}
         for name in share:
-            state = opened.enclave(name, now=now, domain=domain)
+            state = opened.enclave(name, now=at.now, domain=at.domain)
             evaluation = evaluate(
                 CheckedEnclave(keystore, name, state),
                 deciding.get(name, asked),
-                domain,
+                at.domain,
                 stated.get(name, ()),
             )
             enclave = evaluation.enclave
@@ -169,7 +134,7 @@ def keystore_findings(
                 differs = any(finding.kind is DIFFERS for finding in findings)
                 shared = [] if differs else about_governance
                 findings += check_vendors(evaluation, [*about_authorities, *shared, *findings])
-            if not on_robot and name not in wanted:  # a policy knows more exactly of its nodes
+            if not at.on_robot and name not in wanted:  # a policy knows more exactly of its nodes
                 findings = with_start_finding(evaluation, findings)
             all_findings += findings
             if summary := summary_of(enclave):
@@ -194,7 +159,7 @@ def keystore_findings(
     topics = {name: names for *_, share in outcomes for name, names in share.items()}
     all_findings += check_capitals(topics)
     all_findings += zenoh_files.check_network(keystore, only_enclaves)
-    if policies:
+    if at.policies:
         from sros_tool.checks.policies import findings_in
 
         parts = [
@@ -206,9 +171,9 @@ def keystore_findings(
             )
             if only_enclaves is not None
             else policy
-            for policy in policies
+            for policy in at.policies
         ]
-        all_findings += findings_in(parts, distribution)
+        all_findings += findings_in(parts, at.distribution)
     real_root = os.path.realpath(root)
     located = (_with_real_file(finding, opened, real_root) for finding in all_findings)
     all_findings = with_causes(

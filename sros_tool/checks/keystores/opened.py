@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, tzinfo
@@ -14,6 +14,7 @@ from typing import NamedTuple, TypeVar
 from cryptography import x509
 
 from sros_tool.checks.kind import ERROR, FindingKind
+from sros_tool.dds.advisories import Advisory
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import Fleet
@@ -54,31 +55,47 @@ class UnreadablePart(NamedTuple):
     error: SrosError
 
 
+@dataclass(frozen=True, slots=True)
+class Circumstances:
+    """The moment, time zone and other conditions of a check."""
+
+    now: datetime
+    """The moment to check for."""
+    zone: tzinfo = UTC
+    """Time zone of the host on which enclaves run."""
+    domain: int | None = None
+    """The ROS domain that enclaves have to join."""
+    policies: tuple[Policy, ...] = ()
+    """Policies with which permissions are compared."""
+    distribution: str = ""
+    """ROS 2 distribution of the nodes, such as ``humble``; "" is the latest."""
+    vendors: tuple[str, ...] = ()
+    """DDS vendors of the nodes, or ``zenoh``; () if they may use any."""
+    fleet: Fleet | None = None
+    """The robots that placeholders in policies stand for, whose domains are compared, too."""
+    advisories: tuple[Advisory, ...] | None = None
+    """Known DDS vulnerabilities; None for those that ship with sros."""
+    sample: Sequence[str] | None = None
+    """The enclaves of a keystore that are checked with the keystore itself; None for all."""
+    on_robot: bool = False
+    """Whether a keystore is on a robot, where it must not have a CA key."""
+    opened: dict[Path, OpenedKeystore] = field(default_factory=dict, repr=False, compare=False)
+    """The keystores that are already open, by path."""
+
+    def keystore(self, root: Path) -> OpenedKeystore:
+        """Return the keystore at a path; opened once and used for all checks of it."""
+        return self.opened.setdefault(root, OpenedKeystore(root))
+
+
 @dataclass(frozen=True)
 class CheckedKeystore:
     """A view for checks of a keystore, or of an export of it for a robot.
 
     A file that exists and cannot be read counts as missing, and is listed in ``unread``.
-
-    Args:
-        opened: the keystore, or an export of it.
-        now: the moment to check for.
-        zone: the time zone of the host on which its enclaves run.
-        policies: policies with which its permissions are compared.
-        robots: the robots that the policies are for, whose domains are compared, too.
-        on_robot: whether the keystore is on a robot, where it must not have a CA key.
-        distribution: the ROS 2 distribution of its nodes; "" is the latest.
-        on_zenoh: whether its nodes use Zenoh.
     """
 
     opened: OpenedKeystore
-    now: datetime
-    zone: tzinfo = UTC
-    policies: tuple[Policy, ...] = ()
-    robots: Fleet | None = None
-    on_robot: bool = False
-    distribution: str = ""
-    on_zenoh: bool = False
+    at: Circumstances
     _unread: dict[str, UnreadablePart] = field(default_factory=dict)
 
     def _part(self, path: str, read: Callable[[], _Part], otherwise: _Part) -> _Part:
@@ -163,7 +180,7 @@ class CheckedKeystore:
     @property
     def is_original(self) -> bool:
         """Whether this is the original keystore with its CAs, and not on a robot."""
-        return self.looks_like_original and not self.on_robot
+        return self.looks_like_original and not self.at.on_robot
 
     @property
     def root(self) -> Path:
@@ -172,7 +189,7 @@ class CheckedKeystore:
 
     def enclave(self, name: str) -> OpenedEnclave:
         """Return an enclave of the keystore at the moment of the check."""
-        return self.opened.enclave(name, now=self.now)
+        return self.opened.enclave(name, now=self.at.now)
 
     @property
     def can_issue(self) -> bool:

@@ -168,12 +168,12 @@ def evaluate(
         distributions: the ROS 2 distributions that it is for, which findings name.
     """
     keystore = enclave.keystore
-    loaded = loaded_enclave(enclave.name, enclave.folder, enclave.state, moment=keystore.now)
+    loaded = loaded_enclave(enclave.name, enclave.folder, enclave.state, moment=keystore.at.now)
     numbers = (domain,) if domain is not None else example_domains(enclave.state)
     by_domain = {
         number: {
             vendor: VendorParticipant(
-                vendor, loaded, JoinContext(number, keystore.now, keystore.zone)
+                vendor, loaded, JoinContext(number, keystore.at.now, keystore.at.zone)
             )
             for vendor in vendors
         }
@@ -455,7 +455,7 @@ def with_start_finding(
     grant = grant_of(enclave)
     if grant is None or not is_for_ros(grant):
         return [*known_findings]
-    described = has_type_descriptions(enclave.keystore.distribution)
+    described = has_type_descriptions(enclave.keystore.at.distribution)
     if evaluation.portable and _states_all(grant):
         return [*known_findings]
     has_denials = any(not rule.allow for rule in grant.rules)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
+from sros_tool.dds.decision.vendors import ZENOH
 from sros_tool.errors import SrosError
 from sros_tool.faults import ORIGINAL_KEYSTORE, Fault
 from sros_tool.keystore.layout import PERMISSIONS, SESSION_FILE, SETTINGS, ZENOH_FILES
@@ -117,7 +118,7 @@ def check_own_zenoh(enclave: CheckedEnclave) -> Iterator[Finding]:
     if settings and settings.zenoh:
         return
     if not any(os.path.lexists(enclave.folder / file) for file in ZENOH_FILES):
-        if enclave.keystore.on_zenoh:
+        if ZENOH in enclave.keystore.at.vendors:
             yield _found(MISSING, enclave, f"{SESSION_FILE} is missing", SESSION_FILE)
         return
     from sros_tool.keystore.zenoh_files import open_zenoh  # most keystores have no such files
@@ -160,7 +161,7 @@ def check_network(
     except SrosError:  # a finding of each enclave
         return
     try:
-        drift = zenoh_drift(keystore.opened, network, domains, authorities[0], keystore.now)
+        drift = zenoh_drift(keystore.opened, network, domains, authorities[0], keystore.at.now)
     except SrosError as error:
         yield CANNOT_BE_MADE.found("zenoh", str(error), keystore.shown(SETTINGS))
         return
