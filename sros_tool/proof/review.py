@@ -661,11 +661,11 @@ class _Review:
         for path in self._unreviewed_keystores([*changed, *earlier]):
             if not self._has(self.head, str(Path(path) / ENCLAVES)):
                 continue  # the change deletes it, or it only has certificates of CAs
-            text = (
-                "is a keystore that changes and is not reviewed: name it with --keystore, or leave"
-            )
-            place = f"{ENCLAVES} --leave-out {PUBLIC}" if path == "." else quote(path)
-            lines.append((f"{text} it out with --leave-out {place}", path))
+            is_top = path == "."  # of which every file of the repository would be a part
+            review = "move it into a folder" if is_top else "name it with --keystore"
+            place = f"{ENCLAVES} --leave-out {PUBLIC}" if is_top else quote(path)
+            text = f"is a keystore that changes and is not reviewed: {review}, or leave it out with"
+            lines.append((f"{text} --leave-out {place}", path))
         for path in self._used_in_part(changed, reviewed, fleet):
             lines.append(("changes and is used only in part: the rest is not reviewed", path))
         for path in self._not_reviewed_users(changed):

@@ -986,6 +986,7 @@ def test_whether_a_keystore_is_signed_for_the_policies(
     changed = change.review("--policy", "robot.xml", "--keystore", "ks")
     assert changed.status == 1
     assert "'r1/export' is a keystore that changes and is not reviewed: name it" in changed.out
+    assert "'.' is a keystore that changes and is not reviewed: move it into" in changed.out
     assert "'ks' is a keystore" not in changed.out
     certificate = "enclaves/a/cert.pem"
     for file, new in (
