@@ -283,6 +283,7 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
             exceptions += f", without a process of {', '.join(missing)}"
         following = f"; next: bring {folder}/keystore to another machine: it has the CA keys"
         following = following if robot.keystore.exists() else ""
+        following += _elsewhere(robot, closed)
         echo(f"the robot is closed{exceptions}{_until(closed)}{following}", err=True)
     elif closed.proofs:
         accept = _ACCEPT if closed.is_proved(partial=True) else ""
@@ -294,7 +295,7 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
             stop = _started_together(processes)
             echo(f"stop {stop}, and start it with:" if stop else "start again with:")
             echo(f"  {command}")
-        echo(f"next: these commands, and then {ask}", err=True)
+        echo(f"next: these commands, and then {ask}{_elsewhere(robot, closed)}", err=True)
     else:
         steps = f"stop the robot, start each process by the commands in {robot.commands_file}"
         if closed.secured:
@@ -310,6 +311,7 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
             following = f"{steps}, and ask {ask}"
         if not closed.secured and rmws_without_security(robot, observed):
             following = "sros doctor, to find an RMW that enforces security, and set it"
+        following += _elsewhere(robot, closed)
         echo(f"{_state(closed, apply=apply)}{_until(closed)}; next: {following}", err=True)
 
 
@@ -350,6 +352,16 @@ def _state(closed: CloseState, *, apply: bool) -> str:
     }
     exceptions = ", ".join(f"{name} ({word})" for name, word in words.items())
     return f"the processes run in their enclaves{', except for ' * bool(words)}{exceptions}"
+
+
+def _elsewhere(robot: LocalRobot, closed: CloseState) -> str:
+    """Return which files other machines need now, if theirs are earlier: nobody here sees those."""
+    needed = ", ".join(f"{name} ({iso(of)})" for name, of in closed.needed_elsewhere.items())
+    return needed and (
+        f"; on other machines, files from before these times have to be replaced, and the process "
+        f"restarted: {needed}: sros distribute_key {shlex.quote(str(robot.keystore))} ENCLAVE "
+        "FOLDER --force"
+    )
 
 
 def _until(closed: CloseState) -> str:

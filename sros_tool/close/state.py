@@ -33,6 +33,7 @@ from sros_tool.runtime.processes import (
     process_origin,
 )
 from sros_tool.runtime.variables import STRATEGY
+from sros_tool.validity import time_of_file
 from sros_tool.values import DryRun, FileChanges, Words, shows
 from sros_tool.wording import first_few
 
@@ -266,6 +267,9 @@ class CloseState(NamedTuple):
     """The enclaves whose process is started by a unit, and does not run."""
     without: Sequence[str]
     """The enclaves of `--without`, of which no process has to run."""
+    needed_elsewhere: Mapping[str, datetime]
+    """The enclaves of other machines, and when their files in the keystore changed last, in UTC: a
+    machine that got earlier ones still trusts what was revoked since, and needs these."""
     valid_until: datetime | None
     """When the first enclave of the export expires, in UTC; null without an export."""
     denied: Sequence[str]
@@ -345,6 +349,11 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
         new=sorted(new),
         absent=sorted(absent - secured.keys()),
         without=robot.without,
+        needed_elsewhere={
+            name: time_of_file(max(times))
+            for name in sorted(robot.not_here)
+            if (times := _file_times(enclave_path(robot.keystore, name)))
+        },
         valid_until=_valid_until(robot),
         denied=(),
         newly_denied=(),
@@ -353,6 +362,11 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
         dry_run=False,
         changes=(),
     )
+
+
+def _file_times(folder: Path) -> Sequence[float]:
+    """Return when the files in a folder, and those that links in it name, changed last."""
+    return [file.stat().st_mtime for file in folder.glob("*") if file.is_file()]
 
 
 def _valid_until(robot: LocalRobot) -> datetime | None:

@@ -39,6 +39,7 @@ from sros_tool.runtime.processes import (
     process_origin,
     with_files,
 )
+from sros_tool.validity import iso, time_of_file
 from sros_tool.values import as_plain
 from tests.cli.test_json import Seen
 from tests.graph.fake_graph import Beside, graph
@@ -1311,6 +1312,14 @@ def test_what_is_exported_without_the_enclaves_of_other_machines(tmp_path: Path)
     assert exported == [("/a", "/sros_observer")]
     moved = observed.belonging_elsewhere(["/b"])
     assert [each.enclave for each in moved.processes] == ["/a"] and moved.not_here == ["/b"]
+    # What its machine has from before a revocation trusts the revoked key.
+    (shared := tmp_path / "crl.pem").touch()
+    os.utime(shared, (0, revoked := 1_800_000_000))
+    (folder := tmp_path / "keystore/enclaves/b").mkdir(parents=True)
+    (folder / "crl.pem").symlink_to(shared)
+    state_now = state.current_state(robot, None)
+    assert state_now.needed_elsewhere == {"/b": datetime.fromtimestamp(revoked, UTC)}
+    assert "restarted: /b (2027-01-15T08:00:00Z): sros distr" in close._elsewhere(robot, state_now)
 
 
 @sometimes("an_enclave_that_belongs_to_another_machine")
@@ -1331,7 +1340,12 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     )
     assert not (robot.folder / left).exists() and "/listener: process" not in ended.out
     robot.by_hand = {"/talker"}
+    sros("renew", "robot/keystore", "/talker", "--new-key", "--revoke-old", cwd=robot.folder).ok()
+    shared = robot.folder / "robot/keystore/public/identity_ca.crl.pem"
+    needed = f"restarted: /listener ({iso(time_of_file(shared.stat().st_mtime))}): sros distribute_"
+    assert needed in robot.close().err
     ended = robot.close("--proof")
+    assert needed in ended.err
     said = "1 enclave, and no open process in domain 0; of other machines: /listener\n"
     assert said in ended.out
     assert "differs from the signed permissions" not in ended.err
