@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from shlex import quote
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.keystores.opened import Circumstances
@@ -105,7 +106,13 @@ def _policies_at(path: Path) -> list[Path]:
     from sros_tool.policy.document import files_of_policies
 
     if not path.is_dir():
-        read_bytes(path, "file")
+        begin = read_bytes(path, "file")[:1000].lower()
+        if b"multipart/signed" in begin or b"<dds" in begin:
+            raise DocumentError(
+                f"'{path}' is a DDS Security document without its enclave",
+                "Its signature and its subject are checked with the files of the enclave.",
+                f"Name the folder of the enclave, or: `sros inspect {quote(str(path))}`.",
+            )
     if policies := list(files_of_policies(path)):
         return policies
     refuse_earlier(path)

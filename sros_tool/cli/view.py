@@ -26,13 +26,14 @@ from sros_tool.cli.common import (
     local_zone,
     now,
     print_json,
+    print_notes,
     progress,
     refuse_git_revision,
     robot_option,
     save,
     verb,
 )
-from sros_tool.errors import SrosError, UsageError
+from sros_tool.errors import Note, SrosError, UsageError
 from sros_tool.terminal import echo, echo_document
 from sros_tool.values import PlannedFiles, as_plain, file_change, versioned
 
@@ -234,6 +235,8 @@ def view(
     if written != "json":
         for line in picture.headlines:
             echo(line, err=True)
+    if written not in _WITH_FINDINGS:  # rights that DDS refuses would look like all others
+        print_notes([Note(f.id, f.text) for f in picture.findings if f.id.startswith("rights.")])
     if dry_run and as_json:
         changes = file_change(output, existed=output.exists()) if output else ()
         print_json(PlannedFiles(changes, ()))

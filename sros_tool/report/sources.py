@@ -705,12 +705,17 @@ def _without_paths(finding: PicturedFinding, places: Mapping[str, str]) -> Pictu
 
 
 def _file_names(path: Path) -> Mapping[str, str]:
-    """Map the path of a source, as given, absolute and resolved, to its file name.
+    """Map the paths of a source and its folder, as given, absolute and resolved, to their names.
 
     Longer paths come first, so that they are replaced before paths that they contain.
     """
-    places = sorted({str(path), str(path.absolute()), os.path.realpath(path)}, key=len)
-    return {place: _base_name(path) for place in reversed(places) if "/" in place and place != "/"}
+    places = {
+        place: _base_name(shown)
+        for shown in (path.parent, path)
+        for place in (str(shown), str(shown.absolute()), os.path.realpath(shown))
+        if "/" in place and place != "/"
+    }
+    return {place: places[place] for place in sorted(places, key=len, reverse=True)}
 
 
 def _without_path(text: str, places: Mapping[str, str]) -> str:

@@ -90,6 +90,26 @@ def test_a_folder_of_policies_has_the_findings_of_its_files(tmp_path: Path) -> N
     assert alone and value(policies)["findings"] == alone
 
 
+def test_permissions_alone_are_neither_verified_nor_a_broken_policy(
+    robot_keystore: Path, tmp_path: Path
+) -> None:
+    file, named = tmp_path / "lone.p7s", tmp_path / "permissions.p7s"
+    for copy in (file, named):
+        copy.write_bytes(next(robot_keystore.glob("enclaves/**/permissions.p7s")).read_bytes())
+    assert str(tmp_path) not in str(value(named))
+    found = value(file)["findings"]
+    assert [finding["id"] for finding in found] == ["rights.not-verified", "view.not-checked"]
+    assert "a DDS Security document without its enclave" in found[1]["text"]
+    checked = sros("check", file)
+    assert checked.status == 2 and "Name the folder of the enclave" in checked.err
+    (tmp_path / "permissions_ca.cert.pem").write_bytes(
+        (robot_keystore / "public/permissions_ca.cert.pem").read_bytes()
+    )
+    assert "note [rights." not in sros("view", file, "--format", "markdown").ok().err
+    file.write_bytes(file.read_bytes().replace(b"<topic>rt/", b"<topic>rt/x", 1))
+    assert "THE SIGNATURE DOES NOT VERIFY" in sros("view", file, "--format", "markdown").ok().err
+
+
 def test_a_keystore_tells_validity_protection_and_findings(robot_keystore: Path) -> None:
     found = value(robot_keystore)
     kinds = [v["kind"] for v in found["validities"]]
