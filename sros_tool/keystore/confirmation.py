@@ -1,7 +1,8 @@
 """Confirmations of robots: the digests of the enclave files that a robot says it has, and its DDS.
 
-A confirmation proves nothing: whoever controls the robot can write anything into it.  So it is read
-as hostile input, and only compared with what the keystore knows; no path in it is ever opened.
+A confirmation proves nothing: whoever controls the robot can write anything into the confirmation.
+So sros reads confirmations as hostile input, only compares them with what the keystore knows, and
+opens no path in a confirmation.
 `sros_tool/schemas/confirmation.json` describes the format.
 """
 
@@ -124,7 +125,7 @@ class RobotLibrary(NamedTuple):
     path: str
     """Path of the library on the robot."""
     seen: Seen
-    """Whether a running process has loaded the library, or it is only installed."""
+    """Whether a running process has loaded the library, or the library is only installed."""
 
 
 class RobotDds(NamedTuple):
@@ -151,7 +152,7 @@ class RunningFiles(StrEnum):
     EARLIER = "earlier"
     """At least one process still has earlier files, or runs in the enclave from another folder."""
     NOT_SEEN = "not_seen"
-    """No process of the enclave was seen: none runs, or it cannot be looked at."""
+    """No process of the enclave was seen: none runs, or its processes cannot be looked at."""
 
 
 class RobotClock(StrEnum):
@@ -178,15 +179,15 @@ class Confirmation:
     the confirmation does not state them.
 
     The other parts come from `sros agent`, and are None in a confirmation of another program.
-    ``sequence`` is higher in each message of a robot.  ``release`` is the number of the release
-    that is installed; 0 for none.  ``expiry`` and ``running`` map enclaves to when their files
-    expire, and to what their processes have loaded.  ``crl_restart`` are the enclaves of
-    ``restart`` whose processes may not have loaded the revocation list, if not all of them: the
-    others lack only their own new documents.  ``boot`` is a SHA-256 that is another one after each
-    start of the computer.  ``problems`` are short sentences, and
-    ``requests`` signing requests (PEM) for certificates that expire.  ``crl`` is the newest
-    revocation list (PEM) on the robot, if it may differ from the list that was published last: a
-    keystore that was restored from a backup learns from it what it has revoked since.
+    ``sequence`` is higher in each message of a robot.  ``release`` is the number of the installed
+    release; 0 for none.  ``expiry`` and ``running`` map enclaves to when their files expire, and to
+    the files that their processes have loaded.  ``crl_restart`` are the enclaves of ``restart``
+    whose processes may lack the revocation list, unless these are all: processes of the other
+    enclaves lack only their own new documents.  ``boot`` is a SHA-256 that changes with each start
+    of the computer.  ``problems`` are short sentences, and ``requests`` signing requests (PEM) for
+    certificates that expire.  ``crl`` is the newest revocation list (PEM) on the robot, if this
+    list may differ from the list that was published last: a keystore that was restored from a
+    backup learns its later revocations from the list.
     """
 
     robot: str
@@ -223,7 +224,7 @@ OLDER_THAN_INSTALLED = "which this robot has installed before"
 EXPIRED_METADATA = "The metadata in "
 OF_OTHER_CA = "is not sealed by a CA that this robot trusts"
 OF_SAME_NUMBER = "of the installed release, but other files"
-"""The agent's message on a release, or on published metadata, that it refuses."""
+"""The agent's message on a release, or on published metadata, that the agent refuses."""
 COULD_NOT_START = "could not start"
 """A robot's message on an enclave in which no process would start."""
 
@@ -323,7 +324,7 @@ def _confirmed_files(root: Path, folder: Folder, name: str) -> dict[str, bytes]:
 
 
 def certificate_digests(data: bytes) -> tuple[str, ...]:
-    """Return the SHA-256 of each certificate (DER) in a PEM file; damaged ones are left out."""
+    """Return the SHA-256 of the certificates (DER) in a PEM file, without damaged certificates."""
     digests = []
     for block in _PEM.finditer(data):
         try:
@@ -369,7 +370,7 @@ def _json(value: Mapping[str, Any]) -> bytes:
 
 
 def parse_confirmation(data: bytes, label: str) -> Confirmation:
-    """Return the confirmation in a JSON document; ``label`` names it in errors.
+    """Return the confirmation in a JSON document; ``label`` names the document in errors.
 
     Raises:
         DocumentError: the document is too large or not a confirmation; the error names the fault.
@@ -389,7 +390,7 @@ class LastMessage(NamedTuple):
     """The last message of a robot's agent that was verified."""
 
     sequence: int
-    """Its sequence number; later messages have higher numbers."""
+    """Sequence number of the message; later messages have higher numbers."""
     sha256: str
     """SHA-256 of the message."""
     enclave: str
@@ -417,7 +418,7 @@ class Received:
     """A confirmation, and when the keystore received it, by the clock of the keystore's machine.
 
     ``message`` is the last message of the robot's agent, also if a later confirmation came without
-    one; None if there never was one.
+    a message; None if the agent never sent a message.
     """
 
     confirmation: Confirmation
@@ -461,7 +462,7 @@ class KeptConfirmation(NamedTuple):
     """Number of files of these enclaves, without keys."""
     dry_run: DryRun
     changes: Sequence[FileChange]
-    """The file that was written, or would be with ``--dry-run``."""
+    """The file that was written; with ``--dry-run``, the file that would be written."""
     notes: Notes
 
 
@@ -490,7 +491,7 @@ def receive(data: bytes, robot: str, label: str, *, now: datetime) -> Received:
 def refuse_older(keystore: OpenedKeystore, received: Received) -> None:
     """Raise `DocumentError` if a report was made before the last confirmation of its robot.
 
-    If the last confirmation came before its own time, the clock of the robot was ahead then.
+    If the last confirmation was received before it was made, the robot's clock was ahead.
     """
     previous = None
     with suppress(DocumentError):  # a damaged file
@@ -528,8 +529,8 @@ def locked_confirmations(root: Path) -> Iterator[None]:
 def keep_confirmation(keystore: OpenedKeystore, received: Received) -> str:
     """Write a robot's confirmation to the keystore, replacing the previous one.
 
-    What is known of the last message of its agent stays.  The caller holds `locked_confirmations`.
-    Return its path relative to the keystore.
+    The last message of the robot's agent stays.  The caller holds `locked_confirmations`.  Return
+    the path of the confirmation, relative to the keystore.
     """
     robot = received.confirmation.robot
     path, message = confirmation_file(robot), received.message
@@ -582,8 +583,8 @@ def refusals(keystore: OpenedKeystore) -> dict[str, RefusedMessage]:
     """Return why the last messages of robots were refused, by robot.
 
     Raises:
-        DocumentError: the file cannot be read, or is damaged: then it is unknown which robots are
-            current.
+        DocumentError: the file cannot be read, or is damaged, so that the current robots are not
+            known.
     """
     path = keystore.root / REFUSED
     if not os.path.lexists(path):
@@ -659,7 +660,7 @@ def _message_from(value: Any, label: str) -> LastMessage:
 
 
 def _confirmation_from(value: Any, label: str) -> Confirmation:
-    """Return the confirmation in a JSON value; ``label`` names it in errors.
+    """Return the confirmation in a JSON value; ``label`` names the value in errors.
 
     Raises:
         DocumentError: as `parse_confirmation`.
@@ -880,7 +881,7 @@ def _entries(value: Mapping[str, Any], key: str, label: str) -> Iterator[tuple[s
     """Yield the (path, value) pairs of the JSON object at ``key``.
 
     Raises:
-        DocumentError: a path is not that of an enclave file that confirmations list.
+        DocumentError: a path is not the path of an enclave file that confirmations list.
     """
     entries = value[key]
     if not isinstance(entries, dict):

@@ -201,21 +201,21 @@ class RobotStatus:
     """The deployment status of a robot, by its last confirmation.
 
     ``others`` are enclaves of the robot that the fleet does not record.  ``has_release`` is for a
-    robot whose files differ from the keystore's: whether the release that was published last for it
-    has the current files of the keystore.  ``short_lived`` are enclaves with such a validity, of
-    which a file expires soon or has expired.  ``has_list`` says whether it has the current
-    revocation list, or an earlier one that revokes the same, in force or not, and ``renew_from``
-    from when a file of it expires soon.
-    ``lacks_key`` are enclaves whose key the keystore has and the robot does not, which no release
-    brings.  ``is_ahead`` says that, by its message, its files are newer than the backup of the
-    keystore. ``reads_copy`` says that it fetched after the publication and got an earlier release,
-    and ``is_locked_out`` that all its certificates are revoked, or of a CA that was replaced.
-    ``lacks_ca`` says that it refuses releases, because it does not trust the CA that seals them.
-    ``is_doubtful`` says that what it has is not known, whatever it confirmed: its last message was
-    refused, its release was never published, or two computers have its keys, and
-    ``may_trust_replaced`` that a process of it may trust an identity CA that was replaced. The
-    first ``reported``
-    problems are in the words of the robot.
+    robot whose files differ from the keystore's: whether its last published release has the current
+    files of the keystore.  ``short_lived`` are short-lived enclaves of which a file expires soon or
+    has expired.  ``has_list`` says whether the robot has the current revocation list, or an earlier
+    list that revokes the same, in force or not; from ``renew_from`` on, a file of the robot expires
+    soon.  ``lacks_key`` are enclaves whose key the keystore has and the robot lacks: no release
+    brings a key.  The other parts say of the robot:
+
+    - ``is_ahead``: by its message, its files are newer than the backup of the keystore;
+    - ``reads_copy``: it fetched after the publication and got an earlier release;
+    - ``is_locked_out``: all its certificates are revoked, or of a CA that was replaced;
+    - ``lacks_ca``: it refuses releases, because it does not trust the CA that seals releases;
+    - ``is_doubtful``: its files are not known, whatever it confirmed, because its last message was
+      refused, its release was never published, or two computers have its keys;
+    - ``may_trust_replaced``: one of its processes may trust an identity CA that was replaced;
+    - ``reported``: so many of the problems, the first ones, are in its own words.
     """
 
     robot: str
@@ -244,29 +244,30 @@ class RobotStatus:
     fetches: bool
     """Whether the robot fetches its files: its agent has sent a message, which was verified."""
     release: int | None
-    """Number of the release that the robot's agent installed last, 0 for none; null if it does not
-    say it."""
+    """Number of the release that the robot's agent installed last, 0 for none; null if the
+    confirmation does not tell."""
     published: int | None
     """Number of the release that was published last for the robot; null for none."""
     stage: Annotated[str, Words(("unknown", "before", "distribute", "reissue", "complete"))]
-    """The stage of a CA rotation that the robot's CA files have reached; null if it confirmed no CA
-    file. ``before``: it does not trust the new CA yet; ``complete``: it trusts only the new CA."""
+    """The stage of a CA rotation that the robot's CA files have reached; null if the robot
+    confirmed no CA file. ``before``: the robot does not trust the new CA yet; ``complete``: it
+    trusts only the new CA."""
     files: Mapping[str, Mapping[State, int]]
     """Number of the robot's files, by kind and state."""
     pending: tuple[ConfirmedFile, ...]
     """Files that differ from the keystore; empty if the robot sent no confirmation."""
     restart: tuple[str, ...] | None
     """The enclaves whose processes may still run with earlier files on the robot, by its last
-    confirmation, also those that it should not have any more; null if the confirmation does not
-    tell."""
+    confirmation, also enclaves that the robot should not have any more; null if the confirmation
+    does not tell."""
     running: Mapping[str, RunningFiles] | None
     """The files that the processes of each enclave of the robot have loaded, by its last
     confirmation; null if the confirmation does not tell."""
     crl_in_force: bool | None
-    """Whether the robot has the current revocation list, or an earlier one that revokes the same,
-    which has not expired, says that no process may run with another list or with earlier CAs, and
-    is not ``offline``; false if this is not known, or the keystore is older than its robots; null
-    if the keystore has no list, or the robot has no
+    """Whether the current revocation list is in force on the robot, or an earlier list that revokes
+    the same: the robot has the list, which has not expired, says that no process may run with
+    another list or with earlier CAs, and is not ``offline``. False if this is not known, or the
+    keystore is older than its robots; null if the keystore has no list, or the robot has no
     enclave. `sros agent` and plays know the processes that lack only new permissions, governance or
     certificates of their own; for other robots, any restart that is due counts."""
     expiry: Mapping[Annotated[str, Words(_EXPIRING)], datetime]
@@ -274,8 +275,9 @@ class RobotStatus:
     dds: RobotDds | None
     """The DDS of the robot by its last confirmation; null if the confirmation does not tell."""
     problems: tuple[str, ...] | None
-    """What the robot's agent could not do, or what is wrong on the robot, in its own words, or that
-    it fetches from an old copy of what was published; null if the confirmation does not tell."""
+    """What the robot's agent could not do, or what is wrong on the robot, in the agent's words, or
+    that the robot fetches from an old copy of the publication; null if the confirmation does not
+    tell."""
     notes: tuple[str, ...]
     """Remarks (clauses), for example about the robot's clock."""
     to_do: str = ""
@@ -345,7 +347,7 @@ class RobotStatus:
         return replace(status, state=max(self.state, State.EXPIRED, key=_BADNESS.__getitem__))
 
     def without_list(self) -> RobotStatus:
-        """Return the status if it is not known whether the last revocation list is in force."""
+        """Return the status of a robot on which the last list is not known to be in force."""
         crl_in_force = None if self.crl_in_force is None else False
         return replace(self, crl_in_force=crl_in_force, has_list=False)
 
@@ -399,13 +401,14 @@ class PublishedMetadata:
     folder: str
     """Absolute path of the publishing folder; null if it is not known."""
     expires: datetime | None
-    """The first expiry of the published metadata, in UTC: from then on, robots refuse it, and get
-    no new files. Null if an earlier release of sros published last, which did not record it."""
+    """The first expiry of the published metadata, in UTC: from then on, robots refuse the metadata,
+    and get no new files. Null if an earlier release of sros published last, which recorded no
+    expiry."""
     root_expires: datetime | None = None
-    """Expiry of the root metadata, in UTC: to renew it needs the root key. Null if an earlier
-    release of sros published last, which did not record it."""
+    """Expiry of the root metadata, in UTC: only the root key renews the root metadata. Null if an
+    earlier release of sros published last, which recorded no expiry."""
     accepted: bool | None = None
-    """Whether robots still accept it; null if that is not known, because ``expires`` is null."""
+    """Whether robots still accept the metadata; null if ``expires`` is null."""
 
     def at(self, now: datetime) -> PublishedMetadata:
         """Return the publication as robots see it at ``now``."""
@@ -433,19 +436,20 @@ class FleetStatus:
     """The robots whose last confirmation is older than --max-age, sorted by name; without that
     option, the robots that fetch and have sent nothing for more than a day."""
     older: str = ""
-    """Why the keystore is older than its robots, as a clause: it was restored from a backup, or is
-    a copy, and has not published with ``--restored`` since. Null if nothing shows that it is older.
-    """
+    """Why the keystore is older than its robots, as a clause: the keystore was restored from a
+    backup, or is a copy, and has not published with ``--restored`` since. Null if nothing shows
+    this."""
     clock: str = ""
     """How far the clock of this machine is behind the last entry of the ledger, or behind the last
-    confirmation, as a clause: ages and expiry are then not known. Null if it is not behind."""
+    confirmation, as a clause: ages and expiry are then not known. Null if the clock is not behind.
+    """
     edited: str = ""
     """How the keystore's fleet file differs from the file that sros wrote, as a clause: the robots
-    are then perhaps not all. Null if it does not differ."""
+    are then perhaps not all. Null if the file does not differ."""
     revoked_until: datetime | None = None
-    """Until when robots need the revocation list, in UTC: the expiry of the last certificate on it,
-    or of the last revoked certificate of a replaced CA, while a robot may trust this CA. Null if
-    there is none, or if the ledger does not have all of them."""
+    """Until when robots need the revocation list, in UTC: the expiry of the last certificate on the
+    list, or of the last revoked certificate of a replaced CA, while a robot may trust this CA. Null
+    if no certificate is revoked, or if the ledger lacks one of the revoked certificates."""
     publication: PublishedMetadata | None = None
     """What robots fetch; null if nothing was published for a robot."""
     is_any_revoked: bool = False
@@ -473,10 +477,10 @@ class FleetStatus:
     def unconfirmed(self) -> tuple[str, ...]:
         """Names of the robots that have not confirmed the stage of the CA rotation.
 
-        First they have to confirm that they trust the new CA, then that they have the files it
-        issued.  A robot has not confirmed the stage either if its processes still run with earlier
-        files, if it fetches and is offline, if it reports a release that was never published, or if
-        its last message was refused.
+        First the robots have to confirm that they trust the new CA, then that they have the files
+        of the new CA.  A robot has not confirmed the stage either if its processes still run with
+        earlier files, if it fetches and is offline, if it reports a release that was never
+        published, or if its last message was refused.
         """
         return tuple(
             robot.robot
@@ -511,9 +515,9 @@ class FleetStatus:
     def with_overdue(self, now: datetime, max_age: timedelta | None = None) -> FleetStatus:
         """Return a copy with what is to be done, in which robots silent for long are offline.
 
-        These are the robots whose last confirmation is older than ``max_age``; without it, the
-        robots that fetch and sent nothing for more than a day.  Messages of robots that fetch are
-        also as old as they say themselves: whoever has the inbox could hold them back.
+        These are the robots whose last confirmation is older than ``max_age``; without
+        ``max_age``, the robots that fetch and sent nothing for more than a day.  Messages of robots
+        that fetch are also as old as the messages say: whoever has the inbox could hold them back.
         """
         overdue = frozenset(
             robot.robot
@@ -542,7 +546,7 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
     """Return the deployment status of the named robots, or of the whole fleet.
 
     Raises:
-        KeystoreError: it is not a keystore, has no fleet, or some of its enclaves may be missing.
+        KeystoreError: the keystore has no fleet, or some of its enclaves may be missing.
         DocumentError: the fleet has no such robot.
     """
     fleet = recorded_fleet(keystore)
@@ -556,7 +560,7 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
     statuses = tuple(
         _status(robot, records, stages, unrecorded[robot.robot.name]) for robot in compared
     )
-    if older := records.age_clause:  # there may be a later list, which it does not have
+    if older := records.age_clause:  # there may be a later list, which the keystore lacks
         statuses = tuple(status.without_list() for status in statuses)
     may_trust_replaced = any(
         status.crl_in_force is False and (older or status.may_trust_replaced) for status in statuses
@@ -758,8 +762,7 @@ class _KeystoreFiles:
     def files_of(self, name: str) -> Mapping[str, _KeystoreFile | None]:
         """Map the paths of an enclave's exported files, without the key, to their digests.
 
-        A path maps to None if its file cannot be read, or is missing although every export needs
-        it.
+        A path maps to None if its file cannot be read, or is a missing file of `REQUIRED_FILES`.
         """
         folder = enclave_folder(name)
         files: dict[str, _KeystoreFile | None] = dict.fromkeys(
@@ -776,7 +779,7 @@ class _KeystoreFiles:
         return files
 
     def _linked_file(self, path: str, up: str) -> _KeystoreFile | None:
-        """Return the digests of the file that a link leads to; None if it cannot be read.
+        """Return the digests of the file that a link leads to; None for an unreadable file.
 
         ``up`` is the relative path from the link to the folder of all enclaves.
         """
@@ -831,7 +834,7 @@ class _KeystoreRecords:
         published = read_published(keystore)
         self._published = published.robots
         self.published = {name: robot.release.number for name, robot in published.robots.items()}
-        """By robot, the number of the release that was published last."""
+        """Number of the release that was published last, by robot."""
         self.publication = (
             PublishedMetadata(published.folder, published.until, published.root_until)
             if published.robots
@@ -901,8 +904,8 @@ class _KeystoreRecords:
     def is_list_equal(self, file: _Difference) -> bool:
         """Return whether an earlier revocation list revokes all that the current list revokes.
 
-        Each list has all serial numbers, so this is so for every list that was signed after the
-        last revocation in the ledger, if the ledger has all revocations on the current list.
+        Every list has all serial numbers.  So a list that was signed after the last revocation in
+        the ledger is equal, if the ledger has all revocations on the current list.
         """
         return bool(file.exported and file.is_own) and file.confirmed in self._equal_lists
 
@@ -922,7 +925,7 @@ class _KeystoreRecords:
 
     @cached_property
     def age_clause(self) -> str:
-        """Why the keystore is older than its robots, as a clause; "" if nothing shows it."""
+        """Why the keystore is older than its robots, as a clause; "" if nothing shows this."""
         entries = self._keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
         marks = [entry for entry in entries if entry.what in (RESTORED, "release")]
         if marks and marks[-1].what == RESTORED:
@@ -941,9 +944,9 @@ class _KeystoreRecords:
     def lacks_key(self, compared_robot: _ComparedRobot) -> tuple[str, ...]:
         """Return the enclaves whose certificate is for a key that the robot does not have.
 
-        These are the enclaves of which it has no file, those with an earlier key, and those of
-        which its agent says so.  If the keystore does not have the key, it was made on the robot,
-        and a release is enough.
+        These are the enclaves of which the robot has no file, the enclaves with an earlier key, and
+        the enclaves of which its agent says so.  A key that the keystore lacks was made on the
+        robot, and a release is enough.
         """
         confirmed = compared_robot.confirmed
         if confirmed is None:
@@ -993,8 +996,8 @@ class _KeystoreRecords:
     def is_locked_out(self, compared_robot: _ComparedRobot, states: Collection[State]) -> bool:
         """Return whether a web server with the current CA and list refuses a robot.
 
-        ``states`` are those of its certificates, which are then all revoked, or of identity CAs
-        that were replaced.
+        ``states`` are the states of the robot's certificates, which are then all revoked, or of
+        identity CAs that were replaced.
         """
         if not compared_robot.enclaves:
             return False
@@ -1069,7 +1072,7 @@ class _KeystoreRecords:
         return tuple(sorted(name for name in names if not self._keystore.has_enclave(name)))
 
     def short_lived(self, first: Mapping[str, _Expiring]) -> tuple[str, ...]:
-        """Return the short-lived enclaves of which a file is in ``first``: it expires first."""
+        """Return the short-lived enclaves of the files ``first``, which expire first."""
         names = {file.enclave for file in first.values() if file.enclave}
         template = self._keystore.template
         return tuple(sorted(name for name in names if template.longest_validity(name) is not None))
@@ -1114,9 +1117,9 @@ class _KeystoreRecords:
         )
 
     def _identify(self, difference: _Difference, kind: str, name: str) -> tuple[State, str, str]:
-        """Return the state of a file, when it was issued ("": unknown), and its enclave if another.
+        """Return the state of a file, when the file was issued ("": unknown), and its enclave.
 
-        The name is "" unless the file belongs to another enclave than ``name``.
+        The enclave is "" unless the file belongs to another enclave than ``name``.
         """
         if difference.exported is None:
             return State.BROKEN, "", ""
@@ -1157,7 +1160,7 @@ def _status(
         counts.setdefault(file.kind, Counter())[file.state] += 1
     restart = compared_robot.restart()
     if revoked and not compared_robot.enclaves:
-        state = State.REVOKED  # whatever it says: it has nothing to have
+        state = State.REVOKED  # whatever the robot says: it should have no files
     elif different:
         state = max((file.state for file in different), key=_BADNESS.__getitem__)
     elif not compared_robot.enclaves:
@@ -1400,7 +1403,7 @@ def fleet_metrics(
         Metric(
             "sros_fleet_restarts_due",
             "Number of enclaves whose processes may still run with earlier files, for robots that "
-            "say it.",
+            "report it.",
             per_robot(lambda robot: None if robot.restart is None else len(robot.restart)),
         ),
         Metric(
