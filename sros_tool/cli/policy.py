@@ -32,7 +32,7 @@ from sros_tool.cli.common import (
     save,
     verb,
 )
-from sros_tool.errors import PolicyError, UsageError
+from sros_tool.errors import Note, PolicyError, UsageError
 from sros_tool.terminal import echo, echo_document, echo_lines
 from sros_tool.values import FileChange, as_plain, file_change
 from sros_tool.wording import counted, first_few
@@ -144,22 +144,16 @@ def merge_policy(
     if namespace is not None:
         namespace = namespace_of_option(namespace)
         additions = [policy_in_namespace(addition, namespace) for addition in additions]
+    notes: list[Note] = []
     if remaps:
-        from sros_tool.policy.remapping import parse_remapping, remapped_policy
+        from sros_tool.policy.remapping import remapped_policies
 
-        rules = [parse_remapping(text) for text in remaps]
-        remapped = [remapped_policy(addition, rules) for addition in additions]
-        additions = [addition for addition, _ in remapped]
-        if unused := [rule for rule in rules if not any(rule in used for _, used in remapped)]:
-            raise UsageError(
-                f"--remap {unused[0]}: no policy to merge has this name, or node",
-                "",
-                "Write the names as the nodes of the policy use them.",
-            )
+        additions, notes = remapped_policies(additions, remaps)
     if enclave is not None:
         check_enclave_name(enclave)
         additions = [policy_in_enclave(addition, enclave) for addition in additions]
     merged = merge_all(policy, additions)
+    notes += merged.notes()
     if merged.added and (output is None or output.parent.resolve() == policy.parent.resolve()):
         from sros_tool.graph.learn import with_common_parts
 
@@ -183,7 +177,7 @@ def merge_policy(
                 document=EditedText(merged.document, str(policy)).text if to_show else None,
                 dry_run=dry_run,
                 changes=changes,
-                notes=merged.notes(),
+                notes=notes,
             )
         )
     elif dry_run:
@@ -197,7 +191,7 @@ def merge_policy(
         echo_document(merged.document)
     if not dry_run and not as_json:
         _print_added(merged)
-    print_notes(merged.notes())
+    print_notes(notes)
     if saved:
         echo(saved, err=True)
 

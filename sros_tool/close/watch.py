@@ -236,7 +236,7 @@ def _lacking_text(robot: LocalRobot, nodes: Sequence[ObservedNode]) -> str:
     files = shlex.join((str(robot.policy), str(robot.observed_policy)))
     add = f"sros merge_policy {files} --in-place"
     restart = (
-        f"{first_few(meanings, MOST_NAMES)}; then restart it with that, and watch again: "
+        f"{first_few(meanings, MOST_NAMES)}; if the node lacks it, restart it so, and watch again: "
         f"{robot.close_command} --for 1m; otherwise, " * bool(meanings)
     )
     return (

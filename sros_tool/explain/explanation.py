@@ -404,7 +404,11 @@ def likely_meaning(right: Right, used: Collection[Right], named: Iterable[Right]
     similar = _similar_names(right.name, names, right.kind == "services")
     meaning = f"perhaps the policy means {' or '.join(similar)}" if similar else ""
     if len(similar) == 1 and right.kind != "actions":
-        meaning += f" (the node may lack its remapping: -r {right.name}:={similar[0]})"
+        name, meant = right.name, similar[0]
+        meaning += (
+            f" (the node may lack a remapping, -r {name}:={meant}, or the policy, "
+            f"--remap {meant}:={name})"
+        )
     return meaning
 
 

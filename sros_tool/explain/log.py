@@ -911,7 +911,9 @@ class _Examiner:
             for _, part in ACTION_PARTS.get(question.right, (("", ""),))
         )
         return [f"the enclave may {question.word} {' and '.join(names)}: perhaps that is meant"], (
-            f"If a remapping was forgotten, add `--ros-args {' '.join(rules)}`; otherwise {remedy}"
+            f"If the node lacks a remapping, add `--ros-args {' '.join(rules)}`. If the policy "
+            f"lacks one that the node has, write {name} in place of {names[0]}, or merge it with "
+            f"`--remap {quote(names[0])}:={quote(name)}`. Otherwise, {remedy}"
         )
 
     def _how_to_ask(self, denial: Denial, name: str) -> str:

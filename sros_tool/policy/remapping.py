@@ -3,7 +3,9 @@
 A rule is that of ``--ros-args -r`` (ROS 2 design, "Static Remapping"): ``[NODE:]FROM:=TO``, where
 ``__node`` and ``__ns`` stand for name and namespace of a node.  Both names are relative to the node
 unless they are absolute, and the first rule that fits a name counts.  A rule with NODE, other than
-one of ``__node``, is for the node that has this name after ``__node`` (rcl, node.c).
+one of ``__node``, is for the node that has this name after ``__node`` (rcl, node.c).  The name of
+an action is remapped since rcl_action 10.0.2, and on Jazzy since 9.2.8; before, only the names of
+the topics and services that it consists of (rcl, pull request 1170).
 """
 
 from __future__ import annotations
@@ -11,12 +13,20 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from shlex import quote
 from typing import NamedTuple
 
-from sros_tool.errors import UsageError
-from sros_tool.names import check_namespace, expand, expression_problem, is_expression
+from sros_tool.errors import Note, UsageError
+from sros_tool.names import (
+    ACTION_PARTS,
+    check_namespace,
+    expand,
+    expression_problem,
+    is_expression,
+)
 from sros_tool.policy.model import Group, Policy, Profile
 from sros_tool.policy.patterns import matches
+from sros_tool.wording import enumerated
 
 _RULE = re.compile(r"(?:([A-Za-z_]\w*):)?([^:=]+):=([^:=]+)")
 _NODE_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
@@ -32,6 +42,14 @@ class Remapping(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.node}{':' * bool(self.node)}{self.old}:={self.new}"
+
+
+class Use(NamedTuple):
+    """A rule that changed a node or one of its groups (``kind``, "" for the node itself)."""
+
+    rule: Remapping
+    node: str
+    kind: str = ""
 
 
 def parse_remapping(text: str) -> Remapping:
@@ -61,12 +79,52 @@ def parse_remapping(text: str) -> Remapping:
     return Remapping(node, old, new)
 
 
-def remapped_policy(policy: Policy, rules: Sequence[Remapping]) -> tuple[Policy, set[Remapping]]:
-    """Return a policy with remapped names, and the rules that changed something.
+def remapped_policies(
+    policies: Iterable[Policy], texts: Iterable[str]
+) -> tuple[list[Policy], list[Note]]:
+    """Return policies remapped by rules, and notes on what the nodes may do otherwise.
+
+    Raises:
+        UsageError: (or another error of `parse_remapping`) a text is not a rule, or its rule is for
+            a name that no policy has.
+    """
+    rules = [parse_remapping(text) for text in texts]
+    remapped = [remapped_policy(policy, rules) for policy in policies]
+    notes = []
+    for rule in rules:
+        uses = {use for _, of_policy in remapped for use in of_policy if use.rule == rule}
+        if not uses:
+            raise UsageError(
+                f"--remap {rule}: no policy to merge has this name, or node",
+                "",
+                "Write the names as the nodes of the policy use them.",
+            )
+        nodes = sorted({use.node for use in uses})
+        if rule.old == _NODE and len(nodes) > 1:
+            text = (
+                f"--remap {rule} gives one name to the nodes {enumerated(nodes)}. Take the one "
+                f"that is meant with --node, or write its name, as in {nodes[0]}:{rule}."
+            )
+            notes.append(Note("merge.remapped-nodes", text))
+        if any(use.kind == "actions" for use in uses):
+            parts = (
+                f"-r {quote(str(rule._replace(old=rule.old + part, new=rule.new + part)))}"
+                for _, part in ACTION_PARTS["call"]
+            )
+            text = (
+                f"--remap {rule} renames an action. Nodes do so since Kilted, and on Jazzy since "
+                f"rcl_action 9.2.8: start earlier ones with `--ros-args {' '.join(parts)}`."
+            )
+            notes.append(Note("merge.remapped-action", text))
+    return [policy for policy, _ in remapped], notes
+
+
+def remapped_policy(policy: Policy, rules: Sequence[Remapping]) -> tuple[Policy, set[Use]]:
+    """Return a policy with remapped names, and the uses of the rules.
 
     Where a wildcard matches the old name, the new name is added to the wildcard.
     """
-    used: set[Remapping] = set()
+    used: set[Use] = set()
 
     def remapped(profile: Profile) -> Profile:
         renamed = [rule for rule in rules if rule.old == _NODE and rule.node in ("", profile.node)]
@@ -74,7 +132,7 @@ def remapped_policy(policy: Policy, rules: Sequence[Remapping]) -> tuple[Policy,
         of_node = [rule for rule in rules if rule.old != _NODE and rule.node in ("", node)]
         moved = [rule for rule in of_node if rule.old == _NAMESPACE]
         ns = moved[0].new if moved else profile.ns
-        used.update(renamed[:1] + moved[:1])
+        used.update(Use(rule, profile.node) for rule in renamed[:1] + moved[:1])
         of_names = [rule for rule in of_node if rule.old != _NAMESPACE]
         groups = tuple(_remapped_group(group, of_names, ns, node, used) for group in profile.groups)
         return replace(profile, ns=ns, node=node, groups=groups)
@@ -84,7 +142,7 @@ def remapped_policy(policy: Policy, rules: Sequence[Remapping]) -> tuple[Policy,
 
 
 def _remapped_group(
-    group: Group, rules: Iterable[Remapping], ns: str, node: str, used: set[Remapping]
+    group: Group, rules: Iterable[Remapping], ns: str, node: str, used: set[Use]
 ) -> Group:
     """Return a group of a node with remapped names; add the rules that apply to ``used``."""
     by_name: dict[str, Remapping] = {}
@@ -94,7 +152,7 @@ def _remapped_group(
     def new_names(name: str) -> Iterator[str]:
         full = expand(name, ns, node)
         fitting = [rule for old, rule in by_name.items() if matches(full, old)]
-        used.update(fitting)
+        used.update(Use(rule, node, group.kind) for rule in fitting)
         if not fitting or is_expression(full):
             yield name
         yield from (rule.new for rule in fitting)

@@ -266,10 +266,13 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     again = robot.close("--for", "1s", status=1)
     assert policy.read_text() == changed
     assert "nothing is closed yet; fix this first:\n  'robot/policy.xml' stays as it " in again.out
-    remapped = "perhaps the policy means /old/chatter (the node may lack its remapping: -r "
+    remapped = "perhaps the policy means /old/chatter (the node may lack a remapping, -r "
     assert f"lacks 1 right seen now (/listener subscribe /chatter); {remapped}" in again.out
-    assert "-r /chatter:=/old/chatter)" in again.out
-    assert "; then restart it with that, and watch again: sros close robot --for 1m;" in again.out
+    assert "-r /chatter:=/old/chatter, or the policy, --remap /old/chatter:=" in again.out
+    assert (
+        "; if the node lacks it, restart it so, and watch again: sros close robot --for 1m;"
+        in again.out
+    )
     assert " otherwise, if a process should not have them, stop it, and run `sros c" in again.out
     add = "sros merge_policy robot/policy.xml robot/seen.xml --in-place"
     assert f"; if they are right, add them: {add}\n" in again.out
@@ -965,7 +968,7 @@ def test_a_node_that_was_restarted_without_its_namespace(robot: Robot) -> None:
     robot.nodes = (TALKER, LISTENER)
     said = robot.close("--for", "1s", status=1).out
     hint = "perhaps /listener is /left/listener, started without its namespace (-r __ns:=/left)"
-    assert f"; {hint}; then restart it with that, and watch again" in said
+    assert f"; {hint}; if the node lacks it, restart it so, and watch again" in said
     robot.nodes = (TALKER, left, ros_node("listener", "010f0000071200000000"))
     assert "without its namespace" not in robot.close("--for", "1s", status=1).out
 

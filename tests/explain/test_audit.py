@@ -85,8 +85,10 @@ def ids(found: Audit) -> list[str]:
 
 def lacks(used: str, allowed: str) -> str:
     """The hint at a remapping from the name that is used to one like it that is allowed."""
-    node = f"the node may lack its remapping: -r {used}:={allowed}"
-    return f"; perhaps the policy means {allowed} ({node})"
+    node = f"the node may lack a remapping, -r {used}:={allowed}"
+    return (
+        f"; perhaps the policy means {allowed} ({node}, or the policy, --remap {allowed}:={used})"
+    )
 
 
 TALKER = {"/t": {"/talker": ["publish chatter"]}}

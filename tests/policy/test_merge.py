@@ -21,7 +21,7 @@ from sros_tool.policy.model import (
     Profiles,
     policy_in_namespace,
 )
-from sros_tool.policy.remapping import parse_remapping, remapped_policy
+from sros_tool.policy.remapping import parse_remapping, remapped_policies, remapped_policy
 from sros_tool.policy.rights import Right, policy_rights
 from tests.policy.drawn_policies import PATHS, effective, meant, policies
 
@@ -99,7 +99,27 @@ def test_a_policy_whose_names_are_remapped(rules: list[str], names: set[str] | N
         assert (remapped, used) == (before, set())
     else:
         assert {right.name for right in policy_rights(remapped)} == names
-        assert remappings[0] in used
+        assert remappings[0] in {use.rule for use in used}
+
+
+def test_what_nodes_remap_otherwise_is_noted() -> None:
+    """Only rcl_action 9.2.8 (Jazzy), or of Kilted and later, remaps the name of an action."""
+    nodes = [one(group("actions", "plan", execute="ALLOW"), node=node) for node in ("n", "hand")]
+    parts = ("cancel_goal", "get_result", "send_goal", "feedback", "status")
+    rules = " ".join(f"-r plan/_action/{part}:=/arm/plan/_action/{part}" for part in parts)
+    for texts, ids, told in (
+        (
+            ["plan:=/arm/plan"],
+            ["merge.remapped-action"],
+            f"earlier ones with `--ros-args {rules}`.",
+        ),
+        (["__node:=x"], ["merge.remapped-nodes"], "name to the nodes hand and n. Take the one"),
+        (["n:__node:=x"], [], ""),
+        (["__ns:=/left"], [], ""),
+    ):
+        _, notes = remapped_policies(nodes, texts)
+        assert [note.id for note in notes] == ids
+        assert told in "".join(note.text for note in notes)
 
 
 @pytest.mark.parametrize(
