@@ -657,21 +657,24 @@ def test_a_group_of_the_table_says_how_much_of_it_is_left_out(
     browser: Browser, tmp_path: Path
 ) -> None:
     own = [[f"/{'ab'[n % 2]}/t{n}" for n in range(1, 512) if n >> at & 1] for at in range(9)]
+    own.append(["/c/last"])
     enclaves = {f"/e{at}": group("topics", "publish", *names) for at, names in enumerate(own)}
     policy, path = tmp_path / "robot.xml", tmp_path / "table.html"
     policy.write_text(policy_text(enclaves))
     sros("view", policy, "-o", path).ok()
     with opened(browser, path) as page:
         page.click("#tab-names")
-        assert "511 names in 511 rows; shown are the first 400." in page.inner_text("#names")
+        assert "512 names in 512 rows; shown are the first 400." in page.inner_text("#names")
         shown = page.locator("#names .group").evaluate_all(
             "groups => groups.map(it => [it.querySelectorAll('tbody tr').length,"
             " it.querySelector('.soft').textContent])"
         )
         assert sum(rows for rows, _ in shown) == 400
         said = [
-            f"{rows} of {names} names" for (rows, _), names in zip(shown, (256, 255), strict=True)
+            f"{rows} of {names} name{'s' * (names > 1)}"
+            for (rows, _), names in zip(shown, (256, 255, 1), strict=True)
         ]
+        assert shown[-1][0] == 0
         assert [text.split(",")[0] for _, text in shown] == said
 
 

@@ -5,6 +5,7 @@ import { KINDS, LEVELS, RECEIVES, SENDS, noneText } from "./words.js";
 
 export const SHOWN = 4;
 const MOST = 400;
+const NONE_SHOWN = "Not among the rows that are shown: search for a name or an enclave.";
 // Up to so many rows are looked through without groups, and a group of them needs no folding.
 const FEW = 12;
 // What usually moves a robot stands first, then what is open to everybody; what only one side may
@@ -67,9 +68,9 @@ export function namesTable(rows, lacking, opens) {
     const parts = shown.size > FEW ? grouped(fit) : [];
     const part = ([title, all]) => {
       const some = all.filter((row) => shown.has(row));
-      return some.length ? [group(title, all, some, table(some), Boolean(text))] : [];
+      return group(title, all, some, some.length ? table(some) : NONE_SHOWN, Boolean(text));
     };
-    groups.replaceChildren(...(parts.length > 1 ? parts.flatMap(part) : [table([...shown])]));
+    groups.replaceChildren(...(parts.length > 1 ? parts.map(part) : [table([...shown])]));
     const names = namesIn(fit);
     const shared = names > fit.length ? " (names with the same rights share a row)" : "";
     const first = fit.length > MOST ? `; shown are the first ${MOST}` : "";
