@@ -172,19 +172,19 @@ def test_a_process_that_sees_one_enclave_goes_on_to_see_only_that(place: Place) 
 
 
 def test_restarts_that_are_due_are_remembered(place: Place) -> None:
-    assert place.due() == []
+    assert place.due.read() == []
     place.set_due(["/b", "/a"])
-    assert Place(place.path).due() == ["/a", "/b"]
+    assert Place(place.path).due.read() == ["/a", "/b"]
     place.set_due([])
-    assert place.due() == []
-    place.set_delivered(["/a"])
-    assert (place.due(), place.delivered()) == ([], ["/a"])
-    place.set_delivered([])
+    assert place.due.read() == []
+    place.delivered.write(["/a"])
+    assert (place.due.read(), place.delivered.read()) == ([], ["/a"])
+    place.delivered.write([])
     assert not beside(place)
     for bad in (b"", b"{", b"[1]", b'["a"]', b'["/a/../b"]', b"[" * 100_000):
         Path(place.path).with_name(".keystore.sros-restart").write_bytes(bad)
         with pytest.raises(RefusedError):
-            place.due()
+            place.due.read()
 
 
 def test_what_is_no_enclave_is_refused(place: Place) -> None:
@@ -325,7 +325,7 @@ def test_processes_of_a_folder_that_was_lost_have_to_be_restarted(place: Place, 
         return due
 
     assert deliver(OLD) == []
-    assert place.delivered() == ["/a"], "also where nothing changes"
+    assert place.delivered.read() == ["/a"], "also where nothing changes"
     assert deliver(NEW) == ["/a"]
     shutil.rmtree(place.path)
     changed = {**NEW, "enclaves/b/c/cert.pem": b"changed", "enclaves/d/cert.pem": b"new"}

@@ -35,6 +35,49 @@ _BOOT_ID = "/proc/sys/kernel/random/boot_id"
 _LONGEST_WAIT = 60.0
 
 
+class _Record:
+    """A list of texts in a file next to the folder, such as ``.keystore.sros-restart``."""
+
+    def __init__(self, path: str, check: Callable[[str], str]) -> None:
+        """Take the path of the file, and a function that raises for a text that is not valid."""
+        self._path = path
+        self._check = check
+
+    def read(self) -> list[str]:
+        """Return the texts, sorted; none without the file.
+
+        Raises:
+            RefusedError: the file cannot be read.
+        """
+        try:
+            with os.fdopen(os.open(self._path, _FILE), "rb") as file:
+                texts = json.loads(file.read(MOST_OF_FILE).decode())
+            return sorted({self._check(text) for text in texts})
+        except FileNotFoundError:
+            return []
+        except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+            raise RefusedError(
+                f"'{self._path}' cannot be read: {error}. Restart all processes with enclaves, then"
+                " remove it."
+            ) from error
+
+    def write(self, texts: list[str]) -> None:
+        """Write the texts, flushed to the disk; without any, remove the file."""
+        spare = self._path + "-new"
+        if not texts:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(self._path)
+            return
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(spare)
+        with os.fdopen(os.open(spare, _NEW_FILE, 0o600), "w") as file:
+            json.dump(sorted(texts), file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(spare, self._path)
+        _flush(os.path.dirname(self._path))
+
+
 class Place:
     """The folder ``path`` with the enclaves of a robot, and next to it what a change needs.
 
@@ -53,9 +96,9 @@ class Place:
     The folder ``.agent`` in it is that of ``sros agent``, and stays as it is.
 
     Whoever comes after a process that was killed ends a change that was decided, and drops another.
-    ``.keystore.sros-restart`` lists the enclaves whose processes still have files of before, and
-    ``.keystore.sros-delivered`` those that were installed last.  ``.keystore.sros-trusting`` has
-    digests of the CAs and revocation lists that these processes have loaded.
+    ``due`` is the record of the enclaves whose processes still have earlier files, ``delivered`` of
+    the enclaves that were installed last, also if somebody removed them since, and ``trusting`` of
+    digests (`trust_digest`) of enclaves of ``due`` whose processes have these files.
     """
 
     def __init__(self, path: str, owner: str | None = None) -> None:
@@ -74,6 +117,9 @@ class Place:
             raise RefusedError(
                 f"'{self.path}' is a symbolic link. Name the folder that it leads to, or remove it."
             )
+        self.due = _Record(self._beside("restart"), check_enclave)
+        self.delivered = _Record(self._beside("delivered"), check_enclave)
+        self.trusting = _Record(self._beside("trusting"), str)
 
     @property
     def _uid(self) -> int:
@@ -307,43 +353,11 @@ class Place:
 
     # ── what is remembered ─────────────────────────────────────────────────────────────────
 
-    def due(self) -> list[str]:
-        """Return the enclaves whose processes have to be restarted since earlier changes.
-
-        Raises:
-            RefusedError: the record cannot be read.
-        """
-        return self._names("restart", check_enclave)
-
     def set_due(self, names: list[str]) -> None:
-        """Record the enclaves whose processes have to be restarted; flushed to the disk."""
-        self._set_names("restart", names)
+        """_Record the enclaves whose processes have to be restarted."""
+        self.due.write(names)
         if not names:
-            self.set_trusting([])
-
-    def delivered(self) -> list[str]:
-        """Return the enclaves that were installed last, also if somebody removed them since.
-
-        Raises:
-            RefusedError: the record cannot be read.
-        """
-        return self._names("delivered", check_enclave)
-
-    def set_delivered(self, names: list[str]) -> None:
-        """Record the enclaves that are installed; flushed to the disk."""
-        self._set_names("delivered", names)
-
-    def trusting(self) -> list[str]:
-        """Return digests (`trust_digest`) of enclaves of `due` whose processes have these files.
-
-        Raises:
-            RefusedError: the record cannot be read.
-        """
-        return self._names("trusting", str)
-
-    def set_trusting(self, digests: list[str]) -> None:
-        """Record the digests for `trusting`; flushed to the disk."""
-        self._set_names("trusting", digests)
+            self.trusting.write([])
 
     def crl_due(self, files: Files) -> list[str]:
         """Return the enclaves of `due` whose processes may lack the list or a CA in ``files``.
@@ -351,8 +365,10 @@ class Place:
         Raises:
             RefusedError: a record cannot be read.
         """
-        loaded = set(self.trusting())
-        return [enclave for enclave in self.due() if trust_digest(files, enclave) not in loaded]
+        loaded = set(self.trusting.read())
+        return [
+            enclave for enclave in self.due.read() if trust_digest(files, enclave) not in loaded
+        ]
 
     def agent_due(self, files: Files) -> list[str]:
         """Return the enclaves whose restart `sros agent` noted since the start of the machine.
@@ -379,36 +395,6 @@ class Place:
             RecursionError,
         ):
             return enclaves_in(files)
-
-    def _names(self, record: str, check: Callable[[str], str]) -> list[str]:
-        try:
-            handle = os.open(self._beside(record), _FILE)
-            with os.fdopen(handle, "rb") as file:
-                names = json.loads(file.read(MOST_OF_FILE).decode())
-            return sorted({check(name) for name in names})
-        except FileNotFoundError:
-            return []
-        except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
-            raise RefusedError(
-                f"'{self._beside(record)}' cannot be read: {error}. Restart all processes with"
-                " enclaves, then remove it."
-            ) from error
-
-    def _set_names(self, record: str, names: list[str]) -> None:
-        path = self._beside(record)
-        spare = path + "-new"
-        if not names:
-            with contextlib.suppress(FileNotFoundError):
-                os.unlink(path)
-            return
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(spare)
-        with os.fdopen(os.open(spare, _NEW_FILE, 0o600), "w") as file:
-            json.dump(sorted(names), file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(spare, path)
-        _flush(self._parent)
 
 
 def _boot_id() -> str:

@@ -263,7 +263,7 @@ def _look(place: Place, asked: dict, now: float) -> dict:
         "changed": False,
         "changed_enclaves": [],
         "removed_enclaves": [],
-        "restart": place.due(),
+        "restart": place.due.read(),
         "routers": _routers(present),
         "verification": found,
         "confirmation": _confirmation(place, asked, present, now),
@@ -296,7 +296,7 @@ def _after(before: Files, sent: Files) -> Files:
 
 def _confirmation(place: Place, asked: dict, files: Files, now: float) -> dict:
     by_agent = place.agent_due(files)
-    due, crl_due = ({*names, *by_agent} for names in (place.due(), place.crl_due(files)))
+    due, crl_due = ({*names, *by_agent} for names in (place.due.read(), place.crl_due(files)))
     return confirmation(asked["robot"], files, now, sorted(due), sorted(crl_due))
 
 
@@ -335,23 +335,23 @@ def _install(
     }
     # In an enclave that never had a certificate no process can run.
     has_certificate = {enclave_of(path) for path in before if path.endswith("/" + CERTIFICATE_FILE)}
-    ran = has_certificate.union(place.delivered())
-    due_before, trusting = set(place.due()), set(place.trusting())
+    ran = has_certificate.union(place.delivered.read())
+    due_before, trusting = set(place.due.read()), set(place.trusting.read())
     due = sorted({*due_before, *(ran & set(changed))} & set(enclaves_in(after)))
     if check and not present:
         confirmed = _confirmation(place, asked, before, now)
         return {**result, "restart": due, "confirmation": confirmed}
     if present:
         found = verify(place.path, names, asked["verifier"])
-        if found["ok"] and not check and place.delivered() != names:
-            place.set_delivered(names)  # an earlier version delivered them
+        if found["ok"] and not check and place.delivered.read() != names:
+            place.delivered.write(names)  # an earlier version delivered them
     else:
         try:
             place.prepare(after)
             found = verify(place.stage, names, asked["verifier"])
             if found["ok"]:
                 # Recorded first: who is killed in between restarts once too often, not never.
-                place.set_trusting(
+                place.trusting.write(
                     [
                         trust_digest(after, name)
                         for name in due
@@ -361,7 +361,7 @@ def _install(
                 )
                 place.set_due(due)
                 place.replace()
-                place.set_delivered(names)
+                place.delivered.write(names)
         finally:
             place.discard()
     if not found["ok"]:
@@ -375,7 +375,7 @@ def _install(
         )
     return {
         **result,
-        "restart": place.due(),
+        "restart": place.due.read(),
         "verification": found,
         "confirmation": _confirmation(place, asked, after, now),
     }

@@ -60,10 +60,10 @@ def main() -> None:
     try:
         place = Place(module.params["dest"])
         if module.check_mode:
-            due = place.due()
+            due = place.due.read()
         else:
             with place.locked():
-                due = place.due()
+                due = place.due.read()
                 if done & set(due):
                     place.set_due([enclave for enclave in due if enclave not in done])
     except (RefusedError, OSError) as error:
