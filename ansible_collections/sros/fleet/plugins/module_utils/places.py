@@ -354,7 +354,7 @@ class Place:
     # ── what is remembered ─────────────────────────────────────────────────────────────────
 
     def set_due(self, names: list[str]) -> None:
-        """_Record the enclaves whose processes have to be restarted."""
+        """Record the enclaves whose processes have to be restarted."""
         self.due.write(names)
         if not names:
             self.trusting.write([])
