@@ -144,8 +144,12 @@ def load_crl(data: bytes, name: str) -> RevocationList:
     expiry = next_update(crl)
     if expiry is None:
         raise PkiError(f"the revocation list {name} does not say when it expires", "", _RESTORE)
-    revoked = tuple(entry for entry in map(_revoked, crl) if entry.reason in REASONS)
-    return RevocationList(list_number(crl), last_update(crl), expiry, revoked, crl)
+    return RevocationList(list_number(crl), last_update(crl), expiry, revoked_in(crl), crl)
+
+
+def revoked_in(crl: x509.CertificateRevocationList) -> tuple[Revoked, ...]:
+    """Return what a list revokes; an entry with the reason removeFromCRL revokes nothing."""
+    return tuple(entry for entry in map(_revoked, crl) if entry.reason in REASONS)
 
 
 def last_update(crl: x509.CertificateRevocationList) -> datetime:

@@ -14,6 +14,7 @@ from tests.support.harness import copy_of, sros
 FOUND = {
     "keystore.strangers",
     "keystore.peers-revoked",
+    "keystore.peers-accept-revoked",
     "keystore.peers-protection",
     "keystore.peers-domains",
 }
@@ -66,11 +67,32 @@ def test_a_list_that_revokes_an_enclave_of_the_other_folder(keystore: Path, tmp_
         refusing = ", ".join(str(path) for path in paths if path != laptop)
         assert strangers(*paths) == [
             f"nodes of {refusing} refuse nodes of {laptop} in /a: their revocation list revokes "
-            "the certificate"
+            "the certificate",
+            f"nodes of {laptop} accept 1 certificate that the newer revocation list of {refusing} "
+            "revokes",
         ]
     assert strangers(robot, laptop, vendors=("zenoh",)) == []
     sros("distribute_key", keystore, "/a", laptop, "--force").ok()
     assert strangers(keystore, robot, laptop) == []
+
+
+def test_an_export_from_before_a_revocation(keystore: Path, tmp_path: Path) -> None:
+    """Its nodes hear a revoked enclave, of which nothing is in any of the folders."""
+    sros("create_enclave", keystore, "/stolen").ok()
+    early, late = tmp_path / "early", tmp_path / "late"
+    sros("crl", keystore, "--refresh").ok()
+    for folder in (early, late):
+        sros("distribute_key", keystore, "/a", folder).ok()
+    sros("crl", keystore, "--refresh").ok()
+    assert strangers(early, keystore) == []  # a newer list with the same entries
+    sros("revoke", keystore, "/stolen").ok()
+    sros("distribute_key", keystore, "/a", late, "--force").ok()
+    accepts = f"nodes of {early} accept 1 certificate that the newer revocation list of"
+    assert strangers(early, late) == [f"{accepts} {late} revokes"]
+    assert strangers(keystore, early, late) == [f"{accepts} {keystore}, {late} revokes"]
+    (early / "enclaves/a/crl.pem").unlink()
+    assert strangers(late, early) == [f"{accepts} {late} revokes"]
+    assert strangers(late, keystore) == strangers(late, early, vendors=("zenoh",)) == []
 
 
 def test_protection_and_domains_that_keep_nodes_apart(keystore: Path, tmp_path: Path) -> None:

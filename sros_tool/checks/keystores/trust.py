@@ -8,9 +8,11 @@ from contextlib import suppress
 from datetime import datetime
 from functools import cached_property, lru_cache
 from itertools import chain, combinations, product
+from operator import attrgetter
 from typing import NamedTuple
 
 from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding
 
 from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, names_text
 from sros_tool.dds.domains import DomainSet
@@ -29,9 +31,9 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import issued_by, load_certificate, load_certificates
-from sros_tool.pki.crl import lists_as_revoked, read_list
+from sros_tool.pki.crl import list_number, lists_as_revoked, newest_list, read_list, revoked_in
 from sros_tool.pki.distinguished_names import same_name
-from sros_tool.wording import first_few
+from sros_tool.wording import counted, first_few
 
 STRANGERS = FindingKind(
     "keystore.strangers",
@@ -54,6 +56,16 @@ PEERS_REVOKED = FindingKind(
     "If an enclave is meant to be revoked, remove its files. If not, export it again from its "
     "keystore, which may have a new certificate already. If it has none: `sros "
     "generate_artifacts -k KEYSTORE -e ENCLAVE -p POLICY_FILE`, and export the enclave again.",
+)
+PEERS_ACCEPT = FindingKind(
+    "keystore.peers-accept-revoked",
+    WARNING,
+    "an earlier revocation list than that of another keystore or export",
+    "A node with the earlier list communicates with everybody whom only the later list revokes, "
+    "such as the thief of a key.",
+    "RFC 5280, 5.2.3; rmw_dds_common (crl.pem).",
+    "Export its enclaves again from the keystore, with `sros distribute_key KEYSTORE ENCLAVE "
+    "TARGET --force`, bring the files to the robot, and restart the processes.",
 )
 PEERS_PROTECTION = FindingKind(
     "keystore.peers-protection",
@@ -127,6 +139,7 @@ def findings_between(
     yield from _strangers(targets, refused, on_zenoh=on_zenoh)
     if not on_zenoh:
         yield from _revoked(targets)
+        yield from _earlier_lists(targets)
         governed = {shown: _Governed(*target, now) for shown, target in targets.items()}
         yield from _incompatible_governance_findings(governed, refused)
 
@@ -249,6 +262,60 @@ def _names_revoked(data: bytes, keystore: OpenedKeystore, enclaves: Sequence[str
                     revocation_list, certificate.serial_number
                 ):
                     yield name
+
+
+def _earlier_lists(targets: Targets) -> Iterator[Finding]:
+    """Yield findings about targets without what the newer list of another target revokes."""
+    holders: dict[tuple[bytes, bytes], dict[str, None]] = defaultdict(dict)
+    for shown, (keystore, enclaves) in targets.items():
+        for name in enclaves:
+            folder = keystore.folder(name)
+            with suppress(SrosError):
+                trusted = keystore.read(folder / IDENTITY_CA_FILE, "CA certificate")
+                lists = [trusted]  # which has a list, too, in a rotation
+                if (folder / CRL_FILE).exists():
+                    lists.append(keystore.read(folder / CRL_FILE, "revocation list"))
+                holders[trusted, b"\n".join(lists)][shown] = None
+    found: dict[tuple[str, str], None] = {}
+    for (trusted, own_lists), earlier in holders.items():
+        for authority in _certificates(trusted):
+            signer = authority.public_bytes(Encoding.PEM)
+            own = _newest_list(own_lists, signer)
+            newest = max(
+                (_newest_list(lists, signer) for _, lists in holders), key=attrgetter("number")
+            )
+            lacking = newest.serials - own.serials
+            if newest.number == own.number or not lacking:
+                continue
+            later = [
+                shown
+                for (_, lists), names in holders.items()
+                for shown in names
+                if _newest_list(lists, signer) == newest
+            ]
+            text = (
+                f"accept {counted(len(lacking), 'certificate')} that the newer revocation list of "
+                f"{names_text(later)} revokes"
+            )
+            found |= {(shown, f"nodes of {shown} {text}"): None for shown in earlier.keys() - later}
+    for shown, text in found:
+        yield PEERS_ACCEPT.found(shown, text, shown)
+
+
+class _List(NamedTuple):
+    """Number of a revocation list, and what it revokes; -1 and nothing without a list."""
+
+    number: int
+    serials: frozenset[int]
+
+
+@lru_cache(maxsize=256)
+def _newest_list(lists: bytes, signer: bytes) -> _List:
+    """Return the newest of the revocation lists that a CA signed."""
+    newest = newest_list(lists, signer)
+    if newest is None:
+        return _List(-1, frozenset())
+    return _List(list_number(newest), frozenset(entry.serial for entry in revoked_in(newest)))
 
 
 # ── governance and domains ─────────────────────────────────────────────────────────────────
