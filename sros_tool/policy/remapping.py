@@ -44,7 +44,7 @@ class Remapping(NamedTuple):
         return f"{self.node}{':' * bool(self.node)}{self.old}:={self.new}"
 
 
-class Use(NamedTuple):
+class UsedRule(NamedTuple):
     """A rule that changed a node or one of its groups (``kind``, "" for the node itself)."""
 
     rule: Remapping
@@ -119,12 +119,12 @@ def remapped_policies(
     return [policy for policy, _ in remapped], notes
 
 
-def remapped_policy(policy: Policy, rules: Sequence[Remapping]) -> tuple[Policy, set[Use]]:
+def remapped_policy(policy: Policy, rules: Sequence[Remapping]) -> tuple[Policy, set[UsedRule]]:
     """Return a policy with remapped names, and the uses of the rules.
 
     Where a wildcard matches the old name, the new name is added to the wildcard.
     """
-    used: set[Use] = set()
+    used: set[UsedRule] = set()
 
     def remapped(profile: Profile) -> Profile:
         renamed = [rule for rule in rules if rule.old == _NODE and rule.node in ("", profile.node)]
@@ -132,7 +132,7 @@ def remapped_policy(policy: Policy, rules: Sequence[Remapping]) -> tuple[Policy,
         of_node = [rule for rule in rules if rule.old != _NODE and rule.node in ("", node)]
         moved = [rule for rule in of_node if rule.old == _NAMESPACE]
         ns = moved[0].new if moved else profile.ns
-        used.update(Use(rule, profile.node) for rule in renamed[:1] + moved[:1])
+        used.update(UsedRule(rule, profile.node) for rule in renamed[:1] + moved[:1])
         of_names = [rule for rule in of_node if rule.old != _NAMESPACE]
         groups = tuple(_remapped_group(group, of_names, ns, node, used) for group in profile.groups)
         return replace(profile, ns=ns, node=node, groups=groups)
@@ -142,7 +142,7 @@ def remapped_policy(policy: Policy, rules: Sequence[Remapping]) -> tuple[Policy,
 
 
 def _remapped_group(
-    group: Group, rules: Iterable[Remapping], ns: str, node: str, used: set[Use]
+    group: Group, rules: Iterable[Remapping], ns: str, node: str, used: set[UsedRule]
 ) -> Group:
     """Return a group of a node with remapped names; add the rules that apply to ``used``."""
     by_name: dict[str, Remapping] = {}
@@ -152,7 +152,7 @@ def _remapped_group(
     def new_names(name: str) -> Iterator[str]:
         full = expand(name, ns, node)
         fitting = [rule for old, rule in by_name.items() if matches(full, old)]
-        used.update(Use(rule, node, group.kind) for rule in fitting)
+        used.update(UsedRule(rule, node, group.kind) for rule in fitting)
         if not fitting or is_expression(full):
             yield name
         yield from (rule.new for rule in fitting)

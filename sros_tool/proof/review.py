@@ -116,6 +116,7 @@ _NOT_USED = (
     "changes and is not reviewed: no reviewed policy uses it. Name it with --policy, leave it out "
     "with"
 )
+_BOTH_NAMES = "name the folder of both names with --policy, which compares them"
 _PRIVATE_KEY = re.compile(rb"-----BEGIN (?:[A-Z0-9]+ )*PRIVATE KEY-----(?:\s|\\[nr])+[\w+/]")
 """A private key in PEM; a text that only mentions the first line does not match."""
 _OF_POLICIES = tuple(
@@ -499,7 +500,7 @@ class _Review:
             try:
                 files = side.policies(path, placeholders=fleet is not None)
                 if not files:
-                    raise self._missing_file_error(path)
+                    raise self._missing_file_error(path, f" If it is renamed, {_BOTH_NAMES}.")
                 policies += [file for file in files if file not in policies]
             except (SrosError, OSError) as error:
                 known = error if isinstance(error, SrosError) else DocumentError(str(error))
@@ -534,7 +535,7 @@ class _Review:
                 yield ReviewStep("new-access", path, _UNDECIDED, error)
         return keystores
 
-    def _missing_file_error(self, path: str) -> DocumentError:
+    def _missing_file_error(self, path: str, advice: str = "") -> DocumentError:
         """Return the error for a file that HEAD lacks, with a hint where it may have moved."""
         entry = self.base.entry(path) if self.base else None
         became = ""
@@ -544,7 +545,9 @@ class _Review:
                 if tree_entry.id == entry.id:
                     became = f"The change renames it to '{name}'."
         return DocumentError(
-            f"'{path}' is not in the commit", became, "Review the files that the robot uses."
+            f"'{path}' is not in the commit",
+            became,
+            f"Review the files that the robot uses.{advice if entry else ''}",
         )
 
     @staticmethod
@@ -896,7 +899,8 @@ class _Review:
             assert self.base
             for path in self.request.policies:  # raises the reason why it was not read
                 self.base.policies(path, placeholders=base_fleet is not None)
-            new = (("is new, so that all of its access is new", " ".join(self.request.policies)),)
+            text = f"is new, so that all of its access is new; if it is renamed, {_BOTH_NAMES}"
+            new = ((text, " ".join(self.request.policies)),)
             return _FOUND, Facts(new)
         return self._compared_access(before(), head, moving())
 

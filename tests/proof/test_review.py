@@ -329,6 +329,15 @@ def test_a_name_has_a_line_only_if_it_is_new_in_another_namespace(change: Change
         assert "has no / at" not in ended.out
 
 
+def test_a_renamed_policy_is_compared_by_its_folder(change: Change) -> None:
+    """Where its file is named, what is new in it is lost among all that has a new place."""
+    shutil.copytree(change.folder / "common", change.folder / "p/common")
+    change.base = change.commit({"p/a.xml": policy_text({"/a": publish("/x")})})
+    change.commit({"p/a.xml": None, "p/b.xml": policy_text({"/a": publish("/x", "/y")})})
+    ended = change.review("--policy", "p")
+    assert ended.status == 1 and "1 right is new" in ended.out, ended
+
+
 def test_a_renamed_enclave_is_one_line_and_still_new_access(change: Change) -> None:
     reads = publish("/x").replace("publish", "subscribe")
     change.base = change.commit({"robot.xml": policy_text({"/a": publish("/x"), "/b": reads})})
@@ -1044,7 +1053,10 @@ def test_what_is_new_included_or_cannot_fail(change: Change) -> None:
     assert "node.xml" not in change.review("--policy", "robot.xml").ok().out
     change.commit({"new.xml": policy_text({"/c": publish("/z")})})
     new = change.review("--policy", "new.xml")
-    assert (new.status, "is new, so that all of its access is new" in new.out) == (1, True), new
+    assert (new.status, "is new, so that all of its access is new; if it" in new.out) == (
+        1,
+        True,
+    ), new
     change.base = change.commit({"robot.toml": ONLY.replace("/x", "/nobody")})
     change.commit({"README": "x"})
     empty = change.review("--policy", "robot.xml", "--requirements", "robot.toml")
