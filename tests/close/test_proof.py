@@ -4,11 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import UTC, datetime
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
+
 from sros_tool.close.nodes import MovedEndpoint
-from sros_tool.close.proof import _abandoned_names, _lonely_endpoints, _unseen_text
+from sros_tool.close.proof import (
+    _abandoned_names,
+    _lonely_endpoints,
+    _proof_of_requirements,
+    _unseen_text,
+)
 from sros_tool.explain.audit import DeniedRight
 from sros_tool.graph.observation import Endpoint, make_observation
 from sros_tool.policy.model import ALLOW
@@ -57,6 +65,33 @@ def test_a_moved_node_is_left_alone_if_nobody_is_at_its_new_name() -> None:
     right = Right("/guard", ALLOW, "subscribe", "/safe/wheel")
     denied = DeniedRight(right, ("/safe/guard",), "no rule", False, False, (new,))
     assert not _lonely_endpoints(before, now, moved, [denied])
+
+
+@pytest.mark.parametrize(
+    ("statuses", "holds"),
+    [
+        ((0,), True),
+        ((0, 0), True),
+        ((0, 2), None),
+        ((2, 0), None),
+        ((2, 1), False),
+        ((0, 1), False),
+    ],
+)
+def test_requirements_hold_if_they_hold_here_and_elsewhere(
+    statuses: tuple[int, ...], holds: bool | None
+) -> None:
+    """The first status is of the export, the second of the enclaves of other machines, too."""
+    answers = iter(statuses)
+    robot: Any = SimpleNamespace(
+        requirements=Path(__file__),
+        export="export",
+        rights_source="keystore",
+        not_here=["/laptop"] * (len(statuses) > 1),
+        shell=SimpleNamespace(check=lambda *_: next(answers)),
+    )
+    (proof,) = _proof_of_requirements(robot)
+    assert proof.holds is holds
 
 
 def test_a_node_that_others_do_not_see_on_zenoh_needs_its_enclave_in_its_command() -> None:

@@ -45,6 +45,7 @@ from sros_tool.keystore.fleet import recorded_fleet
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import PUBLISHED, key_on_robot
+from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.reader import OpenedKeystore, read_certificate
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, key_digest, make_request, validity_of
@@ -797,10 +798,10 @@ def without_times(text: str) -> list[str]:
     return [line for line in text.splitlines() if "<not_" not in line and "<subject" not in line]
 
 
-def refused(home: Home, robot: str, now: datetime = DUE, **sent: object) -> str:
+def refused(home: Home, robot: str, now: datetime = DUE, signer: str = "", **sent: object) -> str:
     """Return why the only request of a robot's message was refused; nothing is signed."""
     head = (home.root / "ledger.p7s").read_bytes()
-    home.send(robot, now, "", **sent)
+    home.send(robot, now, signer, **sent)
     *_, request = home.of(robot, now).requests
     assert request.outcome == "refused", request
     assert (home.root / "ledger.p7s").read_bytes() == head
@@ -852,6 +853,11 @@ def test_the_grace_after_expiry(home: Home) -> None:
     found = home.collect(LATE)
     assert [robot.requests[0].outcome for robot in found.robots[:2]] == ["renewed", "refused"]
     assert "renewal_grace of r2: 1d" in found.robots[1].requests[0].why
+    renew(home.root, ["/r2/arm"], now=LATE)
+    arm = "enclaves/r2/arm/cert.pem"
+    shutil.copy(home.root / arm, home.folder / "r2" / arm)
+    why = refused(home, "r2", LATE, "/r2/arm", requests=(home.request("r2"),))
+    assert "renewal_grace of r2: 1d" in why, "also where a valid enclave asks for it"
 
 
 def test_one_request_that_cannot_be_signed_stops_no_other(home: Home) -> None:

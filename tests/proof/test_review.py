@@ -879,8 +879,11 @@ def test_a_keystore_fails_for_a_finding_an_expiry_and_a_link_out_of_it(
     (only,) = json.loads(change.review(*words, "1d", "--json").out)["findings"]
     assert only["id"] == "keystore.settings-edited", only
     change.commit({"ks/enclaves/a/cert.pem": "damaged", "ks/sros.toml": settings})
-    damaged = change.review(*words, "1d")
-    assert (damaged.status, "keystore ks: 1 error" in damaged.out) == (2, True), damaged
+    damaged = json.loads(change.review(*words, "1d", "--json").out)
+    steps = {each["step"]: (each["status"], each["result"]) for each in damaged["steps"]}
+    assert (damaged["status"], steps["keystore"][0]) == (2, 1), damaged
+    assert steps["keystore"][1].startswith("1 error"), damaged
+    assert steps["expiry"] == (2, "0 of 1 enclaves need to be renewed, 1 cannot be read"), damaged
     certificate.unlink()
     certificate.symlink_to("../../../robot.xml")
     change.commit({})
