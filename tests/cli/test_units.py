@@ -43,6 +43,7 @@ def test_nodes_of_several_enclaves(made: Path, tmp_path: Path) -> None:
     gripper = settings(folder, "arm-gripper")
     assert f"BindReadOnlyPaths={THERE}/enclaves/arm/gripper" in gripper
     assert f"TemporaryFileSystem={THERE}/enclaves:ro" in gripper
+    assert f"InaccessiblePaths=-{THERE}/private" in gripper, "the keys of the CAs"
     assert 'Environment="ROS_SECURITY_ENCLAVE_OVERRIDE=/arm/gripper"' in gripper
     assert gripper[-1] == "ExecStart=/etc/sros/nodes/arm/gripper"
     assert f"InaccessiblePaths=-{THERE}/enclaves/arm/gripper" in settings(folder, "arm")

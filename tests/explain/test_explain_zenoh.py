@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import shutil
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -368,6 +369,15 @@ def test_an_expired_certificate_gets_no_link(made: Path) -> None:
     found = zenoh(made / "client", "/talker", "publish", "/chatter", "--at", "3y")
     assert found["outcome"] == "refused"
     assert "expired" in found["text"]
+
+
+def test_a_certificate_of_another_enclave_gets_no_link(keystore: Path) -> None:
+    """Zenoh gives its process the rights of the other enclave."""
+    for file in ("cert.pem", "key.pem"):
+        shutil.copy(keystore / "enclaves/listener" / file, keystore / "enclaves/talker")
+    found = zenoh(keystore, "/talker", "publish", "/chatter")
+    assert found["outcome"] == "refused"
+    assert "by the common name '/listener' of cert.pem" in found["text"]
 
 
 @pytest.mark.parametrize("mode", MODES)

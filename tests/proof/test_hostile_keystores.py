@@ -398,6 +398,7 @@ OPEN_SETTINGS = [
     ("transport/link/tls/verify_name_on_connect", False, ""),
     ("transport/link/tls/root_ca_certificate", "/tmp/ca.pem", "a certificate of that CA gets a"),
     ("transport/link/protocols", ["tls", "quic"], "without -> with quic"),
+    ("transport/link/protocols", None, "without -> with all"),
     ("transport/shared_memory/enabled", True, LESS),
     ("scouting/multicast/enabled", True, LESS),
     ("adminspace/enabled", True, "adminspace/permissions/read of /router router.json5 false -> "),
@@ -421,7 +422,7 @@ OPEN_SETTINGS = [
 
 @pytest.mark.parametrize(("path", "value", "said"), OPEN_SETTINGS)
 def test_settings_of_zenoh_are_compared(sound: Path, path: str, value: object, said: str) -> None:
-    keystore = sound / f"set-{path.replace('/', '-')}"
+    keystore = sound / f"set-{path.replace('/', '-')}-{type(value).__name__}"
     copy_of(sound / "ks", keystore)
     setting(path, value)(keystore)
     authority = load_certificate((keystore / "public/permissions_ca.cert.pem").read_bytes(), "")

@@ -6,6 +6,7 @@ import pytest
 
 from sros_tool.runtime.vendor_log import (
     endpoint_refusal,
+    log_lines,
     missing_security,
     participant_refusal,
     plain_refusal,
@@ -77,3 +78,9 @@ def test_what_is_no_refusal(line: str) -> None:
 def test_security_that_is_not_built_in() -> None:
     assert missing_security("This Fast DDS version doesn't have the security libraries")
     assert missing_security("the Cyclone DDS being used does not have security support enabled.")
+
+
+def test_no_process_puts_a_line_of_another_one_into_a_log() -> None:
+    """Behind another line separator, a label would make the text that of another process."""
+    line = "[a-1] one\r[b-2] two\x0b[b-2] three\x85[b-2] four\u2028[b-2] five"
+    assert log_lines(f"{line}\r\n[b-2] own\n") == [line, "[b-2] own", ""]
