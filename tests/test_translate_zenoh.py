@@ -412,7 +412,8 @@ def test_a_session_trusts_its_router_with_its_own_rights_alone(tmp_path: Path) -
 # ── the graph ──────────────────────────────────────────────────────────────────────────────
 
 NODES = """
-<profile ns="/" node="n"><topics publish="ALLOW"><topic>chatter</topic></topics></profile>
+<profile ns="/" node="n"><topics publish="ALLOW"><topic>chatter</topic></topics>
+  <services reply="ALLOW"><service>~/list_parameters</service></services></profile>
 <profile ns="/arm/left" node="camera_*">
   <topics publish="ALLOW" subscribe="ALLOW"><topic>image*</topic></topics>
   <topics publish="DENY"><topic>image_secret</topic><topic>image/*/raw</topic></topics>
@@ -442,6 +443,8 @@ TOKENS = {  # what a token announces, and whether it may
     "MP/%e/%arm%left/camera_1/%arm%left%image_secret/t/h/q": False,
     "SS/%e/%arm%left/camera_1/%arm%left%camera_1%get_parameters/t/h/q": True,
     "SS/%e/%arm%left/camera_1/%arm%left%camera_1%set_parameters/t/h/q": False,
+    "SS/%e/%/n/%n%list_parameters/t/h/q": True,
+    "SS/%e/%arm%left/camera_1/%n%list_parameters/t/h/q": False,
     "SC/%e/%/n/%dock%_action%send_goal/t/h/q": True,
     "SS/%e/%/n/%dock%_action%send_goal/t/h/q": False,
     "MS/%e/%/n/%dock%_action%status/t/h/q": True,
@@ -525,15 +528,16 @@ def test_denied_services_of_a_node_take_it_away(
     assert tuple(graph_rules("/e", 0, rights, nodes_in_rules(rules, "/e"))) == rules
     own = RemoteRights("/e", rules)
     peer = RemoteRights("/p", tuple(graph_rules("/p", 0, rights, profiles)))
-    direct = next(
-        r for r in RightsBetween((own, peer)).rights_for_others("/p") if r.common_name == "/e"
-    )
+    between = RightsBetween((own, peer))
+    direct = next(r for r in between.rights_for_others("/p") if r.common_name == "/e")
+    obeyed = AccessControl(tuple(between.rights_for_others("/e")))
     for remote in (own, direct):
         control = AccessControl((remote,))
         for announced in ("NN/%e/{}", "MP/%e/{}/%chatter/t/h/q"):
             for node in (*may, *may_not):
                 key = f"@ros2_lv/0/z/0/0/{announced.format(node)}"
                 assert control.allows("/e", IN, Message.LIVELINESS_TOKEN, key) is (node in may), key
+                assert obeyed.allows("/p", OUT, Message.LIVELINESS_TOKEN, key) is (node in may), key
         announcing = ("/e", IN, Message.LIVELINESS_TOKEN)
         passes = partial(control.allows, *announcing)
         assert passes(example_token(0, "/e", control.allowed_keys(*announcing), passes))

@@ -25,8 +25,11 @@ def test_only_the_authority_itself_may_have_signed() -> None:
     for other in others:
         document = smime.parse(signed_by(other)(b"document"))
         document.verify(other[0])
-        with pytest.raises(PkiError, match="it is signed by"):
-            document.verify(signer[0])
+        both = smime.parse(signed_by(signer, also=other)(b"document"))
+        assert len(both.signatures) == 2
+        for signed in (document, both):
+            with pytest.raises(PkiError, match="it is signed by"):
+                signed.verify(signer[0])
 
 
 def test_what_was_changed_after_it_was_signed_is_refused() -> None:
