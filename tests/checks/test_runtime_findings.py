@@ -17,11 +17,19 @@ import pytest
 from sros_tool.checks import runtime
 from sros_tool.checks.environment import secured_by
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingFilter
+from sros_tool.checks.processes import may_lack_list
 from sros_tool.checks.runtime import RuntimeState
-from sros_tool.runtime.processes import Process, ProcessTable, RunningProcesses
+from sros_tool.keystore.layout import CERTIFICATE_FILE, CRL_FILE
+from sros_tool.runtime.processes import (
+    LoadedFile,
+    Process,
+    ProcessEnclave,
+    ProcessTable,
+    RunningProcesses,
+)
 from sros_tool.zenoh.json5 import MOST_BYTES
 from tests.checks import zenoh_cases
-from tests.checks.bench import DAY, Bench
+from tests.checks.bench import DAY, SECRET, Bench
 from tests.checks.runtime_cases import (
     CASES,
     DOMAIN,
@@ -43,6 +51,7 @@ from tests.checks.runtime_cases import (
     with_processes,
 )
 from tests.support.children import wait_for
+from tests.support.harness import sros
 
 pytest_plugins = ["tests.checks.sound_keystore"]
 
@@ -241,6 +250,32 @@ def test_what_keeps_the_enclave_from_loading_is_found_too(sound_one: RuntimeStat
     assert (missing.id, outdated.id) == ("enclave.file-missing", "runtime.process-outdated")
     assert "permissions.p7s" in missing.text
     assert "permissions.p7s (removed)" in outdated.text
+
+
+def test_a_process_of_a_revoked_enclave_whose_files_are_gone(bench: Bench) -> None:
+    """Where the keystore is, its ledger tells what the process has loaded."""
+    state = sound_state(bench)
+    sros("revoke", bench.root, "/base", env={"SROS_CA_PASSPHRASE": SECRET}).ok()
+    assert "runtime.process-revoked" in ids(state)
+
+
+@pytest.mark.parametrize(
+    ("name", "moved", "lacks"),
+    [
+        (CERTIFICATE_FILE, False, False),
+        (CERTIFICATE_FILE, True, True),
+        (CRL_FILE, False, True),
+        ("", True, True),
+        ("", False, False),
+    ],
+)
+def test_a_process_that_may_have_loaded_another_list(name: str, moved: bool, lacks: bool) -> None:
+    """Of a folder that was moved since, nobody knows which list the process found there."""
+    begin = datetime.now(UTC)
+    later = begin + timedelta(seconds=1)
+    files = (LoadedFile(name, later),) if name else ()
+    enclave = ProcessEnclave("/ks", "/a", files, moved={"/ks": later} if moved else {})
+    assert may_lack_list(Process(1, ("node",), {}, begin), enclave) is lacks
 
 
 def test_the_daemon_of_another_domain_is_not_asked(sound_one: RuntimeState, bench: Bench) -> None:

@@ -59,6 +59,7 @@ def test_under_default_allow_a_denial_of_everything_holds(tmp_path: Path) -> Non
     assert "zenoh.deny-in-wildcard" not in found(tmp_path, document)
     rule("less", "deny", "@ros2_lv/0/**", "/router")(document)
     assert "zenoh.deny-in-wildcard" in found(tmp_path, document)
+    assert "zenoh.name-not-verified" in found(tmp_path, document), "nobody has to have a name"
 
 
 def test_the_defaults_of_zenoh_are_open(tmp_path: Path) -> None:
