@@ -380,6 +380,10 @@ def test_an_error_is_said_once(change: Change, tmp_path: Path) -> None:
     assert ended.status == 2 and ended.out.count("not well-formed") == 1
     assert ended.out.count(": could not be decided, for the same reason\n") == 2
     assert summary.read_text().count("not well-formed") == 2  # in short, and as a finding
+    (link := tmp_path.with_name("link.md")).symlink_to(summary)
+    ended = change.review("--policy", "robot.xml", "--summary", str(link))
+    assert (ended.status, link.is_symlink()) == (2, True)
+    assert "sros does not write through links or to devices" in ended.err
 
 
 def test_a_common_part_that_ships_with_sros_needs_no_review(change: Change) -> None:
