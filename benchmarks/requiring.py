@@ -14,6 +14,7 @@ LIMIT = 5.0
 
 def requiring(folder: Path, enclaves: int, rounds: int) -> list[Figure]:
     """Measure the decision on 50 requirements, with as many names as enclaves."""
+    from sros_tool.checks.keystores.opened import Circumstances
     from sros_tool.proof.findings import decide_all
     from sros_tool.proof.requirements import parse_requirements
     from sros_tool.proof.system import load_system
@@ -25,7 +26,8 @@ def requiring(folder: Path, enclaves: int, rounds: int) -> list[Figure]:
     def work() -> float:
         begin = time.process_time()
         found = decide_all(
-            parse_requirements(text, "required.toml"), load_system(policy, moment=datetime.now(UTC))
+            parse_requirements(text, "required.toml"),
+            load_system(policy, Circumstances(datetime.now(UTC))),
         )
         taken = time.process_time() - begin
         assert len(found.violations) == 1

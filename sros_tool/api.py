@@ -843,6 +843,7 @@ def check_requirements(
         >>> for finding in sros_tool.check_requirements("robot.xml", "robot.requirements.toml"):
         ...     print(finding.place, finding.text)
     """
+    from sros_tool.checks.keystores.opened import Circumstances
     from sros_tool.checks.kind import NOTE
     from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.keystore.template import load_template
@@ -852,16 +853,18 @@ def check_requirements(
 
     if vendor and vendor not in WORLDS:
         raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(WORLDS)}.")
-    of, only = _domain(domain), _vendors(vendor, distribution)
+    at = Circumstances(
+        _time_or_now(now),
+        zone,
+        _domain(domain),
+        vendors=_vendors(vendor, distribution),
+        fleet=read_fleet(Path(fleet)) if fleet else None,
+    )
     files = [requirements] if isinstance(requirements, str | PathLike) else requirements
     system = load_system(
         [Path(path)] if isinstance(path, str | PathLike) else list(map(Path, path)),
-        moment=_time_or_now(now),
-        zone=zone,
-        domain=of,
-        fleet=read_fleet(Path(fleet)) if fleet else None,
-        only_enclaves=only,
-        template=load_template(fspath(template)) if template else None,
+        at,
+        load_template(fspath(template)) if template else None,
     )
     findings = requirement_findings(read_all_requirements(map(Path, files), system.fleet), system)
     return tuple(

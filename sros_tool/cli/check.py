@@ -458,16 +458,7 @@ def _system(
     from sros_tool.keystore.template import load_template
     from sros_tool.proof.system import load_system
 
-    return load_system(
-        paths,
-        keystore=circumstances.opened.get(paths[0]),
-        moment=circumstances.now,
-        zone=circumstances.zone,
-        domain=circumstances.domain,
-        fleet=circumstances.fleet,
-        only_enclaves=circumstances.vendors,
-        template=load_template(template) if template else None,
-    )
+    return load_system(paths, circumstances, load_template(template) if template else None)
 
 
 def _suggested(system: System) -> str:

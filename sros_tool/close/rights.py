@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.close.robot import MOST_NAMES, REQUIREMENTS, TEMPLATE
 from sros_tool.errors import SrosError
 from sros_tool.files import policies_dir
@@ -102,7 +103,7 @@ def requirements_broken_by(robot: Path, addition: str, moment: datetime) -> list
         merged = merge_into(path, read_policy(path, addition.encode())).document
 
         def broken_requirements(policy: Policy) -> dict[Requirement, None]:
-            decided = decide_all(needed, policy_system(policy, moment=moment, template=template))
+            decided = decide_all(needed, policy_system(policy, Circumstances(moment), template))
             return dict.fromkeys(violation.requirement for violation in decided.violations)
 
         if after := broken_requirements(read_policy(path, merged)):

@@ -960,21 +960,19 @@ class _Review:
         base_files: dict[str, Path] = {}
         if self.base:
             base_files = yield from self._requirement_files(self.base)
-        at, zone = self.request.at, self.request.zone
+        at = self._circumstances()
         systems: dict[str, Callable[[], System]] = {
             path: partial(
                 load_system,
                 folder,
-                moment=at,
-                zone=zone,
-                keystore=OpenedKeystore(folder, lacks_keys=True),
+                replace(at, opened={folder: OpenedKeystore(folder, lacks_keys=True)}),
             )
             for path, folder in keystores.items()
         }
         if self.request.policies:
             named = " ".join(self.request.policies)
             systems[named] = lambda: load_system(
-                policies, moment=at, fleet=fleet, template=self._template()
+                policies, self._circumstances(fleet), self._template()
             )
         if not systems:
             yield from _read(files, lambda: fleet)

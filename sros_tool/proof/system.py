@@ -8,13 +8,14 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta, tzinfo
+from datetime import datetime, timedelta
 from functools import partial
 from itertools import product
 from pathlib import Path
 from shlex import quote
 
 from sros_tool.automata import NameSet
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.dds.decision.access import Access, AccessVerb, GovernedDomain
 from sros_tool.dds.decision.expressions import matches
 from sros_tool.dds.decision.grants import other_fitting_enclaves
@@ -105,28 +106,16 @@ class System:
 
 
 def load_system(
-    path: Path | Sequence[Path],
-    *,
-    moment: datetime,
-    zone: tzinfo = UTC,
-    domain: int | None = None,
-    fleet: Fleet | None = None,
-    only_enclaves: Collection[str] = (),
-    template: Template | None = None,
-    keystore: OpenedKeystore | None = None,
+    path: Path | Sequence[Path], at: Circumstances, template: Template | None = None
 ) -> System:
     """Return the worlds of policies, or of a keystore with its signed documents.
 
     Args:
         path: the keystore; or policies and folders of policies, which count as one policy.
-        moment: the time for which rights are decided.
-        zone: the time zone of robots, in which some vendors read dates.
-        domain: the ROS domain; for a keystore, None stands for all domains.
-        fleet: the robots that fill in placeholders of a policy.
-        only_enclaves: the names of the wanted worlds, from `WORLDS`; () stands for all. A keystore
+        at: the moment, the time zone of robots, the ROS domain (for a keystore, None stands for all
+            domains), the fleet, and the vendors of the wanted worlds, from `WORLDS`. A keystore
             without Zenoh configurations has no Zenoh world.
         template: the template of the keystore for which a policy is meant.
-        keystore: the keystore, if it is open already.
 
     Raises:
         DocumentError: a file cannot be read, there is no policy, two policies state the same
@@ -142,33 +131,21 @@ def load_system(
                 "A template is for a policy that is not signed yet.",
                 "Leave --template out, or check the policy.",
             )
-        return _keystore_system(
-            keystore or OpenedKeystore(paths[0]), moment, zone, domain, only_enclaves
-        )
+        return _keystore_system(at.keystore(paths[0]), at)
     files = [file for path in paths for file in files_of_policies(path)]
     if not files:
         raise PolicyError(
             "requirements need a policy, and there is no policy", "", "Name a policy."
         )
-    policy = join_policies([read_policy_for(file, fleet) for file in files])
-    system = policy_system(
-        policy, moment=moment, domain=domain or 0, only_enclaves=only_enclaves, template=template
-    )
-    return replace(system, fleet=lambda: fleet)
+    policy = join_policies([read_policy_for(file, at.fleet) for file in files])
+    return replace(policy_system(policy, at, template), fleet=lambda: at.fleet)
 
 
 # ── a policy ───────────────────────────────────────────────────────────────────────────────
 
 
-def policy_system(
-    policy: Policy,
-    *,
-    moment: datetime,
-    domain: int = 0,
-    only_enclaves: Collection[str] = (),
-    template: Template | None = None,
-) -> System:
-    """Return the worlds of a policy as if it were signed at ``moment``.
+def policy_system(policy: Policy, at: Circumstances, template: Template | None = None) -> System:
+    """Return the worlds of a policy as if it were signed now, for its ROS domain or 0.
 
     The governance is the template's, with the protection that the policy states added.  Without a
     template, a name has exactly the protection that the policy states for it, and all other names
@@ -179,6 +156,7 @@ def policy_system(
             enforce the policy.
     """
     refuse_fallbacks(policy)
+    domain = at.domain or 0
     domains = DomainSet.of((domain, domain))
     rights = frozenset(right for right in policy_rights(policy) if right.qualifier is ALLOW)
     stated = _stated_topics([enclave.path for enclave in policy.enclaves], rights)
@@ -192,17 +170,17 @@ def policy_system(
         enclave.path: permissions_for(
             enclave,
             subject=subjects[enclave.path],
-            validity=window(moment, _PLANNED),
+            validity=window(at.now, _PLANNED),
             domains=domains,
         )
         for enclave in policy.enclaves
     }
     worlds = []
     for vendor in TESTED:
-        if not only_enclaves or vendor.value in only_enclaves:
+        if not at.vendors or vendor.value in at.vendors:
             governed = GovernedDomain(vendor, governance, domain)
             access = {
-                name: (Access(governed, permissions, subjects[name], moment=moment),)
+                name: (Access(governed, permissions, subjects[name], moment=at.now),)
                 for name, permissions in signed.items()
             }
             granted = {} if unique else {name: (subject,) for name, subject in subjects.items()}
@@ -211,12 +189,12 @@ def policy_system(
                 _dds_world(vendor, access, stated, demanded=demanded, fitting_others=fitting_others)
             )
     left_out = None
-    if not only_enclaves or _ZENOH in only_enclaves:
+    if not at.vendors or _ZENOH in at.vendors:
         try:
             remotes = tuple(remote_rights(enclave, domain) for enclave in policy.enclaves)
             worlds.append(_planned_zenoh(policy, AccessControl(remotes), domain, stated))
         except SrosError as error:
-            if only_enclaves:
+            if at.vendors:
                 raise
             left_out = error
     return System(policy.file, tuple(worlds), Places.index_of_policy(policy), rights, left_out)
@@ -366,13 +344,7 @@ _MOST_DOMAINS = 20
 _MOST_GOVERNANCES = 4
 
 
-def _keystore_system(
-    keystore: OpenedKeystore,
-    at: datetime,
-    zone: tzinfo,
-    domain: int | None,
-    only_enclaves: Collection[str],
-) -> System:
+def _keystore_system(keystore: OpenedKeystore, at: Circumstances) -> System:
     """Return the worlds of a keystore.
 
     Each vendor has one world for each group of domains with the same rules.  The signed documents
@@ -388,7 +360,7 @@ def _keystore_system(
     source = load_rights(keystore, hidden=True)
     rights = frozenset(right for right in source.rights if right.qualifier is ALLOW)
     stated = _stated_topics(names, rights)
-    loaded = {name: deciding_enclave(keystore, name, moment=at) for name in names}
+    loaded = {name: deciding_enclave(keystore, name, moment=at.now) for name in names}
     for name, enclave in loaded.items():
         if (
             not enclave.permissions
@@ -424,7 +396,7 @@ def _keystore_system(
         for grant in grants_of_enclave
         for rule in grant.rules
     }
-    domains = (domain,) if domain is not None else DomainSet.one_of_each_kind(listed, granted)
+    domains = (at.domain,) if at.domain is not None else DomainSet.one_of_each_kind(listed, granted)
     domains = domains or (0,)
     if len(domains) > _MOST_DOMAINS:
         raise KeystoreError(
@@ -437,16 +409,18 @@ def _keystore_system(
         name: [grant.subject for grant in grants_of_enclave]
         for name, grants_of_enclave in grants.items()
     }
-    moments = {name: (at, *_later_moments(name, grants.get(name, ()), at)) for name in names}
+    moments = {
+        name: (at.now, *_later_moments(name, grants.get(name, ()), at.now)) for name in names
+    }
     worlds = []
     for vendor, number in product(TESTED, domains):
-        if only_enclaves and vendor.value not in only_enclaves:
+        if at.vendors and vendor.value not in at.vendors:
             continue
         title = vendor.title if len(domains) == 1 else f"{vendor.title} in domain {number}"
         access: dict[str, tuple[Access, ...]] = {}
         idle = []
         for name, enclave in loaded.items():
-            now = Evaluator(vendor, enclave, JoinContext(number, at, zone)).access
+            now = Evaluator(vendor, enclave, JoinContext(number, at.now, at.zone)).access
             if now is not None and len(moments[name]) == len(documents) == 1:
                 access[name] = (now,)
                 continue
@@ -457,7 +431,7 @@ def _keystore_system(
                 _without_faults(enclave, grants.get(name, ()), document) for document in documents
             )
             accesses = (
-                Evaluator(vendor, loaded_enclave, JoinContext(number, moment, zone)).access
+                Evaluator(vendor, loaded_enclave, JoinContext(number, moment, at.zone)).access
                 for loaded_enclave, moment in product(possible, moments[name])
             )
             access[name] = tuple(
@@ -471,8 +445,8 @@ def _keystore_system(
         )
     for first in range(0, len(worlds), len(domains)):
         _link_domains(worlds[first : first + len(domains)])  # those of one vendor
-    if _ZENOH in only_enclaves or (not only_enclaves and has_zenoh_files(root, hidden=True)):
-        on_zenoh = list(_zenoh_worlds(keystore, domain, stated))
+    if _ZENOH in at.vendors or (not at.vendors and has_zenoh_files(root, hidden=True)):
+        on_zenoh = list(_zenoh_worlds(keystore, at.domain, stated))
         _link_domains(on_zenoh)
         worlds += on_zenoh
     files = {name: str(enclave_path(root, name) / PERMISSIONS_FILE) for name in names}

@@ -389,20 +389,18 @@ def _with_requirements(
         UsageError: there are two sources.
         SrosError: the requirements cannot be read.
     """
+    from sros_tool.checks.keystores.opened import Circumstances
     from sros_tool.proof.findings import assumption_text, decide_all, decided_findings
     from sros_tool.proof.requirements import demand, read_requirements
     from sros_tool.proof.system import load_system
 
     if len(drawing.sources) > 1:
         raise UsageError("--requirements takes one policy or keystore", "", "Name only one SOURCE.")
-    system = load_system(
-        drawing.sources[0],
-        moment=drawing.now,
-        zone=drawing.zone,
-        fleet=drawing.fleets[0],
-        template=load_template(drawing.template) if drawing.template else None,
-        keystore=keystore,
-    )
+    at = Circumstances(drawing.now, drawing.zone, fleet=drawing.fleets[0])
+    if keystore:
+        at.opened[drawing.sources[0]] = keystore
+    template = load_template(drawing.template) if drawing.template else None
+    system = load_system(drawing.sources[0], at, template)
     stated = read_requirements(file, system.fleet)
     decided = decide_all(stated, system)
     findings = decided_findings(decided, system)

@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import render_governance
@@ -62,7 +63,7 @@ def witnesses(world: str, domain: int = DOMAIN) -> Iterator[tuple[Policy, Use, b
         policy = draw_policy(draw)
         try:
             system = policy_system(
-                policy, moment=datetime.now(UTC), domain=domain, only_enclaves=(world,)
+                policy, Circumstances(datetime.now(UTC), domain=domain, vendors=(world,))
             )
         except PolicyError:
             continue  # Zenoh cannot carry it out

@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from functools import lru_cache
 from itertools import count, permutations
 
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.dds.decision.vendors import TESTED
 from sros_tool.names import dds_names, expand
 from sros_tool.policy.model import (
@@ -171,7 +172,7 @@ def test_every_decision_is_that_of_brute_force() -> None:
     different: list[str] = []
     implied = 0
     for number, policy, requirements in cases():
-        system, protected = policy_system(policy, moment=NOW), levels(policy)
+        system, protected = policy_system(policy, Circumstances(NOW)), levels(policy)
         for world in system.worlds:
             # The links of Zenoh are always encrypted.
             level = (lambda _: 2) if world.title == "Zenoh" else protected

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.files import templates_dir
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
@@ -31,7 +32,7 @@ def may(right: str, *names: str) -> str:
 
 def robot(rights: Mapping[str, str]) -> System:
     policy = read_policy(Path("robot.xml"), policy_text(dict(rights)).encode())
-    return policy_system(policy, moment=NOW)
+    return policy_system(policy, Circumstances(NOW))
 
 
 def decided(rights: Mapping[str, str], required: str) -> Decided:
@@ -352,7 +353,7 @@ def test_protection_is_that_of_the_policy_and_of_a_chosen_template(
     weak.write_text((templates_dir() / "production.toml").read_text().replace("ENCRYPT", "SIGN"))
     template = load_template(str(weak) if chosen == WEAK else chosen) if chosen else None
     policy = read_policy(Path("r.xml"), policy_text({"/a": SCAN.format(name)}).encode())
-    system = policy_system(policy, moment=NOW, template=template)
+    system = policy_system(policy, Circumstances(NOW), template)
     found = decide_all(parse_requirements(required.encode(), "r.toml"), system)
     assert (not found.violations, bool(found.assumed)) == PROTECTION[case]
 
@@ -383,14 +384,14 @@ def test_unique_subjects_fit_no_other_permissions(tmp_path: Path) -> None:
     policy = read_policy(Path("r.xml"), policy_text(SHARED).encode())
     requirements = parse_requirements(ONLY_MUX.encode(), "r.toml")
     for template, holds in (("production", True), ("sros2", False)):
-        system = policy_system(policy, moment=NOW, template=load_template(template))
+        system = policy_system(policy, Circumstances(NOW), load_template(template))
         assert (decide_all(requirements, system).violations == ()) is holds
         (tmp_path / "r.xml").write_text(policy_text(SHARED))
         ks = tmp_path / template
         sros("create_keystore", ks, "--template", template).ok()
         sros("generate_artifacts", "-k", ks, "-p", tmp_path / "r.xml").ok()
         assert (
-            decide_all(requirements, load_system(ks, moment=NOW_SIGNED)).violations == ()
+            decide_all(requirements, load_system(ks, Circumstances(NOW_SIGNED))).violations == ()
         ) is holds
 
 

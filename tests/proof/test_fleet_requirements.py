@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.errors import DocumentError
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.proof.findings import decide_all
@@ -163,7 +164,9 @@ def test_proposals_for_a_fleet_demand_what_those_for_its_robots_demand(folder: P
     from sros_tool.fleet.fleet_file import read_fleet
 
     fleet = read_fleet(folder / "fleet.toml")
-    system = load_system(folder / "robot.xml", moment=datetime(2027, 1, 1, tzinfo=UTC), fleet=fleet)
+    system = load_system(
+        folder / "robot.xml", Circumstances(datetime(2027, 1, 1, tzinfo=UTC), fleet=fleet)
+    )
     each, folded = (suggest(system.rights, system.worlds, of) for of in (None, fleet))
     text = render_requirements(folded, "robot.xml")
     assert "# only /{robot}/mux may publish {namespace}/cmd_vel\n" in text

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.files import policies_dir
 from sros_tool.proof.findings import decide_all
 from sros_tool.proof.requirements import Requirement, demand, read_requirements
@@ -27,7 +28,9 @@ def requirements() -> tuple[Requirement, ...]:
 
 
 def test_they_hold_and_could_fail(requirements: tuple[Requirement, ...]) -> None:
-    decided = decide_all(requirements, load_system(policies_dir() / "mobile_robot.xml", moment=NOW))
+    decided = decide_all(
+        requirements, load_system(policies_dir() / "mobile_robot.xml", Circumstances(NOW))
+    )
     assert decided.violations == ()
     assert decided.vacuous == ()
     assert len(requirements) >= 15
@@ -133,7 +136,7 @@ def test_a_change_breaks_what_it_should(
     assert after != before
     file.write_text(after)
     asked = [each for each in requirements if LONG or shown(each) == mutation.breaks]
-    decided = decide_all(asked, load_system(folder / "mobile_robot.xml", moment=NOW))
+    decided = decide_all(asked, load_system(folder / "mobile_robot.xml", Circumstances(NOW)))
     (violation,) = decided.violations
     assert decided.vacuous == ()
     assert shown(violation.requirement) == mutation.breaks
