@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -397,51 +398,39 @@ def sign_request(
       $ sros sign_request keystore keystore/enclaves/arm/camera/request.pem \
             --renew -o camera.tgz
     """
+    from sros_tool.keystore.delivery.signing import certify_requests
     from sros_tool.keystore.delivery.signing import sign_request as sign
     from sros_tool.runtime.variables import domain_from
 
     root, request = root_and_file(arguments, "sign_request takes a keystore and one request")
+    work: Callable[..., Signed] = certify_requests
     if no_answer:
         if output is not None or force:
             raise UsageError("--no-answer makes no file: leave out -o and --force")
-        policy = _policy(policy_file, fleet_file)
-        _certify(
-            root,
-            request,
-            policy,
-            only,
-            allow_refusal,
-            refuse_revoked=refuse_revoked,
-            renew=renew,
-            dry_run=dry_run,
-            as_json=as_json,
-        )
-        return
-    if output is None:
-        output = _STREAM if request == _STREAM else Path(request.name).with_suffix(".answer.tar.gz")
-    stream = output == _STREAM
-    if stream and not dry_run:
-        _refuse_json(as_json)
-        _refuse_terminal()
-    existed = output.exists()
-    signed = sign(
+    else:
+        if output is None:
+            streamed = request == _STREAM
+            output = _STREAM if streamed else Path(request.name).with_suffix(".answer.tar.gz")
+        stream = output == _STREAM
+        if stream and not dry_run:
+            _refuse_json(as_json)
+            _refuse_terminal()
+        work = partial(sign, answer=None if stream else output, force=force)
+    existed = output is not None and output.exists()
+    signed = work(
         root,
         read_named(request, "signing request"),
         policy=_policy(policy_file, fleet_file),
         only_enclaves=only,
         refuse_revoked=refuse_revoked,
         renew=renew,
-        answer=None if stream else output,
-        force=force,
         domain=domain_from(os.environ),
         **change_options(dry_run=dry_run, allow_refusal=allow_refusal),
     )
     _show_signed(signed, output, existed=existed, as_json=as_json)
 
 
-def _show_signed(
-    signed: Signed, answer: Path | None, *, existed: bool = False, as_json: bool
-) -> None:
+def _show_signed(signed: Signed, answer: Path | None, *, existed: bool, as_json: bool) -> None:
     """Print what was done with signed requests; ``answer`` is the file for the robot."""
     from sros_tool.pki.certificates import digest
 
@@ -490,35 +479,6 @@ def _policy(file: Path | None, fleet_file: Path | None) -> Policy | FleetPolicy 
     if fleet_file is None:
         return read_policy(file)
     return FleetPolicy(read_policy(file, placeholders=True), read_fleet(fleet_file))
-
-
-def _certify(
-    root: Path,
-    request: Path,
-    policy: Policy | FleetPolicy | None,
-    only: tuple[str, ...],
-    allow_refusal: tuple[Vendor, ...],
-    *,
-    refuse_revoked: bool,
-    renew: bool,
-    dry_run: bool,
-    as_json: bool,
-) -> None:
-    """Certify the keys of several requests, and print what was done."""
-    from sros_tool.keystore.delivery.signing import certify_requests
-    from sros_tool.runtime.variables import domain_from
-
-    done = certify_requests(
-        root,
-        read_named(request, "signing request"),
-        policy=policy,
-        only_enclaves=only,
-        refuse_revoked=refuse_revoked,
-        renew=renew,
-        domain=domain_from(os.environ),
-        **change_options(dry_run=dry_run, allow_refusal=allow_refusal),
-    )
-    _show_signed(done, None, as_json=as_json)
 
 
 @verb("import")

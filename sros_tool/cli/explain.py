@@ -323,13 +323,15 @@ def explain(
     if who:
         asking = asking._replace(domain=domain_of(domain))  # all domains, unless asked
         chosen = None if why_zenoh else chosen_vendor(vendor, distro, os.environ)
-        only = patterns, robots
+        question, only = _question_to_all(rest, kind), (patterns, robots)
         if policy:
-            return _show_who_in_policy(policy, opened, rest, kind, chosen, asking, only, as_json)
-        by_stated = not (vendor or distro)
-        return _show_who(
-            opened, rest, kind, chosen, why_zenoh, asking, only, as_json, stated=by_stated
-        )
+            decider, where = _policy_to_decide(policy, opened, chosen, asking, only)
+        else:
+            by_stated = not (vendor or distro)
+            decider, where = _keystore_to_decide(
+                opened, chosen, why_zenoh, asking, only, stated=by_stated
+            )
+        return _print_answer_for_all(decider, question, kind, where, as_json)
     question = _question(opened, rest, kind)
     asked = _open(opened, rest[0], policy, asking)
     context = asking.context(asked.enclave.joined_domains)
@@ -802,28 +804,30 @@ def _link_text(link: CheckedLink) -> str:
 # ── --who ──────────────────────────────────────────────────────────────────────────────────
 
 
-def _show_who(
+_Where = tuple["Fleet | None", int | None, "DomainSet | None", str]
+"""The arguments of `_who_lines` after ``answer``."""
+_Only = tuple[tuple[str, ...], tuple[str, ...]]
+"""The values of --match and --robot."""
+
+
+def _keystore_to_decide(
     keystore: OpenedKeystore | None,
-    other_arguments: tuple[str, ...],
-    kind: str | None,
     chosen_vendor: tuple[Vendor, str] | None,
     why_zenoh: str,
     asking: AskingContext,
-    only: tuple[tuple[str, ...], tuple[str, ...]],
-    as_json: bool,
+    only: _Only,
     *,
     stated: bool,
-) -> int:
-    """Print which enclaves of the keystore may do something; return 0 if any may, else 1.
+) -> tuple[Decider, _Where]:
+    """Return who decides on the enclaves of a keystore, and where these are.
 
-    ``chosen_vendor`` is the vendor that decides, None for Zenoh; ``only`` are --match and --robot.
-    With ``stated``, the vendor of the distribution that the keystore or its fleet states decides.
+    ``chosen_vendor`` is the vendor that decides, None for Zenoh.  With ``stated``, the vendor of
+    the distribution that the keystore or its fleet states decides.
     """
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.layout import is_original_keystore
     from sros_tool.keystore.selection import select_enclaves
 
-    question = _question_to_all(other_arguments, kind)
     keystore = keystore or _keystore_of_environment()
     keystore.check()
     patterns, robots = only
@@ -852,21 +856,17 @@ def _show_who(
     is_export = not is_original_keystore(keystore.root)
     domains = None if is_export else keystore.domains
     asked_in = " in this export" if is_export else ""
-    where = (fleet, asking.domain, domains, asked_in)
-    return _print_answer_for_all(decider, question, kind, where, as_json)
+    return decider, (fleet, asking.domain, domains, asked_in)
 
 
-def _show_who_in_policy(
+def _policy_to_decide(
     policy: Path,
     keystore: OpenedKeystore | None,
-    other_arguments: tuple[str, ...],
-    kind: str | None,
     chosen_vendor: tuple[Vendor, str] | None,
     asking: AskingContext,
-    only: tuple[tuple[str, ...], tuple[str, ...]],
-    as_json: bool,
-) -> int:
-    """Print which enclaves of a policy may do something, like `_show_who`."""
+    only: _Only,
+) -> tuple[Decider, _Where]:
+    """Return who decides on the enclaves of a policy, and where these are."""
     from sros_tool.explain.asking import fleet_of, policy_to_ask
     from sros_tool.explain.vendors import VendorOfPolicy
 
@@ -881,11 +881,10 @@ def _show_who_in_policy(
         raise UsageError(
             "--robot takes a keystore", "", f"Add --match '/{robots[0]}/*' in place of it."
         )
-    question = _question_to_all(other_arguments, kind)
     fleet = fleet_of(asking.fleet_file, None)
     _, stated = policy_to_ask(policy, fleet)
     decider = VendorOfPolicy(stated, *chosen_vendor, asking, patterns or ("*",))
-    return _print_answer_for_all(decider, question, kind, (fleet, asking.domain, None, ""), as_json)
+    return decider, (fleet, asking.domain, None, "")
 
 
 def _question_to_all(other_arguments: tuple[str, ...], kind: str | None) -> Question:
@@ -900,16 +899,9 @@ def _question_to_all(other_arguments: tuple[str, ...], kind: str | None) -> Ques
 
 
 def _print_answer_for_all(
-    decider: Decider,
-    question: Question,
-    kind: str | None,
-    where: tuple[Fleet | None, int | None, DomainSet | None, str],
-    as_json: bool,
+    decider: Decider, question: Question, kind: str | None, where: _Where, as_json: bool
 ) -> int:
-    """Print the decisions on all enclaves; return 0 if any enclave may do it, else 1.
-
-    ``where`` has the arguments of `_who_lines` after ``answer``.
-    """
+    """Print the decisions on all enclaves; return 0 if any enclave may do it, else 1."""
     from sros_tool.explain.who import answer_for_all, callable_action, names_meant
 
     with progress("asking"):
