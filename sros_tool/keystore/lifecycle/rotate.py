@@ -176,7 +176,8 @@ def rotate_ca(
             cut_off = robots_cut_off(change.keystore, rotation, stage, change.now)
             if cut_off and not allow_unconfirmed:
                 raise _cut_off_error(change.keystore, rotation, stage, cut_off, roles)
-            stage = rotator.go_to(stage, roles, new_keys, existing, validity, progress)
+            wanted = _WantedAuthorities(roles, new_keys, existing, validity)
+            stage = rotator.go_to(stage, wanted, progress)
             if stage in (RotationStage.DISTRIBUTE, RotationStage.REISSUE):
                 change.notes += _no_robot_notes(change.keystore, change.names)
             change.finish()
@@ -458,13 +459,7 @@ class _Rotator:
         self.kept_elsewhere: list[str] = []
 
     def go_to(
-        self,
-        stage: RotationStage,
-        roles: Sequence[str],
-        new_keys: Keyring,
-        existing: Mapping[str, bytes],
-        validity: Span | None,
-        progress: Progress | None,
+        self, stage: RotationStage, wanted: _WantedAuthorities, progress: Progress | None
     ) -> RotationStage:
         """Stage all changes up to ``stage``; return the stage of the keystore afterwards.
 
@@ -478,9 +473,7 @@ class _Rotator:
             self._refuse_deletion(stage)
             return stage
         if self._rotation.stage is RotationStage.NONE:
-            successors = self._begin_rotation(
-                roles, new_keys, existing, validity, next_to=stage is RotationStage.DISTRIBUTE
-            )
+            successors = self._begin_rotation(wanted, next_to=stage is RotationStage.DISTRIBUTE)
             if stage is RotationStage.DISTRIBUTE:
                 self._distribute(successors)
             else:
@@ -551,15 +544,7 @@ class _Rotator:
 
     # ── the stages ─────────────────────────────────────────────────────────────────────────
 
-    def _begin_rotation(
-        self,
-        roles: Sequence[str],
-        new_keys: Keyring,
-        existing: Mapping[str, bytes],
-        validity: Span | None,
-        *,
-        next_to: bool,
-    ) -> list[_Successor]:
+    def _begin_rotation(self, wanted: _WantedAuthorities, *, next_to: bool) -> list[_Successor]:
         for role in ROLES:
             strangers = unknown_authorities(self._keystore, role)
             if strangers and not self._keystore.ledger_with("what", "ca").gaps and next_to:
@@ -570,16 +555,9 @@ class _Rotator:
                     f"Restore '{self._root}/{ca_certificate(role)}' from a backup; or, if all "
                     "processes may be restarted together, replace the CAs at once with --finish.",
                 )
-        successors = _make_successors(
-            self._change,
-            roles,
-            new_keys,
-            existing,
-            window(self._change.now, validity or self._template.authority_validity),
-            next_to=next_to,
-        )
+        successors = _make_successors(self._change, wanted, next_to=next_to)
         for successor in successors:
-            if validity is None:
+            if wanted.validity is None:
                 self._note_earlier_expiry(successor.old[0], successor.new.certificate)
             self._change.entries.append(
                 certificate_entry(self._change.now, "ca", successor.new.certificate)
@@ -891,23 +869,28 @@ class _Successor:
         return Replacement(self.file, digest(self.old[0]), digest(self.new.certificate), self.key)
 
 
+@dataclass(frozen=True, slots=True)
+class _WantedAuthorities:
+    """The CAs with which a rotation begins, as for `rotate_ca`."""
+
+    roles: Sequence[str]
+    new_keys: Keyring
+    existing: Mapping[str, bytes]
+    validity: Span | None
+
+
 def _make_successors(
-    change: KeystoreChange,
-    roles: Sequence[str],
-    new_keys: Keyring,
-    existing: Mapping[str, bytes],
-    validity: Window,
-    *,
-    next_to: bool,
+    change: KeystoreChange, authorities: _WantedAuthorities, *, next_to: bool
 ) -> list[_Successor]:
-    """Create new CAs for ``roles`` (empty: for both roles), and stage their keys.
+    """Create the wanted CAs, and stage their keys.
 
     With ``next_to``, new keys in the keystore get file names next to the current keys; otherwise
     they replace the current keys.
     """
-    template = change.template
+    template, new_keys = change.template, authorities.new_keys
     files = change.keystore.authority_files
-    wanted = set(roles or ROLES)
+    wanted = set(authorities.roles or ROLES)
+    validity = window(change.now, authorities.validity or template.authority_validity)
     if IDENTITY in wanted and change.keyring.ca_service(change.root, IDENTITY, template):
         raise UsageError(
             f"the identity CA of keystore '{change.root}' is a CA service",
@@ -929,10 +912,7 @@ def _make_successors(
         if wanted & set(serves):
             _check_place(change, file, serves[0], new_keys)
             at = f"{PRIVATE}/{'next_' if next_to else ''}{file}.key.pem"
-            certificate = next((existing[role] for role in serves if role in existing), b"")
-            successors.append(
-                _make_successor(change, file, serves, at, new_keys, certificate, validity)
-            )
+            successors.append(_make_successor(change, file, serves, at, authorities, validity))
     return successors
 
 
@@ -957,11 +937,10 @@ def _make_successor(
     file: str,
     roles: tuple[str, ...],
     at: str,
-    new_keys: Keyring,
-    existing: bytes,
+    wanted: _WantedAuthorities,
     validity: Window,
 ) -> _Successor:
-    transaction, template = change.transaction, change.template
+    transaction, template, new_keys = change.transaction, change.template, wanted.new_keys
     old = change.keystore.certificates_of(file)
     encrypted = change.keyring.is_encrypted(change.keystore, roles[0], template)
     place = new_keys.places.get(roles[0], "")
@@ -992,7 +971,7 @@ def _make_successor(
         name = common_name(f"{template.authority_name} identity CA {secrets.token_hex(4)}")
     # Robots tell by the dates which CA replaced which: see `retired_authorities`.
     first = validity_of(old[0]).not_before
-    if existing:
+    if existing := next((wanted.existing[r] for r in roles if r in wanted.existing), b""):
         certificate = _existing_ca(change, roles, existing, key, name)
         if validity_of(certificate).not_before < first and publish_command(change.root):
             raise KeystoreError(
