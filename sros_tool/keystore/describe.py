@@ -53,6 +53,7 @@ from sros_tool.pki.certificates import (
     common_name_of,
     digest,
     load_certificates,
+    readable_fingerprints,
     subject_text,
     validity_of,
 )
@@ -380,7 +381,8 @@ class DescribedKeystore(NamedTuple):
     authorities: Mapping[str, AuthorityFile | UnreadableFile]
     """CAs of the keystore, by role (``identity``, ``permissions``)."""
     unknown_authorities: Sequence[str]
-    """CAs in the files of CAs that the ledger does not record, as text: somebody added them."""
+    """CAs in CA files, of the keystore or of an enclave, that the keystore does not know, as text:
+    somebody added them."""
     governance: DescribedGovernance | UnreadableFile | None
     """Governance of the keystore, or null."""
     zenoh: NetworkFacts | None
@@ -647,11 +649,7 @@ def _describe_keystore(keystore: OpenedKeystore, now: datetime) -> DescribedKeys
     problems += [f"ledger: {gap}" for gap in gaps]
     strangers: list[str] = []
     with suppress(SrosError):  # of the ledger, or of a file of CAs, as above
-        strangers += (
-            f"{role} CA: {authority_text(authority)} is not in the ledger"
-            for role in authorities
-            for authority in unknown_authorities(keystore, role)
-        )
+        strangers += _unknown_authorities(keystore, authorities, names, now)
     return DescribedKeystore(
         path=keystore.root,
         template=settings.name if settings else None,
@@ -664,6 +662,25 @@ def _describe_keystore(keystore: OpenedKeystore, now: datetime) -> DescribedKeys
         unreadable=unreadable,
         problems=problems + strangers,
     )
+
+
+def _unknown_authorities(
+    keystore: OpenedKeystore, roles: Iterable[str], names: Iterable[str], now: datetime
+) -> Iterator[str]:
+    """Yield, as text, CAs that the ledger does not record, and CAs in the file of an enclave alone.
+
+    Raises:
+        SrosError: the ledger or a CA file of the keystore cannot be read.
+    """
+    for role in roles:
+        for authority in unknown_authorities(keystore, role):
+            yield f"{role} CA: {authority_text(authority)} is not in the ledger"
+        known, file = {*map(digest, keystore.authority(role))}, f"{role}_ca.cert.pem"
+        for name in names:
+            data = keystore.enclave(name, now=now).files.get(file, b"")
+            if more := readable_fingerprints(data) - known:
+                text = f"{file} has a CA that the keystore lacks (SHA-256 {min(more)[:8]})"
+                yield f"{role} CA: {name}: {text}"
 
 
 def _describe_governance(

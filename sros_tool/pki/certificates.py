@@ -632,6 +632,15 @@ def fingerprints(pem: bytes) -> frozenset[str]:
     return frozenset(map(digest, load_certificates(pem, "the certificate of a CA")))
 
 
+@lru_cache(maxsize=8)
+def readable_fingerprints(pem: bytes) -> frozenset[str]:
+    """Return the `fingerprints` of a CA file; none if it cannot be read."""
+    try:
+        return fingerprints(pem)
+    except PkiError:
+        return frozenset()
+
+
 # ── DDS participants ───────────────────────────────────────────────────────────────────────
 
 IDENTITY_DIGITS = 12

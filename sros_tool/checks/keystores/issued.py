@@ -37,8 +37,8 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.protection import less_protected
 from sros_tool.pki.certificates import (
     authority_text,
-    fingerprints,
     load_certificates,
+    readable_fingerprints,
 )
 from sros_tool.pki.crl import load_crl, signed_by
 from sros_tool.policy.model import stated_protections
@@ -235,7 +235,7 @@ def summary_of(enclave: CheckedEnclave) -> EnclaveSummary | None:
         else "",
         len(certificate.subject.rdns) > 1,
         tuple(
-            _trusted_fingerprints(enclave.state.files.get(name, b"")) for name in _AUTHORITY_FILES
+            readable_fingerprints(enclave.state.files.get(name, b"")) for name in _AUTHORITY_FILES
         ),
         _list_number(enclave),
     )
@@ -262,15 +262,6 @@ def _number_if_signed(data: bytes, authority: bytes) -> int:
     except SrosError:
         return -1
     return crl.number if authentic else -1
-
-
-@lru_cache(maxsize=8)
-def _trusted_fingerprints(data: bytes) -> frozenset[str]:
-    """Return fingerprints of the certificates in a CA file; empty if unreadable."""
-    try:
-        return fingerprints(data)
-    except SrosError:
-        return frozenset()
 
 
 def check_issued(
