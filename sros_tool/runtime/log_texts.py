@@ -117,17 +117,17 @@ _RENEW_ENCLAVE = "Renew the enclave: `sros renew KEYSTORE ENCLAVE`."
 _SIGN_PERMISSIONS = "Sign the permissions again: `sros create_permission KEYSTORE ENCLAVE POLICY`."
 _SIGN_DOCUMENT = (
     f"`sros explain KEYSTORE ENCLAVE --log LOG` names the document. {_SIGN_PERMISSIONS} "
-    "Restore a governance from a backup: every enclave depends on it."
+    "Restore governance.p7s from a backup: every enclave depends on this file."
 )
 _MAKE_READABLE = (
-    "Allow the user that runs the node to read it, and to enter the folders above it: `ls -lL "
-    "{path}`, run as that user, shows whether this works."
+    "Allow the user of the node to read the file, and to enter the folders above the file: `ls -lL "
+    "{path}`, run as this user, shows whether the file can be read."
 )
 _MAKE_READABLE_FOR_USER = (
-    "As the user that runs the node, run `sros check KEYSTORE`: it names what this user cannot "
-    "read. If the folder is an export, give it to that user: `sudo chown -R USER KEYSTORE`. If it "
-    "has the CA keys, which no node should be able to read, export the enclave into a folder of "
-    "that user."
+    "As the user that runs the node, run `sros check KEYSTORE`, which names the files that this "
+    "user cannot read. If the folder is an export, give the folder to this user: `sudo chown -R "
+    "USER KEYSTORE`. If the folder has the CA keys, which no node should be able to read, export "
+    "the enclave into a folder of the user."
 )
 _SET_DOMAIN = (
     "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env KEYSTORE ENCLAVE --domain ID` prints "
@@ -144,10 +144,10 @@ _RENEW_PARTICIPANT = (
 _OTHER_PERMISSIONS_CA = (
     "its permissions are not signed by a permissions CA that this process has loaded. This process "
     "was not restarted since stage 1 of a rotation (`sros rotate_ca`), or the peer was not "
-    "restarted since stage 2; or they have enclaves of different keystores, or a file was changed"
+    "restarted since stage 2; or both have enclaves of different keystores, or a file was changed"
 )
 _SAME_KEYSTORE = (
-    "Give both sides enclaves of the same keystore; `sros inspect` shows the CA of each."
+    "Give both sides enclaves of the same keystore; `sros inspect` shows the CA of an enclave."
 )
 _FAST, _CYCLONE = Vendor.FAST, Vendor.CYCLONE
 _CYCLONE_TRACE = denial_trace_variables("stderr")["CYCLONEDDS_URI"]
@@ -175,24 +175,24 @@ _ROS_TEXTS = (
         r"SECURITY ERROR: directory '(?P<keystore>[^']*)/enclaves/enclaves(?:/[^']*)?' does not",
         "ROS_SECURITY_KEYSTORE names the folder `enclaves` of {keystore}, and has to name the "
         "keystore",
-        "Set it to the folder of the keystore: `sros env KEYSTORE ENCLAVE` prints all variables.",
+        "Set the variable to the keystore: `sros env KEYSTORE ENCLAVE` prints all variables.",
     ),
     _log_text(
         "enclave-missing", _ROS,
         r"rcl: SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",
         "the enclave's folder {path} does not exist: ROS_SECURITY_KEYSTORE or the enclave's name "
-        "is wrong", "Correct it: `sros list_enclaves KEYSTORE` shows the names.",
+        "is wrong", "Correct the name: `sros list_enclaves KEYSTORE` shows all names.",
     ),
     _log_text(
         "runs-unsecured", _ROS, r"SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",
         "the enclave's folder {path} does not exist, and as ROS_SECURITY_STRATEGY is not exactly "
         "Enforce, the node RUNS UNSECURED",
-        "Start it with `sros run`, which runs it secured or not at all.",
+        "Start the node with `sros run`, which runs a node secured or not at all.",
     ),
     _log_text(
         "keystore-unset", _ROS, r"failed to initialize rcl: error not set",
         "security is on, and ROS_SECURITY_KEYSTORE is unset or empty",
-        "Set it to the folder of the keystore: `sros env KEYSTORE ENCLAVE` prints all variables.",
+        "Set the variable to the keystore: `sros env KEYSTORE ENCLAVE` prints all variables.",
     ),
     _log_text(
         "files-missing", _ROS, r"couldn't find all security files",
@@ -250,22 +250,23 @@ _CYCLONE_PARTICIPANT_TEXTS = (
     _log_text(
         "peer-handshake", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed"
         r"|FSM: handshake (?:failed|timeout)|handshake \(lguid=\S+ rguid=\S+\) failed",
-        "a PEER failed to authenticate: most often its key.pem is not the key of its cert.pem, "
-        "which Cyclone DDS does not check for its own enclave; or it runs another DDS or version",
+        "a PEER failed to authenticate: most often the key.pem of the peer is not the key of its "
+        "cert.pem, which the peer's Cyclone DDS does not check; or the peer runs another DDS or "
+        "version",
         "Run `sros verify` or `sros inspect` on the enclave of every peer.", (Fault.KEY_MISMATCH,),
     ),
     _log_text(
         "peer-governance", _CYCLONE, r"security_attributes mismatch",
         "a PEER was refused: its governance has other protection than the governance of this "
-        "process. The processes have enclaves of different keystores, or one was started before "
-        "the governance changed",
-        f"{_SAME_KEYSTORE} It also shows the governance. Export the enclaves again, and restart "
-        "both processes.",
+        "process. The processes have enclaves of different keystores, or one process was started "
+        "before the governance changed",
+        f"{_SAME_KEYSTORE} `sros inspect` also shows the governance. Export the enclaves again, "
+        "and restart both processes.",
     ),
     _log_text(
         "peer-unsecured", _CYCLONE, r"Non secure remote (?:reader|writer) \S+ is not allowed"
         r"|from unauthenticated participant|downgrade participant \S+ to non-secure",
-        "a PEER was refused: it runs without DDS Security, or is not authenticated yet",
+        "a PEER was refused: the peer runs without DDS Security, or is not authenticated yet",
         "Start the peer in its enclave: `sros run KEYSTORE PEER -- COMMAND`.",
     ),
     _log_text(
@@ -299,12 +300,13 @@ _CYCLONE_START_TEXTS = (
         "a plugin of DDS Security (authentication, access control, cryptography) cannot be loaded, "
         "so no secured process starts",
         "Install Cyclone DDS with its plugins, as the distribution packages it; `sros doctor` "
-        "shows whether it enforces.",
+        "shows whether this DDS enforces security.",
     ),
     _log_text(
         "property", _CYCLONE, r"required security property (?P<property>\S+) missing",
         "the program secures its participant without naming {property}",
-        "Start it through an RMW of ROS 2, in an enclave: `sros run KEYSTORE ENCLAVE -- COMMAND`.",
+        "Start the program through an RMW of ROS 2, in an enclave: `sros run KEYSTORE ENCLAVE -- "
+        "COMMAND`.",
     ),
     _log_text(
         "certificate-expired", _CYCLONE, r"Certificate not valid: error: certificate has expired",
@@ -326,20 +328,20 @@ _CYCLONE_START_TEXTS = (
     _log_text(
         "revoked", _CYCLONE, r"Certificate not valid: error: certificate revoked",
         "the certificate of the enclave is revoked",
-        "Revoked enclaves are refused on purpose. To use the enclave again, create it with a new "
+        "Revoked enclaves are refused on purpose. To use the enclave again, give the enclave a new "
         "key: `sros create_enclave KEYSTORE ENCLAVE`.",
         (Fault.REVOKED,),
     ),
     _log_text(
         "crl-expired", _CYCLONE, r"Certificate not valid: error: CRL (?:has expired|is not yet)",
         "the CRL has expired or is not valid yet, so that every participant is refused",
-        "Sign it again: `sros crl KEYSTORE --refresh`.",
+        "Sign the CRL again: `sros crl KEYSTORE --refresh`.",
         (Fault.CRL_EXPIRED, Fault.CRL_NOT_YET_VALID),
     ),
     _log_text(
         "crl-unreadable", _CYCLONE, r"Failed to read CRL",
         "crl.pem is not a CRL, so that every participant is refused",
-        "Sign it again: `sros crl KEYSTORE --refresh`.", (Fault.CRL_MALFORMED,),
+        "Sign the CRL again: `sros crl KEYSTORE --refresh`.", (Fault.CRL_MALFORMED,),
     ),
     _log_text(
         "key-encrypted", _CYCLONE, r"Failed to parse certificate: .*(?:bad decrypt|empty password)",
@@ -392,13 +394,13 @@ _CYCLONE_START_TEXTS = (
     _log_text(
         "malformed", _CYCLONE, r"Can not parse (?P<document>governance|permissions) file",
         "Cyclone DDS does not accept the {document} document, although it is signed correctly",
-        "Generate it with sros; `sros check` reports what vendors read differently.",
+        "Generate the document with sros; `sros check` reports what vendors read differently.",
         _DOCUMENT_FAULTS,
     ),
     _log_text(
         "file-missing", _CYCLONE, r"File could not be found, opened or is empty, path: "
         r"(?P<path>\S+)",
-        "the file {path} is missing, empty or not readable", "Restore it.", _FILE_FAULTS,
+        "the file {path} is missing, empty or not readable", "Restore the file.", _FILE_FAULTS,
     ),
     _log_text(
         "peer-refused", _CYCLONE, r"Remote secure participant \S+ not allowed"
@@ -410,8 +412,8 @@ _CYCLONE_START_TEXTS = (
     _log_text(
         "participant", _CYCLONE, r"rmw_create_node: failed to create (?:DomainParticipant|domain)",
         "the process could not join its domain, and this line does not say whether DDS Security, "
-        "the network interface or the domain is the reason: Cyclone DDS says it in an earlier "
-        "line, on standard error", _EXPLAIN_REMEDY, _ALL_FAULTS, vagueness=2,
+        "the network interface or the domain is the reason: an earlier line of Cyclone DDS, on "
+        "standard error, says the reason", _EXPLAIN_REMEDY, _ALL_FAULTS, vagueness=2,
     ),
 )  # fmt: skip
 
@@ -419,21 +421,21 @@ _FAST_PARTICIPANT_TEXTS = (
     _log_text(
         "peer-permissions-ca", _FAST,
         rf"{_REFUSED_PARTICIPANT}Remote participant PermissionsCA differs from local",
-        "a PEER was refused: it has another permissions CA than this process. The processes have "
-        "enclaves of different keystores, or one was started before the CA was replaced and the "
-        "other after it",
-        _SAME_KEYSTORE + " Restart both after each stage of `sros rotate_ca KEYSTORE`.",
+        "a PEER was refused: the peer has another permissions CA than this process. The processes "
+        "have enclaves of different keystores, or only one process was restarted since the CA was "
+        "replaced",
+        _SAME_KEYSTORE + " Restart both processes after each stage of `sros rotate_ca KEYSTORE`.",
     ),
     _log_text(
         "peer-version", _FAST, r"Remote participant PermissionsCA algorithm differs from local",
-        "a PEER was refused: it runs another version of Fast DDS, or its permissions CA has "
-        "another type of key", "Run one version of Fast DDS on all hosts of the robot.",
+        "a PEER was refused: the peer runs another version of Fast DDS, or has a permissions CA "
+        "with another type of key", "Run one version of Fast DDS on all hosts of the robot.",
     ),
     _log_text(
         "peer-permissions", _FAST,
         rf"{_REFUSED_PARTICIPANT}Remote participant doesn't found in its permissions file",
         "a PEER was refused: by the clock and the time zone of this host its permissions have "
-        "expired or are not valid yet, or they have no grant for its certificate",
+        "expired or are not valid yet, or the permissions have no grant for its certificate",
         "Compare clocks and time zones of both hosts: Fast DDS reads dates in local time. "
         f"{_RENEW_PARTICIPANT}",
     ),
@@ -447,7 +449,7 @@ _FAST_PARTICIPANT_TEXTS = (
         "peer-malformed", _FAST,
         r"Error validating remote permissions for \S+ \(Malformed permissions file",
         "a PEER was refused: Fast DDS does not accept its permissions, although signed correctly",
-        "Generate them again with sros: `sros create_permission KEYSTORE PEER POLICY`.",
+        "Sign the peer's permissions again: `sros create_permission KEYSTORE PEER POLICY`.",
     ),
     _log_text(
         "peer-domain", _FAST, r"Error checking remote participant"
@@ -475,7 +477,7 @@ _FAST_PARTICIPANT_TEXTS = (
         "peer-governance", _FAST, r"Security manager returns an error for (?:reader|writer)",
         "a publisher or subscription of a PEER was refused. Without another line with the reason, "
         "the governance of the peer protects the topic differently: the processes have enclaves "
-        "of different keystores, or one was started before the governance changed",
+        "of different keystores, or one process was started before the governance changed",
         "`sros check KEYSTORE OTHER`, with the keystore or export of the peer, names the topic. "
         "Export the enclaves of both processes again, from the same keystore, and restart both "
         "processes.", vagueness=1,
@@ -516,7 +518,7 @@ _FAST_START_TEXTS = (
     ),
     _log_text(
         "key-unreadable", _FAST, r"Error obtaining private key",
-        "key.pem is encrypted, damaged or empty", "Store it as PEM without a passphrase.",
+        "key.pem is encrypted, damaged or empty", "Store the key as PEM without a passphrase.",
         (*_KEY_FAULTS, *_FILE_FAULTS),
         refuses=RefusedObject.PARTICIPANT,
     ),
@@ -546,7 +548,7 @@ _FAST_START_TEXTS = (
     _log_text(
         "grant", _FAST, r"Not found the identity subject name in permissions file",
         "one of three causes: the permissions have expired, are not valid yet, or have no grant "
-        "for this subject name. Fast DDS reads their dates in the local time of the host",
+        "for this subject name. Fast DDS reads the dates in the local time of the host",
         _EXPLAIN_REMEDY, _GRANT_FAULTS,
         refuses=RefusedObject.PARTICIPANT,
     ),
@@ -559,7 +561,7 @@ _FAST_START_TEXTS = (
     _log_text(
         "domain", _FAST, r"Not found topic access rule for topic (?P<topic>[^\s)]+)",
         "the governance has no rule for the topic in the domain of this process: most often "
-        "because it does not list that domain (ROS_DOMAIN_ID)", _SET_DOMAIN,
+        "because the governance does not list the domain (ROS_DOMAIN_ID)", _SET_DOMAIN,
         (Fault.GOVERNANCE_DOMAIN,),
         refuses=RefusedObject.TOPIC,
     ),
@@ -568,7 +570,7 @@ _FAST_START_TEXTS = (
         r"|Error loading (?:Permissions|Governance) XML|XMLPARSER\s*Error\].*Function "
         r"parse_(?:grant|rule|criteria|permissions|domain|topic|participant|governance)",
         "Fast DDS does not accept a document, although it is signed correctly",
-        "Generate it with sros; `sros check` reports what vendors read differently.",
+        "Generate the document with sros; `sros check` reports what vendors read differently.",
         _DOCUMENT_FAULTS,
         refuses=RefusedObject.PARTICIPANT,
     ),
@@ -582,7 +584,7 @@ _FAST_START_TEXTS = (
         "endpoint-gone", _FAST, r"Cannot find (?:local|remote) (?:reader|writer|participant)\b",
         "a message could not be protected, because its writer, its reader or the peer is not known "
         "yet or has just gone: seen when a process starts or ends",
-        "Do nothing if it stops. If this continues, restart the process and its peers.",
+        "Do nothing if such messages stop. If they continue, restart the process and its peers.",
         vagueness=1,
     ),
 )  # fmt: skip
@@ -591,7 +593,7 @@ _CONSEQUENCE_TEXTS = (
     _log_text(
         "plugin-unset", _FAST, r"Authentication plugin not configured. Security will be disabled",
         "the process RUNS UNSECURED: it has no enclave",
-        "Start it with `sros run KEYSTORE ENCLAVE -- COMMAND`, secured or not at all.",
+        "Start the process with `sros run KEYSTORE ENCLAVE -- COMMAND`, secured or not at all.",
     ),
     _log_text(
         "participant", _FAST, r"Error while configuring security plugin"
@@ -605,7 +607,7 @@ _CONSEQUENCE_TEXTS = (
         "participant", _FAST, r"Cannot create participant due to initialization error"
         r"|Problem creating RTPSParticipant|failed to create participant",
         "the process may not join, and this log gives no reason: Fast DDS 2.6 and 2.9 log "
-        "nothing about signatures, expired permissions and subjects, later releases log them on "
+        "nothing about signatures, expired permissions and subjects, later releases do so on "
         "standard output or in the file of ROS_SECURITY_LOG_FILE",
         _EXPLAIN_OR_LOG_FILE, _ALL_FAULTS,
         remedy_without_fault=_LOG_FILE_REMEDY, vagueness=2,
@@ -616,13 +618,13 @@ _CONSEQUENCE_TEXTS = (
         "the opposite: for a client in place of a server, say; this message does not name the "
         "topic",
         f"Start the node with `CYCLONEDDS_URI='{_CYCLONE_TRACE}'` to see the topic, and explain "
-        "that log.",
+        "the new log.",
         vagueness=3,
     ),
     _log_text(
         "service", _ROS, r"(?:could not|failed to) create (?:service|client|action \w+)"
         r"|create_(?:service|client)\(\) failed",
-        "the permissions deny a service or client, and this message does not name it. If the node "
+        "the permissions deny a service or client that this message does not name. If the node "
         "fails when it is created, a standard service of the node is denied: the node has another "
         "name or namespace than in the policy",
         "Compare the node's name and namespace with the policy's profile (ns, node); the line that "
@@ -742,7 +744,7 @@ UNKNOWN = LogText(
         re.IGNORECASE,
     ),
     "a line of DDS Security that sros does not know",
-    "Read the line: it may matter. If it kept a node from starting, `sros check KEYSTORE` and "
+    "Read the line, which may matter. If a node did not start, `sros check KEYSTORE` and "
     "`sros explain KEYSTORE ENCLAVE join` check all that DDS checks.",
 )
 """The meaning of a line that looks like a DDS Security message but is not in `LOG_TEXTS`."""
@@ -750,13 +752,13 @@ UNKNOWN = LogText(
 _NAME_ENCLAVE = (
     "start the process with `sros run KEYSTORE ENCLAVE -- COMMAND`, or name its enclave in "
     "ROS_SECURITY_ENCLAVE_OVERRIDE or `--ros-args --enclave`. Do not create an enclave /: every "
-    "process that names none would run in it."
+    "process that names no enclave would run in /."
 )
 NO_ENCLAVE = _log_text(
     "no-enclave", _ROS, "",
     "no enclave is named for this process, so it looked for the files of the enclave /, and the "
-    "keystore has none",
-    f"Name one: {_NAME_ENCLAVE}",
+    "keystore has no enclave /",
+    f"Name an enclave: {_NAME_ENCLAVE}",
     refuses=RefusedObject.PARTICIPANT,
 )  # fmt: skip
 """The meaning of `files-missing` in a process that named no enclave."""
@@ -765,6 +767,6 @@ RUNS_OPEN = _log_text(
     "no enclave is named for this process, so it gets the enclave /. If the keystore has no "
     "enclave /, the process does not start with ROS_SECURITY_STRATEGY=Enforce; with any other "
     "value, it RUNS UNSECURED without a further message",
-    f"If it runs, stop it. Then {_NAME_ENCLAVE}", vagueness=4,
+    f"If the process runs, stop the process. Then {_NAME_ENCLAVE}", vagueness=4,
 )  # fmt: skip
 """The meaning of rcl's line about the enclave /, in a log without an error after it."""

@@ -14,13 +14,13 @@ from typing import NamedTuple
 
 from sros_tool.runtime.log_texts import LogText
 
-_RUN_IN_ENCLAVE = "Start it in its enclave: `sros run KEYSTORE ENCLAVE -- COMMAND`."
+_RUN_IN_ENCLAVE = "Start the process in its enclave: `sros run KEYSTORE ENCLAVE -- COMMAND`."
 _RUN_PEER = "Start that process in its enclave: `sros run KEYSTORE PEER -- COMMAND`."
 _SAME_KEYSTORE = (
     "Give both sides enclaves of the same keystore, and restart both after each stage of `sros "
-    "rotate_ca KEYSTORE`; `sros inspect` shows the CA of each."
+    "rotate_ca KEYSTORE`; `sros inspect` shows the CA of an enclave."
 )
-_WRITE_AGAIN = "Let `sros zenoh KEYSTORE` write the file, and do not edit it."
+_WRITE_AGAIN = "Let `sros zenoh KEYSTORE` write the file, and do not edit the file."
 
 ZENOH_IDS = "zenoh-"
 """Prefix of the ids of Zenoh's log texts."""
@@ -55,8 +55,8 @@ _LISTENING_TEXTS = (
     _zenoh_text(
         "peer-expired", r"invalid peer certificate: certificate expired",
         "a PEER was refused: its certificate has expired, by the clock of this host",
-        "Renew it, and restart the peer: `sros inspect KEYSTORE` shows which one, `sros renew "
-        "KEYSTORE PEER` renews it.",
+        "`sros inspect KEYSTORE` shows which certificate has expired, and `sros renew KEYSTORE "
+        "PEER` renews the peer's enclave; then restart the peer.",
     ),
     _zenoh_text(
         "peer-not-yet-valid", r"invalid peer certificate: certificate not valid yet",
@@ -66,12 +66,12 @@ _LISTENING_TEXTS = (
     _zenoh_text(
         "closed-expired", r"Closing \S+ link .{1,200}remote certificate chain expired",
         "a connection was closed, because the certificate of the other side has expired",
-        "Renew it, and restart that process: `sros renew KEYSTORE PEER`.",
+        "Renew the enclave of that process, `sros renew KEYSTORE PEER`, and restart the process.",
     ),
     _zenoh_text(
         "alert", r"zenoh_link\S*: received fatal alert: (?P<alert>\w{1,40})",
         "a PEER closed the connection: it does not accept the certificate of this process "
-        "({alert}); most often it compares the name of the endpoint with it "
+        "({alert}); most often it compares the name of the endpoint with the certificate "
         "(verify_name_on_connect), but certificates of enclaves name no host",
         f"Look at the configuration of the peer. {_WRITE_AGAIN}",
     ),
@@ -129,7 +129,7 @@ _CONNECTING_TEXTS = (
     _zenoh_text(
         "tcp-to-tls", r"Unable to connect to configured peer (?P<endpoint>tcp/\S+)! Read error on "
         r"TCP link .{1,120}early eof",
-        "the other side closed a connection without TLS to {endpoint}: it listens with TLS",
+        "the other side closed a connection without TLS to {endpoint}, where it listens with TLS",
         _RUN_IN_ENCLAVE,
     ),
     _zenoh_text(
@@ -145,7 +145,8 @@ _CONNECTING_TEXTS = (
     ),
     _zenoh_text(
         "port-taken", r"Unable to open listener (?P<endpoint>\S+): .*Address already in use",
-        "another process listens at {endpoint} already", "Stop it: it may be another router.",
+        "another process listens at {endpoint} already",
+        "Stop that process: it may be another router.",
     ),
 )  # fmt: skip
 
@@ -153,27 +154,27 @@ _CONFIGURATION_TEXTS = (
     _zenoh_text(
         "rules", r"Access control not enabled due to: (?P<reason>.{1,200}?) at /",
         "access_control is not valid, so the session does not open: {reason}",
-        f"`sros check FILE` examines it. {_WRITE_AGAIN}",
+        f"`sros check FILE` examines the file. {_WRITE_AGAIN}",
     ),
     _zenoh_text(
         "no-rules", r"Access control (?P<part>rules|subjects|policies) list is empty",
         "access_control has no {part}: no message passes",
-        f"`sros check FILE` examines it. {_WRITE_AGAIN}",
+        f"`sros check FILE` examines the file. {_WRITE_AGAIN}",
     ),
     _zenoh_text(
         "setting", r"unknown field `(?P<field>[^`]{1,60})`, expected one of",
         "the configuration has a setting that this Zenoh does not have: {field}",
-        f"`sros check FILE` examines it. {_WRITE_AGAIN}",
+        f"`sros check FILE` examines the file. {_WRITE_AGAIN}",
     ),
     _zenoh_text(
         "expression", r"Invalid Key Expr `(?P<key>[^`]{1,200})`: (?P<reason>.{1,200}?) at /",
         "the key expression {key} is not valid ({reason}), so the session does not open",
-        f"`sros check FILE` examines it. {_WRITE_AGAIN}",
+        f"`sros check FILE` examines the file. {_WRITE_AGAIN}",
     ),
     _zenoh_text(
         "configuration", r"Invalid configuration file (?P<path>\S{1,300})",
         "rmw_zenoh does not accept the configuration {path}",
-        f"`sros check FILE` examines it. {_WRITE_AGAIN}",
+        f"`sros check FILE` examines the file. {_WRITE_AGAIN}",
     ),
 )  # fmt: skip
 

@@ -1007,7 +1007,7 @@ def test_a_folder_that_is_missing_is_looked_for_in_the_keystore(
     for folder, told in (
         (f"/tmp/nowhere/enclaves{ENCLAVE}", f"names /tmp/nowhere and has to be {keystore}: "),
         (f"{keystore}/enclaves{ENCLAVE}x", f"Perhaps you mean {ENCLAVE}."),
-        (f"{keystore}/enclaves/qqq", "Correct it: `sros list_enclaves"),
+        (f"{keystore}/enclaves/qqq", "Correct the name: `sros list_enclaves"),
     ):
         log.write_text(f"rcl: SECURITY ERROR: directory '{folder}' does not exist\n")
         ended = sros("explain", keystore, ENCLAVE, "--log", log)

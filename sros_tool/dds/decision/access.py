@@ -51,7 +51,7 @@ class Outcome(StrEnum):
     DENIED = "denied"
     """Creating the endpoint fails."""
     PEER_DENIES = "peer denies"
-    """The participant or endpoint is created, but permitted peers do not match it."""
+    """The process creates the participant or endpoint, but no permitted peer matches."""
     REFUSED = "refused"
     """The participant does not start at all."""
     CRASHES = "crashes"
@@ -65,8 +65,9 @@ class Outcome(StrEnum):
 
 OutcomeWord = Annotated[
     Outcome,
-    "What happens: creating it fails (`denied`), peers do not match it (`peer denies`), the "
-    "process does not start (`refused`), or it or its peers crash (`crashes`).",
+    "What happens: the endpoint is not created (`denied`), peers do not match the endpoint (`peer "
+    "denies`), the process does not start (`refused`), or the process or its peers crash "
+    "(`crashes`).",
 ]
 ReasonWord = Annotated[str, "Why, as a stable word such as `no-rule`."]
 
@@ -102,7 +103,7 @@ _REASONS = {
     "deny-rule": "a deny rule matches",
     "partition": "the rule that decides does not name the partitions",
     "default": "no rule matches, so the default of the grant decides",
-    "no-rule": "no rule allows it, and the vendor ignores the default",
+    "no-rule": "no rule allows the access, and the vendor ignores the default",
     "unrestricted": "the governance does not control this access",
     "no-topic-rule": "no topic rule of the governance matches the topic",
     "domain-not-in-governance": "no domain rule of the governance lists the domain",
@@ -132,7 +133,7 @@ class Refusal(NamedTuple):
     outcome: Outcome = Outcome.REFUSED
 
     def decision(self) -> Decision:
-        """Return the decision on any access: it fails with this refusal."""
+        """Return the decision on any access: this refusal."""
         return Decision(self.outcome, self.reason, self.text)
 
 
@@ -259,12 +260,12 @@ class _Entry(NamedTuple):
 def _rules_for(
     traits: VendorTraits, grant: Grant, domain: int
 ) -> tuple[list[NumberedRule], RuleVerdict]:
-    """Return the rules of the grant for ``domain``, and the verdict if none of them matches."""
+    """Return the rules of the grant for ``domain``, and the verdict if no rule matches."""
     rules: list[NumberedRule] = []
     for index, rule in enumerate(grant.rules):
         holds = holds_for(traits.open_range, rule.domains, domain)
         if holds is None:
-            # Cyclone DDS looks for the next rule before it uses one, so it never uses the last one.
+            # Cyclone DDS looks for the next rule before using a rule, so never uses the last rule.
             return rules[:-1], RuleVerdict(Outcome.CRASHES, "open-range", index)
         if holds:
             rules.append((index, rule))
@@ -370,7 +371,7 @@ class _GrantRules:
         return _every_topic() - NameSet.union(filter(None, crashing))
 
     def _crashing_topics(self, group: Sequence[_Entry]) -> NameSet | None:
-        """Return the topics on which a criteria crashes the process; None if it never does.
+        """Return the topics on which a criteria crashes the process; None for no topic.
 
         An empty ``<topic>`` crashes the process, unless an earlier ``<topic>`` of the criteria
         matches.
@@ -440,14 +441,15 @@ def _any_matches(style: Style, expressions: tuple[str, ...], partition: str) -> 
 def _usable_expression(traits: VendorTraits, text: str) -> str:
     """Return the expression as the vendor reads it.
 
-    An empty expression that crashes the vendor becomes ``*``, because it crashes for every name.
+    An empty expression that crashes the vendor becomes ``*``: such an expression crashes for every
+    name.
     """
     text = _trimmed(traits, text)
     return text or "*" if traits.crashes_on_empty_texts else text
 
 
 def _trimmed(traits: VendorTraits, text: str) -> str:
-    """Return the text of an element, without spaces around it if the vendor ignores them."""
+    """Return the text of an element, trimmed if the vendor ignores spaces around the text."""
     return text.strip(" \t\v\r\n") if traits.trims_texts else text
 
 
@@ -547,10 +549,10 @@ def _verdict_text(
 ) -> str:
     """Return ``verdict`` on ``asked_access``, such as ``publish rt/a``, as a clause.
 
-    ``by_peers``: the participant itself allows the access, and its peers deny it.
+    ``by_peers``: the participant itself allows the access, and its peers deny the access.
     """
     rule = "" if verdict.rule is None else f"rule {verdict.rule + 1}"
-    peers = f" for domain {domain}, and peers enforce that" if by_peers else ""
+    peers = f" for domain {domain}, and peers deny the access" if by_peers else ""
     match verdict.reason:
         case "allow-rule":
             return f"{rule} allows {asked_access} by {verdict.expression}"
@@ -615,12 +617,14 @@ def _decide_join(
     missing = f"no allow rule of the grant covers {where}"
     opened = not governed.all_controlled() and otherwise.outcome is not Outcome.ALLOWED
     if opened and otherwise.outcome is Outcome.CRASHES:
-        # With a topic that is free it starts without a look at its rules; its peers look at them.
+        # With a topic that is free, the participant starts without its rules; its peers read them.
         text = _verdict_text(otherwise, f"joining {where}", governed.domain)
         text = text.replace("crashes the process", "crashes the processes of its peers")
         return _Joining(Outcome.CRASHES, otherwise.reason, text, hits_peers=True)
     if traits.always_needs_allow_rule or opened:
-        return _Joining(Outcome.PEER_DENIES, "no-rule", f"{missing}, so peers refuse it")
+        return _Joining(
+            Outcome.PEER_DENIES, "no-rule", f"{missing}, so peers refuse the participant"
+        )
     if otherwise.outcome is Outcome.DENIED:
         return _Joining(Outcome.REFUSED, "no-rule", missing)
     text = _verdict_text(otherwise, f"joining {where}", governed.domain)
@@ -687,7 +691,7 @@ class GrantedAccess:
         self._traits = traits
         self._domain = domain
         self.rules, self.otherwise = _rules_for(traits, grant, domain)
-        """The rules for the domain, and the verdict if none of them matches."""
+        """The rules for the domain, and the verdict if no rule matches."""
         self._own_rules = self.rules if traits.filters_own_domain else list(enumerate(grant.rules))
 
     def topics(self, verb: AccessVerb) -> NameSet:
@@ -930,7 +934,9 @@ class Access:
             if join.outcome is Outcome.PEER_DENIES:
                 if not self._can_exchange_unprotected(rule):
                     return self._peers_refuse(rule)
-                text += " or protect it, so that even peers that refuse the participant exchange it"
+                text += (
+                    " or protect the topic, which even peers that refuse the participant exchange"
+                )
             return self._answer(Outcome.ALLOWED, "unrestricted", text, topic_rule=rule)
         verdict = self._own[verb].ask(topic, partitions)
         if not verdict.allowed:
@@ -976,7 +982,8 @@ class Access:
 
     def _peers_refuse(self, rule: TopicRule) -> Decision:
         text = (
-            f"no allow rule of the grant covers domain {self._governed.domain}, so peers refuse it"
+            f"no allow rule of the grant covers domain {self._governed.domain}, so peers refuse "
+            "the participant"
         )
         return self._answer(Outcome.PEER_DENIES, "peer-refuses-participant", text, topic_rule=rule)
 
