@@ -100,11 +100,11 @@ def merge_policy(
 ) -> None:
     """Print POLICY with the rights of every OTHER policy added.
 
-    Comments, includes, metadata and layout of POLICY do not change. A right is added only if the
-    enclave does not have it yet; rights from includes and wildcards count. Where a profile of OTHER
-    includes common parts, a new profile of POLICY includes those in POLICY's folder. Publish and
-    subscribe are separate rights. A DENY always stays and always wins over an ALLOW; contradictions
-    between the policies are reported.
+    Comments, includes, metadata and layout of POLICY do not change. POLICY can be without enclaves
+    (`<enclaves/>`). A right is added only if the enclave does not have it yet; rights from includes
+    and wildcards count. Where a profile of OTHER includes common parts, a new profile of POLICY
+    includes those in POLICY's folder. Publish and subscribe are separate rights. A DENY always
+    stays and always wins over an ALLOW; contradictions between the policies are reported.
 
     Example:
       $ sros merge_policy robot.xml learned.xml --in-place
@@ -204,7 +204,7 @@ _MOST_OF_ENCLAVE = 2
 def _print_added(merged: Merged) -> None:
     count = len(merged.added)
     if not count:
-        echo("no right was missing", err=True)
+        echo("no right was added", err=True)
         return
     from sros_tool.policy.node_basics import NodeRights
 

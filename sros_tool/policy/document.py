@@ -394,6 +394,7 @@ def read_policy(
     *,
     placeholders: bool = False,
     policy_files: PolicyFiles | None = None,
+    may_be_empty: bool = False,
 ) -> Policy:
     """Read a policy file with its includes, which must be in its folder or below.
 
@@ -405,6 +406,7 @@ def read_policy(
         placeholders: accept the placeholders of `sros_tool.policy.placeholders` in names; they are
             not filled in, so only `sros_tool.fleet.expansion` can use the policy.
         policy_files: returns the content of included files that are not in the file system.
+        may_be_empty: accept a file without any enclave, to which some are added.
 
     Raises:
         PolicyError: (or another `DocumentError`, with file and line) the file violates the format,
@@ -418,7 +420,9 @@ def read_policy(
             )
         joined = join_policies([read_policy(file, placeholders=placeholders) for file in files])
         return replace(joined, file=str(path))
-    return _Reader(path, content, placeholders=placeholders, policy_files=policy_files).policy()
+    reader = _Reader(path, content, placeholders=placeholders, policy_files=policy_files)
+    reader.may_be_empty = may_be_empty
+    return reader.policy()
 
 
 def refuse_fallbacks(policy: Policy) -> None:
@@ -434,6 +438,7 @@ def refuse_fallbacks(policy: Policy) -> None:
 class _Reader:
     _other_roots: tuple[str, ...] = ()
     """Root elements that are accepted besides <policy>."""
+    may_be_empty = False
 
     def __init__(
         self,
@@ -520,7 +525,7 @@ class _Reader:
         return self._policy_of(enclaves, version)
 
     def _policy_of(self, enclaves: Mapping[str, Enclave], version: str) -> Policy:
-        if not enclaves:
+        if not enclaves and not self.may_be_empty:
             raise PolicyError(f"'{self._shown}': the policy has no enclave")
         digest = self._includer.digest()
         read = tuple(replace(enclave, digest=digest) for enclave in enclaves.values())

@@ -403,7 +403,7 @@ def merge_into(path: Path, additions: Policy) -> Merged:
 def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
     """Merge several policies, one after the other, into the file at ``path``; write nothing."""
     document, policies = read_bytes(path, "policy file"), tuple(policies)
-    first = before = read_policy(path, document)
+    first = before = read_policy(path, document, may_be_empty=True)
     added: list[Right] = []
     contradictions: list[Contradiction] = []
     for additions in policies:

@@ -159,7 +159,7 @@ def test_merge_in_place_keeps_mode_and_link(folder: Path) -> None:
     assert (folder / "link.xml").is_symlink()
     before, inode = file.read_bytes(), file.stat().st_ino
     ended = sros("merge_policy", "a.xml", "b.xml", "--in-place").ok()
-    assert ended.err.splitlines() == ["no right was missing", STILL]
+    assert ended.err.splitlines() == ["no right was added", STILL]
     assert (file.read_bytes(), file.stat().st_ino) == (before, inode)
 
 
