@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from zoneinfo import ZoneInfo
@@ -16,6 +17,7 @@ from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.vendors import TESTED, Signers, Vendor, joined_titles
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
+from sros_tool.keystore.lifecycle.rotation import rotation_status
 from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
@@ -114,6 +116,16 @@ def test_a_revocation_list_that_ends(tmp_path: Path) -> None:
     sros("crl", root, "--refresh").ok()
     ends = [day for day in (0, 12, 16, 22) if ids(root, NOW + timedelta(days=day))]
     assert ends == [16, 22], "nothing is wrong with the list that the remedy makes"
+
+
+def test_a_ca_with_a_short_validity_expires_soon_in_its_last_third(tmp_path: Path) -> None:
+    choices = replace(load_template("production"), authority_validity=timedelta(days=60))
+    create_keystore(tmp_path / "ks", template=choices, now=NOW)
+    for day, soon in ((39, False), (41, True)):
+        now = NOW + timedelta(days=day)
+        assert ("keystore.ca-ends-soon" in ids(tmp_path / "ks", now)) is soon
+        remarks = rotation_status(OpenedKeystore(tmp_path / "ks"), now=now).remarks
+        assert any("begin to replace it" in remark for remark in remarks) is soon
 
 
 def test_files_that_expire_soon_are_one_finding(tmp_path: Path) -> None:
