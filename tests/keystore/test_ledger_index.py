@@ -18,7 +18,7 @@ import pytest
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore import ledger as ledger_module
 from sros_tool.keystore.delivery.signing import sign_request
-from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, LEDGER_INDEX
+from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, LEDGER_INDEX, LOCK
 from sros_tool.keystore.ledger_index import IndexUpdate
 from sros_tool.keystore.lifecycle.create import create_enclaves
 from sros_tool.keystore.lifecycle.renew import renew
@@ -27,7 +27,7 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.certificates import make_request
 from sros_tool.pki.crl import load_crl
 from sros_tool.pki.keys import generate_key, load_key
-from tests.support.harness import certificate, copy_of, remains
+from tests.support.harness import certificate, copy_of, remains, sros
 from tests.support.long_form import some
 
 NOW = datetime.now(UTC) + timedelta(hours=1)
@@ -263,3 +263,11 @@ def test_a_key_that_was_put_into_another_enclave_is_found_by_check(root: Path) -
         sign_request(root, make_request(key, "/other"), now=NOW)
     renew(root, ["/a"], now=NOW, new_key=True)
     sign_request(root, make_request(key, "/other"), now=NOW)
+
+
+def test_check_knows_the_index_and_the_lock_of_a_writer(root: Path) -> None:
+    for name in (LOCK, ".sros-other"):
+        (root / name).touch()
+    found = sros("check", root, "--severity", "note").out.splitlines()
+    unknown = [line.partition(": ")[0] for line in found if "[keystore.unknown-file]" in line]
+    assert unknown == [str(root / ".sros-other")] and (root / LEDGER_INDEX).exists()

@@ -17,30 +17,26 @@ from sros_tool.keystore.layout import (
     AGENT,
     CONFIRMED,
     ENCLAVES,
-    FLEET,
-    FLEET_ROOT,
     IDENTITY_CA_FILE,
     KEY_FILE,
     KEY_URI_FILE,
     LEDGER,
-    LEDGER_HEAD,
+    LEDGER_INDEX,
+    LOCK,
     OPTIONAL_FILES,
     PRIVATE,
     PUBLIC,
-    PUBLISHED,
     REQUEST,
     REQUIRED_FILES,
     RETIRED,
     REVOKED,
-    ROTATION,
     SEAL,
-    SEALED_LEDGER,
-    SETTINGS,
     STAGE,
     ZENOH_FILES,
     UnreadPath,
     enclave_folder,
     hidden_enclaves,
+    is_layout_path,
 )
 from sros_tool.owners import other_writers, replaceable_on_the_way, user_name
 from sros_tool.pki.keys import holds_private_key
@@ -234,7 +230,6 @@ _KNOWN = (
     SEAL,
     "governance.xml",
 )
-_TOP = (SETTINGS, FLEET, FLEET_ROOT, PUBLISHED, LEDGER, LEDGER_HEAD, ROTATION)
 _KNOWN_ANYWHERE = re.compile(
     r".*\.(?:cert|key|crl)\.pem\Z|.*\.p11\Z|.*\.srl\Z|index\.txt.*|serial.*"
 )
@@ -507,7 +502,7 @@ def _stray_file_findings(
         yield ARCHIVE.found(path, "a keystore contains no archive and no container of keys", path)
         return
     known = (
-        (inside == "." and (name in _TOP or SEALED_LEDGER.fullmatch(name)))
+        (inside == "." and (is_layout_path(name) or name in (LEDGER_INDEX, LOCK)))
         or (place in (PUBLIC, PRIVATE) and _KNOWN_ANYWHERE.match(name))
         or (place == REVOKED and name in _KNOWN)
         or place == RETIRED
