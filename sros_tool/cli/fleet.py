@@ -901,7 +901,10 @@ def _groups(compared_fleet: ComparedFleet, robots: Sequence[str]) -> list[_Group
     clauses_by_robot: dict[str, str] = {}
     for robot in sorted(status.robots, key=lambda robot: places[robot.robot]):
         if robots or robot.state != "current" or robot.notes or robot.problems:
-            clauses = (*_expiry_clauses(robot, compared_fleet.at), *_summary(robot, status.stage))
+            clauses = (
+                *_expiry_clauses(robot, compared_fleet.at),
+                *_summary(robot, status.stage, compared_fleet.at),
+            )
             what = _CLOCK.sub("", _without_robot_name("; ".join(clauses), robot.robot))
             clauses_by_robot[robot.robot] = what
             row = (robot.state.value, robot.to_do, *_DURATION.split(what))
@@ -1086,7 +1089,7 @@ def _expiry_clauses(robot: RobotStatus, moment: datetime) -> Iterator[str]:
             yield f"{_KINDS.get(kind, kind)} expired {elapsed(moment - end)} ago"
 
 
-def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
+def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
     """Yield clauses on how a robot's files differ from the keystore's, the worst first."""
     from sros_tool.keystore.confirmation import enclave_of
 
@@ -1126,11 +1129,9 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
         yield f"lacks the key of {names}, which no release brings"
     elif robot.lacks_ca:
         yield "does not trust the CA that seals releases, so fetching cannot help"
-    elif robot.is_locked_out and robot.enclaves:
-        revoked = robot.files.get("certificate", {}).keys() == {"revoked"}
-        fault = "revoked" if revoked else "of an identity CA that was replaced"
-        server = f"a web server with the current {'list' if revoked else 'CA'} refuses it"
-        yield f"all its certificates are {fault}: {server}"
+    elif robot.is_locked_out(moment):
+        why = "have expired, were revoked, or are of an identity CA that was replaced"
+        yield f"all its certificates {why}: a web server with the current CA and list refuses it"
     seen = [name for name in robot.restart or () if (robot.running or {}).get(name) == "earlier"]
     if seen:
         yield f"processes of {first_few(seen, _MOST_GROUPS)} have not loaded the installed files"

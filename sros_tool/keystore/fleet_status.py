@@ -9,10 +9,10 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from functools import cached_property
 from itertools import chain
@@ -205,12 +205,12 @@ class RobotStatus:
     files of the keystore.  ``short_lived`` are short-lived enclaves of which a file expires soon or
     has expired.  ``has_list`` says whether the robot has the current revocation list, or an earlier
     list that revokes the same, in force or not; from ``renew_from`` on, a file of the robot expires
-    soon.  ``lacks_key`` are enclaves whose key the keystore has and the robot lacks: no release
-    brings a key.  The other parts say of the robot:
+    soon.  From ``locked_out_from`` on, a web server with the current CA and list refuses a robot
+    that fetches.  ``lacks_key`` are enclaves whose key the keystore has and the robot lacks: no
+    release brings a key.  The other parts say of the robot:
 
     - ``is_ahead``: by its message, its files are newer than the backup of the keystore;
     - ``reads_copy``: it fetched after the publication and got an earlier release;
-    - ``is_locked_out``: all its certificates are revoked, or of a CA that was replaced;
     - ``lacks_ca``: it refuses releases, because it does not trust the CA that seals releases;
     - ``is_doubtful``: its files are not known, whatever it confirmed, because its last message was
       refused, its release was never published, or two computers have its keys;
@@ -291,7 +291,7 @@ class RobotStatus:
     lacks_key: tuple[str, ...] = ()
     reads_copy: bool = False
     is_ahead: bool = False
-    is_locked_out: bool = False
+    locked_out_from: datetime | None = None
     lacks_ca: bool = False
     reported: int = 0
 
@@ -331,6 +331,10 @@ class RobotStatus:
         if self.fetches and self.received and self.clock:
             return min(self.received, self.clock)
         return self.received
+
+    def is_locked_out(self, now: datetime) -> bool:
+        """Return whether a web server with the current CA and list refuses it at ``now``."""
+        return self.locked_out_from is not None and self.locked_out_from <= now
 
     def offline(self) -> RobotStatus:
         """Return the status after nothing was heard of the robot for too long."""
@@ -383,7 +387,7 @@ class RobotStatus:
         if (self.published or 0) == (self.release or 0):
             return "find out why" if self.is_published else "publish"
         is_silent = self.received is None or now - self.received > _SILENCE
-        if self.is_locked_out:
+        if self.is_locked_out(now):
             return "deliver" if is_silent else "wait, else deliver"
         if is_silent:
             return "check whether it is on"
@@ -993,19 +997,28 @@ class _KeystoreRecords:
         has_all = is_published or is_refused or (confirmed.release or 0) == last
         return has_all and not (authority and authority.reason == SAME_KEY)
 
-    def is_locked_out(self, compared_robot: _ComparedRobot, states: Collection[State]) -> bool:
-        """Return whether a web server with the current CA and list refuses a robot.
+    def locked_out_from(self, compared_robot: _ComparedRobot) -> datetime | None:
+        """Return when a web server with the current CA and list begins to refuse a robot.
 
-        ``states`` are the states of the robot's certificates, which are then all revoked, or of
-        identity CAs that were replaced.
+        This is the last expiry of its certificates, without those that are revoked, or of identity
+        CAs that were replaced; without any other, the time is long ago.  None if it is not known.
         """
-        if not compared_robot.enclaves:
-            return False
+        long_ago = datetime.min.replace(tzinfo=UTC)
         authority = self._issued.get(self._stages.identity_ca)
         has_same_key = authority and authority.reason == SAME_KEY
-        return {*states} == {State.REVOKED} or (
-            self._stages.is_of_replaced_ca(compared_robot) and not has_same_key
-        )
+        if self._stages.is_of_replaced_ca(compared_robot) and not has_same_key:
+            return long_ago
+        digests = set(compared_robot.expiring.get("certificate", ()))
+        for file in compared_robot.different:
+            if _kind_of(file.path) == "certificate":
+                digests.update(file.certificates[:1])
+        ends = []
+        for entry in map(self._issued.get, digests):
+            if entry is None or not entry.not_after:
+                return None
+            is_revoked = entry.serial in self._revoked_serials
+            ends.append(long_ago if is_revoked else parse_iso(entry.not_after))
+        return max(ends, default=None)
 
     def reads_copy(self, compared_robot: _ComparedRobot, last_heard: datetime | None) -> bool:
         """Return whether a robot fetched long after the publication, and got an earlier release.
@@ -1216,7 +1229,6 @@ def _status(
     fetches = bool(received and received.message)
     has_release = bool(different) and records.has_release(compared_robot)
     validity = records.validity(compared_robot)
-    certificates = counts.get("certificate", {}).keys()
     status = RobotStatus(
         compared_robot.robot.name,
         state,
@@ -1250,7 +1262,7 @@ def _status(
         lacks_key=records.lacks_key(compared_robot) if different or state is State.UNUSABLE else (),
         is_ahead=is_ahead,
         reported=len((confirmed and confirmed.problems) or ()),
-        is_locked_out=records.is_locked_out(compared_robot, certificates),
+        locked_out_from=records.locked_out_from(compared_robot) if fetches else None,
     )
     if not (status.fetches and records.reads_copy(compared_robot, status.last_heard)):
         return status

@@ -531,7 +531,7 @@ def test_a_robot_that_was_off_during_a_rotation_has_missed_it(field: Field) -> N
     field.age("r2", timedelta(hours=1))
     assert shown() == ("earlier", "deliver")
     said = field.run("fleet", "status", "ks", "--robot", "r2", status=1).out
-    assert "all its certificates are of an identity CA that was replaced" in said
+    assert "are of an identity CA that was replaced: a web server with" in said
     field.deliver("r2")
     assert field.states()["r2"] == "current"
 
@@ -866,6 +866,25 @@ def test_a_robot_whose_files_have_expired_is_not_in_order(field: Field) -> None:
     assert [(robot.state, robot.to_do) for robot in renewed.robots] == [("expired", "deliver")]
 
 
+def test_a_robot_whose_certificates_have_all_expired_cannot_fetch(field: Field) -> None:
+    """Neither a robot whose other files have expired, nor a robot that does not fetch."""
+    field.run("fleet", "publish", "ks", "pub")
+    field.send("r1", release=1)
+    before = fleet_status(OpenedKeystore(field.root), ["r1", "r2"])
+    end = before.robots[0].expiry["certificate"]
+    assert [robot.locked_out_from for robot in before.robots] == [end, None]
+    field.run("renew", "ks", "/r1/base")
+    field.run("fleet", "publish", "ks", "pub")
+    status = fleet_status(OpenedKeystore(field.root), ["r1"])
+    late = end + timedelta(minutes=1)
+    heard = replace(status.robots[0], received=late, clock=late)
+    assert heard.locked_out_from == end
+    for until, to_do in ((end, "wait, else deliver"), (late + timedelta(1), "wait: it fetches")):
+        robot = replace(heard, locked_out_from=until)
+        (found,) = replace(status, robots=(robot,), publication=None).with_overdue(late).robots
+        assert (found.state, found.to_do) == ("expired", to_do)
+
+
 def samples(text: str, metric: str, *labels: str) -> list[tuple[tuple[str, ...], float]]:
     """Return the values of a metric, with some of their labels."""
     return [
@@ -998,7 +1017,7 @@ def test_what_is_to_be_done_for_robots_that_do_not_fetch_what_is_published(field
     rows = said()
     assert rows["r1"][0] == "deliver" and "lacks the key of /r1/base, which no" in rows["r1"][1]
     assert "the published one" not in rows["r1"][1], "no other enclave waits for it"
-    refused = "all its certificates are revoked: a web server with the current list refuses it"
+    refused = "a web server with the current CA and list refuses it"
     assert rows["r3"][0] == "wait, else deliver" and refused in rows["r3"][1]
     assert rows["r2"][0] == "wait: it fetches"
     kept = field.root / "confirmed/r2.json"
