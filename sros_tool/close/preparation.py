@@ -35,6 +35,17 @@ from sros_tool.runtime.variables import ENCLAVE
 from sros_tool.values import FileChange
 from sros_tool.wording import counted, enumerated, first_few
 
+_NOT_FOR_GIT = """\
+# What `sros close` makes for this machine, and private keys.
+/keystore/
+/export/
+/start/
+/observed.json
+/processes.json
+/rights.html
+/seen.xml
+"""
+
 
 class CommandStep(NamedTuple):
     """A command line of sros that is a step of closing a robot."""
@@ -76,12 +87,13 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
         with suppress(SrosError):  # the steps say what is wrong
             denied_before = _denied_access(robot)
     done, problems, is_stopped = _do_steps(robot, duration, partial=partial, dry_run=dry_run)
+    ignored = [] if dry_run else _ignore_in_git(robot)
     removed = [] if dry_run or is_stopped else _remove_enclaves(robot)
     state = current_state(robot, robot.read_policy())._replace(steps=done, dry_run=dry_run)
     if dry_run or is_stopped:
-        return state._replace(problems=problems)
+        return state._replace(problems=problems, changes=ignored)
     _remember_later_processes(robot, state.observed)
-    changes = [*write_start_files(robot, state), *removed]
+    changes = [*ignored, *write_start_files(robot, state), *removed]
     denied = _denied_access(robot)
     newly_denied = [right for right in denied if right not in denied_before]
     problems += _problems_of(robot, state, partial=partial)
@@ -109,6 +121,15 @@ def _check_folder(robot: LocalRobot) -> None:
     results = (robot.observation_file, robot.policy, robot.keystore, robot.export)
     if robot.folder.is_dir() and [*robot.folder.iterdir()] and not any(map(Path.exists, results)):
         robot.shell.say(f"'{robot.folder}' has files of yours: sros adds its own to them")
+
+
+def _ignore_in_git(robot: LocalRobot) -> list[FileChange]:
+    """Write which files of the folder are not for git, unless something says it already."""
+    file = robot.folder / ".gitignore"
+    if os.path.lexists(file):
+        return []
+    replace_file(file, _NOT_FOR_GIT.encode())
+    return [FileChange("create", str(file))]
 
 
 def _remember_later_processes(robot: LocalRobot, observed: ObservedProcesses) -> None:

@@ -622,6 +622,7 @@ class _Review:
         """Return the step on private keys in keystores of HEAD, and in files that change.
 
         Whether options allow new access does not matter: whoever reads the repository has them.
+        Keys of keystores that are not reviewed, and were there before, are only named.
         """
         entries = dict(self._changed_files(self.head, self.base)) if self.base else {}
         entries |= {
@@ -629,7 +630,12 @@ class _Review:
             for path, entry in self.head.files.items()
             if _is_below(path, self.request.keystores)
         }
-        files = {path: entry.id for path, entry in entries.items() if entry.mode in FILES}
+        earlier: dict[str, TreeEntry] = {}
+        with suppress(SrosError):  # `left_out` says that these were not looked for
+            walked = self._changed_files(self.head, None)
+            earlier = {path: entry for path, entry in walked if path.endswith(KEY_FILE)}
+        both = {**earlier, **entries}
+        files = {path: entry.id for path, entry in both.items() if entry.mode in FILES}
         keys = {
             digits
             for digits, content in self._contents(files.values())
@@ -640,7 +646,9 @@ class _Review:
             for path, digits in sorted(files.items())
             if digits in keys and not _is_below(path, self.request.left_out)
         ]
-        return (_FOUND, Facts(tuple(lines))) if lines else None
+        failing = tuple(line for line in lines if line[1] in entries)
+        named = tuple(line for line in lines if line[1] not in entries)
+        return (_FOUND if failing else _OK, Facts(failing, named)) if lines else None
 
     def _unreviewed_step(
         self, reviewed: Sequence[Path], fleet: Fleet | None

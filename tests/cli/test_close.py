@@ -7,9 +7,11 @@ import json
 import os
 import re
 import shutil
+import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -211,6 +213,7 @@ def made(folder: Path) -> list[str]:
 
 
 MADE = [
+    ".gitignore",
     *("common", "export", "keystore", "observed.json", "observer.xml", "policy.xml"),
     *("processes.json", "requirements.toml", "rights.html", "start"),
 ]
@@ -229,6 +232,12 @@ def test_everything_is_prepared_and_nothing_is_closed(robot: Robot) -> None:
     mine.unlink()
     assert ended.err.startswith("'robot' has files of yours: sros adds its own to them\n")
     assert made(robot.folder) == MADE
+    git = partial(subprocess.run, cwd=robot.folder / "robot", check=True, capture_output=True)
+    git(["git", "init", "-q"])
+    for_git = git(["git", "ls-files", "-o", "--exclude-standard"], text=True).stdout.split()
+    shutil.rmtree(robot.folder / "robot/.git")
+    of_policy = {name for name in for_git if not name.startswith("common/")}
+    assert of_policy == {".gitignore", "policy.xml", "observer.xml", "requirements.toml"}
     export = robot.folder / "robot/export"
     assert list_enclaves(export) == ("/listener", "/sros_observer", "/talker")
     assert not (export / "private").exists()
@@ -244,8 +253,10 @@ def test_everything_is_prepared_and_nothing_is_closed(robot: Robot) -> None:
     assert ended.err.endswith(
         "next: sros doctor, to find an RMW that enforces security, and set it\n"
     )
+    (ignored := robot.folder / "robot/.gitignore").write_text("mine\n")
     said = robot.close().err
     assert said.endswith("nothing is closed yet; next: sros close robot --apply\n")
+    assert ignored.read_text() == "mine\n"
 
 
 @sometimes("a_policy_that_was_changed_stays_and_is_followed", 1 / 2)

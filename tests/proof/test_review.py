@@ -1052,6 +1052,13 @@ def test_private_keys_in_a_commit_are_named(change: Change, made_keystores: Path
     for key in keys:
         assert f"  '{key}' has a private key, which whoever can read" in ended.out, ended
     assert "cannot start" not in ended.out, ended
+    change.base = change.commit({})
+    change.commit({"README": "x"})
+    for status, more in ((0, ()), (1, ("--keystore", "ks"))):
+        ended = change.review("--policy", "robot.xml", *more)
+        assert ended.status == status and f"'{keys[1]}' has a private key, " in ended.out, ended
+    left = change.review("--policy", "robot.xml", "--leave-out", "ks").ok().out
+    assert "has a private key" not in left
 
 
 def test_what_is_new_included_or_cannot_fail(change: Change) -> None:
