@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.checks.keystores.opened import Circumstances
+from sros_tool.dds.decision.vendors import TESTED
 from sros_tool.files import templates_dir
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
@@ -380,7 +381,7 @@ def test_permissions_that_a_vendor_takes_for_ones_own_count() -> None:
     assert decided(others, ONLY_MUX).violations == ()
 
 
-def test_unique_subjects_fit_no_other_permissions(tmp_path: Path) -> None:
+def test_unique_subjects_fit_no_other_permissions_for_each_vendor(tmp_path: Path) -> None:
     policy = read_policy(Path("r.xml"), policy_text(SHARED).encode())
     requirements = parse_requirements(ONLY_MUX.encode(), "r.toml")
     for template, holds in (("production", True), ("sros2", False)):
@@ -390,9 +391,11 @@ def test_unique_subjects_fit_no_other_permissions(tmp_path: Path) -> None:
         ks = tmp_path / template
         sros("create_keystore", ks, "--template", template).ok()
         sros("generate_artifacts", "-k", ks, "-p", tmp_path / "r.xml").ok()
-        assert (
-            decide_all(requirements, load_system(ks, Circumstances(NOW_SIGNED))).violations == ()
-        ) is holds
+        signed = load_system(ks, Circumstances(NOW_SIGNED))
+        assert (decide_all(requirements, signed).violations == ()) is holds
+        vendors = [vendor.title for vendor in TESTED]
+        assert [world.title for world in signed.worlds] == vendors
+        assert [world.title for world in system.worlds] == [*vendors, "Zenoh"]
 
 
 CAMERA = {
