@@ -35,6 +35,7 @@ if TYPE_CHECKING:
         load_template,
         new_access,
         open_keystore,
+        policy_rights,
         read_policy,
         renew,
         revoke,
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.revoke import Revocation
     from sros_tool.keystore.template import Template
     from sros_tool.policy.model import Policy
+    from sros_tool.policy.rights import Right
     from sros_tool.proof.growth import Growth
 
 __version__ = "0.4.0.dev0"
@@ -70,6 +72,7 @@ __all__ = [
     "Policy",
     "PolicyError",
     "Revocation",
+    "Right",
     "SrosError",
     "Template",
     "UsageError",
@@ -84,6 +87,7 @@ __all__ = [
     "load_template",
     "new_access",
     "open_keystore",
+    "policy_rights",
     "read_policy",
     "renew",
     "revoke",
@@ -97,6 +101,7 @@ _ELSEWHERE = {
     "Growth": "sros_tool.proof.growth",
     "Policy": "sros_tool.policy.model",
     "Revocation": "sros_tool.keystore.lifecycle.revoke",
+    "Right": "sros_tool.policy.rights",
     "Template": "sros_tool.keystore.template",
     **dict.fromkeys((name for name in __all__ if name.endswith("Error")), "sros_tool.errors"),
 }

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.participant import JoinContext
     from sros_tool.keystore.template import Template
     from sros_tool.policy.model import Policy
+    from sros_tool.policy.rights import Right
     from sros_tool.proof.growth import Growth
 
 AnyPath = str | PathLike[str]
@@ -285,6 +286,27 @@ def read_policy(path: AnyPath) -> Policy:
             "Do not read the policy: pass its path to a function with fleet=, such as "
             "generate(keystore, path, fleet=FLEET_FILE).",
         ) from error
+
+
+@_checked
+def policy_rights(policy: AnyPath | Policy) -> tuple[Right, ...]:
+    """Return the rights in a policy, as it states them but with absolute names, sorted.
+
+    Returns:
+        Rights with ``enclave``, ``qualifier`` (``ALLOW`` or ``DENY``), ``right`` (such as
+        "publish") and ``name``, perhaps with wildcards.
+
+    Raises:
+        PolicyError: (or another `DocumentError`) The policy cannot be read.
+
+    Example:
+        >>> [str(right) for right in sros_tool.policy_rights(policy) if right.name == "/chatter"]
+        ['/talker_listener/listener ALLOW subscribe topic /chatter',
+         '/talker_listener/talker ALLOW publish topic /chatter']
+    """
+    from sros_tool.policy import rights
+
+    return tuple(sorted(rights.policy_rights(_policy(policy)), key=rights.order))
 
 
 @_checked

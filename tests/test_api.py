@@ -154,6 +154,18 @@ def test_zenoh_answers_by_the_files_in_the_keystore(
         ask(made, TALKER, "publish", "/chatter", distribution="lyrical")
 
 
+def test_the_rights_of_a_policy_have_absolute_names(tmp_path: Path) -> None:
+    (path := tmp_path / "robot.xml").write_text(policy_text({"/a": publish("x", "~/y")}))
+    rights = [right for right in sros_tool.policy_rights(path) if right.right == "publish"]
+    assert [str(right) for right in rights][-2:] == [
+        "/a ALLOW publish topic /n/y",
+        "/a ALLOW publish topic /x",
+    ]
+    policy = sros_tool.read_policy(path)
+    assert sros_tool.policy_rights(policy) == sros_tool.policy_rights(path)
+    assert sros_tool.explain_access(policy, "/a", "publish", "/x")
+
+
 def test_findings_are_for_the_nodes_of_a_distribution(tmp_path: Path) -> None:
     policy = tmp_path / "robot.xml"
     policy.write_text(policy_text({"/a": publish("/x")}))
