@@ -423,7 +423,7 @@ comparing all names is faster.
 
 
 def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
-    """Yield a note on enclaves that Cyclone DDS mistakes for each other.
+    """Yield a note on enclaves with plain subjects that Cyclone DDS mistakes for each other.
 
     ``names`` are all enclaves; a pair is reported if one of the two is in ``new``.
     """

@@ -293,7 +293,8 @@ def _read_zenoh(table: _Table) -> ZenohNetwork:
                 if not is_endpoint(endpoint):
                     raise _TemplateError(
                         f"{table.path}.{key} has {endpoint!r}, which is not HOST:PORT, such as "
-                        "localhost:7447 or [::1]:7447"
+                        "localhost:7447 or [::1]:7447; names of hosts have only letters, digits, "
+                        "- and ."
                     )
     table.finish()
     return network

@@ -424,6 +424,10 @@ def test_a_template_mends_names_that_it_makes_unique(tmp_path: Path) -> None:
         for template in ("development", "production")
     }
     assert found == {"development": True, "production": False}
+    for template in found:
+        sros("create_keystore", tmp_path / template, "--template", template).ok()
+        made = sros("create_enclave", tmp_path / template, "/arm", "/left/arm").ok()
+        assert ("Cyclone DDS 0.10 mistakes /arm" in made.err) == found[template]
 
 
 def test_requirements_of_a_package_in_two_namespaces(tmp_path: Path) -> None:

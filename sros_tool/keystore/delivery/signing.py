@@ -453,7 +453,7 @@ class _Signer:
 
     def name_notes(self) -> Iterator[Note]:
         """Yield notes on the names of new enclaves that vendors or users may confuse."""
-        if not self._new:
+        if not self._new or self._change.template.unique_subject:
             return iter(())
         recorded = self._change.keystore.ledger_file.recorded_enclaves()
         names = self._change.names if recorded is None else recorded

@@ -779,7 +779,7 @@ def write_enclaves(
     change.notes = [
         *(note for made in done.values() for note in made.notes),
         *(writer.notes if writer.entries else ()),
-        *name_notes({*change.names, *created}, created),
+        *(() if change.template.unique_subject else name_notes({*change.names, *created}, created)),
         *change.notes,
     ]
     superseded = [made.superseded for made in done.values() if made.superseded]
