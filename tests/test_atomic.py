@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import stat
 import threading
@@ -84,6 +85,23 @@ def test_content_is_on_the_disk_before_its_name(
     calls.clear()
     write_new_folder(tmp_path / "folder", FILES)
     assert calls[:2] == ["flush_file_system", "rename"]
+
+
+def test_a_temporary_file_that_was_removed_before_it_was_locked_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another process took it for one that a killed process left."""
+    lock, removed = fcntl.flock, list[Path]()
+
+    def lose_the_first(handle: int, how: int) -> None:
+        if not removed:
+            removed.extend(tmp_path.iterdir())
+            removed[0].unlink()
+        lock(handle, how)
+
+    monkeypatch.setattr(fcntl, "flock", lose_the_first)
+    replace_file(tmp_path / "file", b"new")
+    assert removed and tree(tmp_path) == {"file": b"new"}
 
 
 def test_only_its_owner_can_read_a_new_file_that_is_never_one_of_before(
