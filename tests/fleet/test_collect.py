@@ -52,6 +52,7 @@ from sros_tool.pki.certificates import Issuer, key_digest, make_request, validit
 from sros_tool.pki.crl import load_crl
 from sros_tool.pki.keys import PrivateKey, generate_key, load_key
 from sros_tool.validity import BACKDATE, iso, parse_iso
+from tests.dds.signer_rows import signed_by
 from tests.support.harness import copy_of, policy_text, publish, sros
 from tests.support.messages import key_of, said_by, signed_message
 
@@ -239,6 +240,22 @@ def test_the_verb_says_what_it_did(home: Home) -> None:
     assert [robot["outcome"] for robot in json.loads(ended.out)["robots"]] == [
         "unchanged", "kept", "kept",
     ]  # fmt: skip
+
+
+def test_a_message_with_two_signatures_or_a_weak_one_proves_nothing(home: Home) -> None:
+    said = render_confirmation(home.said("r1", NOW))
+    base, arm = (
+        (read_certificate(home.folder / f"r1/enclaves{name}/cert.pem"), home.key("r1", name))
+        for name in ("/r1/base", "/r1/arm")
+    )
+    for message, why in (
+        (signed_by(base, also=arm)(said), "it is not signed by exactly one certificate"),
+        (signed_by(base, "-md", "sha1")(said), "it has a weak signature, with SHA1"),
+    ):
+        home.put("r1", message)
+        assert home.of("r1").why.startswith(why)
+    home.put("r1", signed_by(base)(said))
+    assert home.of("r1").outcome == "kept"
 
 
 def test_a_robot_cannot_answer_for_another_one(home: Home) -> None:
