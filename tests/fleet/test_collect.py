@@ -45,6 +45,7 @@ from sros_tool.keystore.fleet import recorded_fleet
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import PUBLISHED, key_on_robot
+from sros_tool.keystore.ledger import RESTORED
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.reader import OpenedKeystore, read_certificate
 from sros_tool.pki import smime
@@ -542,6 +543,9 @@ def test_what_only_robots_know_to_be_revoked_is_revoked_again(home: Home) -> Non
     assert now and now.number > lost.number
     assert {of[:1] + of[2:] for of in now.revoked} == {of[:1] + of[2:] for of in lost.revoked}
     assert len(now.revoked) == 2 and not (home.root / "enclaves/r2/base").exists()
+    marks = OpenedKeystore(home.root).ledger_with("what", RESTORED).entries
+    numbers = [entry.number for entry in marks if entry.what == RESTORED]
+    assert numbers == [int(DUE.timestamp())], "no answer had it before"
     found_kinds = set(re.findall(r"\[(keystore\.\S+)\]", sros("check", "ks", cwd=home.folder).out))
     assert found_kinds == {"keystore.clock-behind"}  # the messages are from later than now
     again = home.collect(DUE)

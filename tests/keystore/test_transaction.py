@@ -789,6 +789,16 @@ def test_a_list_of_files_that_cannot_be_read_is_told(text: str, keystore: Path) 
     assert snapshot(keystore) == before
 
 
+@pytest.mark.parametrize("mode", [0o710, 0o701])
+def test_a_stage_that_others_can_open_is_refused(mode: int, keystore: Path) -> None:
+    made_up_stage(keystore, "after", [])
+    (keystore / STAGE).chmod(mode)
+    before = snapshot(keystore)
+    with pytest.raises(KeystoreError, match=r"not an interrupted change of yours.*may open it"):
+        create_enclaves(keystore, ["/new"], now=NOW)
+    assert snapshot(keystore) == before
+
+
 def made_up_stage(keystore: Path, live: str, moves: list[list[str | None]]) -> None:
     for name in ("before", "after", "added"):
         (keystore / STAGE / name).mkdir(parents=True)
