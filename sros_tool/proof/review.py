@@ -18,7 +18,7 @@ from functools import cache, partial
 from itertools import chain, islice
 from pathlib import Path
 from shlex import quote
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, TypeVar
 
 from sros_tool.checks.keystores.issued import (
     LESS_PROTECTED,
@@ -101,6 +101,7 @@ from sros_tool.proof.system import System, load_system
 from sros_tool.values import Words
 from sros_tool.wording import first_few
 
+Value = TypeVar("Value")
 _HEAD, _BASE = "HEAD", "BASE"
 _FILE_MISSING = f"enclave.{Fault.FILE_MISSING.id}"
 _MOST_ENTRIES = 200_000
@@ -404,7 +405,9 @@ class _Review:
         for path, keystore in keystores.items():
             with suppress(SrosError):  # what is wrong with it is a finding
                 self.robots[path] = load_fleet(OpenedKeystore(keystore))
-        base_keystores = yield from self._base_keystores(keystores)
+        base_keystores: dict[str, Path] = {}
+        if self.base:
+            base_keystores = yield from _read_each("new-access", keystores, self.base.tree)
         before = cache(partial(load_policies, of_base, _BASE, base_fleet))
         earlier: dict[str, Callable[[], AccessSource]] = {
             path: partial(load_side, folder) for path, folder in base_keystores.items()
@@ -478,62 +481,51 @@ class _Review:
 
     def _fleet(self, side: CommitFiles | None) -> Generator[ReviewStep, None, Fleet | None]:
         """Return the fleet of BASE or HEAD, None without one; yield the steps that read it."""
-        path = self.request.fleet
-        if not path or not side:
+        if not self.request.fleet or not side:
             return None
-        try:
+        files = yield from self._files(side, "files", [self.request.fleet])
+        fleets = yield from _read_each("files", files, lambda path: read_fleet(files[path]))
+        return fleets.get(self.request.fleet)
+
+    def _files(
+        self, side: CommitFiles, kind: str, paths: Iterable[str]
+    ) -> Generator[ReviewStep, None, dict[str, Path]]:
+        """Return the files that BASE or HEAD has at paths; HEAD has to have all of them."""
+
+        def file_at(path: str) -> Path | None:
             file = side.file(path)
-            if file:
-                return read_fleet(file)
-            if side is self.head:
+            if not file and side is self.head:
                 raise self._missing_file_error(path)
-        except SrosError as error:
-            yield ReviewStep("files", path, _UNDECIDED, error)
-        return None
+            return file
+
+        return (yield from _read_each(kind, paths, file_at))
 
     def _policies(
         self, side: CommitFiles, fleet: Fleet | None
     ) -> Generator[ReviewStep, None, list[Path]]:
         """Return the policy files of BASE or HEAD; yield the steps that read them."""
-        policies: list[Path] = []
-        for path in self.request.policies:
-            try:
-                files = side.policies(path, placeholders=fleet is not None)
-                if not files:
-                    raise self._missing_file_error(path, f" If it is renamed, {_BOTH_NAMES}.")
-                policies += [file for file in files if file not in policies]
-            except (SrosError, OSError) as error:
-                known = error if isinstance(error, SrosError) else DocumentError(str(error))
-                yield ReviewStep("policy", path, _UNDECIDED, known)
-        return policies
+
+        def files_at(path: str) -> Sequence[Path]:
+            files = side.policies(path, placeholders=fleet is not None)
+            if not files:
+                raise self._missing_file_error(path, f" If it is renamed, {_BOTH_NAMES}.")
+            return files
+
+        read = yield from _read_each("policy", self.request.policies, files_at)
+        return list(dict.fromkeys(file for files in read.values() for file in files))
 
     def _keystores(self, side: CommitFiles) -> Generator[ReviewStep, None, dict[str, Path]]:
         """Return the keystore folders of BASE or HEAD, by path; yield the steps that read them."""
-        keystores: dict[str, Path] = {}
-        for path in self.request.keystores:
-            try:
-                folder = side.tree(path)
-                if not folder:
-                    raise self._missing_file_error(path)
-                if not is_keystore(folder):
-                    raise DocumentError(f"'{path}' is not a keystore", "It has no enclaves in it.")
-                keystores[path] = folder
-            except (SrosError, OSError) as error:
-                known = error if isinstance(error, SrosError) else DocumentError(str(error))
-                yield ReviewStep("keystore", path, _UNDECIDED, known)
-        return keystores
 
-    def _base_keystores(self, paths: Iterable[str]) -> Generator[ReviewStep, None, dict[str, Path]]:
-        """Return the folders of those keystores that BASE has; yield the steps that read them."""
-        keystores: dict[str, Path] = {}
-        for path in paths if self.base else ():
-            assert self.base
-            try:
-                if folder := self.base.tree(path):
-                    keystores[path] = folder
-            except SrosError as error:
-                yield ReviewStep("new-access", path, _UNDECIDED, error)
-        return keystores
+        def folder_at(path: str) -> Path:
+            folder = side.tree(path)
+            if not folder:
+                raise self._missing_file_error(path)
+            if not is_keystore(folder):
+                raise DocumentError(f"'{path}' is not a keystore", "It has no enclaves in it.")
+            return folder
+
+        return (yield from _read_each("keystore", self.request.keystores, folder_at))
 
     def _missing_file_error(self, path: str, advice: str = "") -> DocumentError:
         """Return the error for a file that HEAD lacks, with a hint where it may have moved."""
@@ -939,20 +931,6 @@ class _Review:
 
     # ── requirements ───────────────────────────────────────────────────────────────────────
 
-    def _requirement_files(self, side: CommitFiles) -> Generator[ReviewStep, None, dict[str, Path]]:
-        """Return the requirements files of BASE or HEAD; yield the steps that read them."""
-        files: dict[str, Path] = {}
-        for path in self.request.requirements:
-            try:
-                file = side.file(path)
-                if file:
-                    files[path] = file
-                elif side is self.head:
-                    raise self._missing_file_error(path)
-            except SrosError as error:
-                yield ReviewStep("requirements", path, _UNDECIDED, error)
-        return files
-
     def _requirements(
         self,
         policies: Sequence[Path],
@@ -964,10 +942,10 @@ class _Review:
     ) -> Iterator[ReviewStep]:
         if not self.request.requirements:
             return
-        files = yield from self._requirement_files(self.head)
-        base_files: dict[str, Path] = {}
+        paths, base_files = self.request.requirements, dict[str, Path]()
+        files = yield from self._files(self.head, "requirements", paths)
         if self.base:
-            base_files = yield from self._requirement_files(self.base)
+            base_files = yield from self._files(self.base, "requirements", paths)
         at = self._circumstances()
         systems: dict[str, Callable[[], System]] = {
             path: partial(
@@ -989,8 +967,7 @@ class _Review:
                 system = load()
                 before = self._keystore_fleet(subject) if subject in keystores else base_fleet
             except (SrosError, OSError) as error:
-                known = error if isinstance(error, SrosError) else DocumentError(str(error))
-                yield ReviewStep("requirements", subject, _UNDECIDED, known)
+                yield _undecided("requirements", subject, error)
                 continue
             wanted = yield from _read(files, system.fleet)
             earlier = yield from _read(
@@ -1269,14 +1246,32 @@ def _without_left_robots(before: Fleet | None, after: FleetSource) -> Fleet | No
     )
 
 
+def _undecided(kind: str, subject: str, error: SrosError | OSError) -> ReviewStep:
+    known = error if isinstance(error, SrosError) else DocumentError(str(error))
+    return ReviewStep(kind, subject, _UNDECIDED, known)
+
+
+def _read_each(
+    kind: str, paths: Iterable[str], read: Callable[[str], Value | None]
+) -> Generator[ReviewStep, None, dict[str, Value]]:
+    """Return what is read from paths, without None; yield a step for each path that cannot be."""
+    values: dict[str, Value] = {}
+    for path in paths:
+        try:
+            value = read(path)
+        except (SrosError, OSError) as error:
+            yield _undecided(kind, path, error)
+        else:
+            if value is not None:
+                values[path] = value
+    return values
+
+
 def _read(
     files: Mapping[str, Path], fleet: FleetSource
 ) -> Generator[ReviewStep, None, list[Requirement]]:
     """Return the requirements of files, by path; yield the steps that cannot read them."""
-    requirements: list[Requirement] = []
-    for path, file in files.items():
-        try:
-            requirements += read_requirements(file, fleet)
-        except SrosError as error:
-            yield ReviewStep("requirements", path, _UNDECIDED, error)
-    return requirements
+    read = yield from _read_each(
+        "requirements", files, lambda path: read_requirements(files[path], fleet)
+    )
+    return [requirement for requirements in read.values() for requirement in requirements]
