@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
@@ -17,7 +17,12 @@ from urllib.parse import quote
 
 from sros_tool.checks.kind import ChosenFindings, Finding, FindingKind, Severity, group_by_cause
 from sros_tool.errors import SrosError
-from sros_tool.fleet.robots import Fleet, named_robots, with_robot_placeholder
+from sros_tool.fleet.robots import (
+    Fleet,
+    grouped_by_robot,
+    named_robots,
+    with_robot_placeholder,
+)
 from sros_tool.keystore.layout import (
     CRL_FILE,
     GOVERNANCE_P7S,
@@ -87,37 +92,18 @@ def _merge_robots(
     largest group; many merged findings that differ only in another robot are merged again. Findings
     that share a cause stay as they are, and without ``fleet``, all findings do.
     """
-    read = [(group, _kinds(group, fleet) if fleet else {}) for group in groups]
-    robots: dict[Hashable, set[str]] = defaultdict(set)
-    for _, kinds in read:
-        for robot, same_and_similar in kinds.items():
-            for kind in same_and_similar:
-                robots[kind].add(robot)
-
-    def largest(kinds: _Kinds, which: int, otherwise: Hashable) -> tuple[Hashable, str]:
-        kinds_and_robots = ((kind[which], robot) for robot, kind in kinds.items())
-        return max(
-            kinds_and_robots,
-            key=lambda kind_and_robot: len(robots[kind_and_robot[0]]),
-            default=(otherwise, ""),
-        )
-
-    chosen = [(group, largest(kinds, 0, group), largest(kinds, 1, group)) for group, kinds in read]
-    parts: dict[Hashable, set[Hashable]] = defaultdict(set)
-    for _, (same, _), (similar, _) in chosen:
-        parts[similar].add(same)
-    merged: dict[tuple[Hashable, bool], dict[str, list[tuple[Finding, ...]]]] = {}
-    for group, of_same, of_similar in chosen:
-        many = len(parts[of_similar[0]]) > _MOST_SIMILAR
-        kind, of = of_similar if many else of_same
-        merged.setdefault((kind, many), {}).setdefault(of, []).append(group)
-    for (_, many), of_robot in merged.items():
+    read = []
+    for group in groups:
+        kinds = _kinds(group, fleet) if fleet else {}
+        same: list[tuple[Hashable, str]] = [(kind, robot) for robot, (kind, _) in kinds.items()]
+        read.append((group, same or [(group, "")], [(kind, r) for r, (_, kind) in kinds.items()]))
+    for (_, many), of_robot in grouped_by_robot(read, _MOST_SIMILAR).items():
         (first, *more), *others = of_robot.values()
         if others:
             count = counted(len(others), "more robot")
             names = first_few(list(of_robot)[1:], _MOST_ROBOTS, joint=", and ")
-            same = "the same, about other robots," if many else "the same"
-            yield first, f"{same} for {count}: {names}"
+            said = "the same, about other robots," if many else "the same"
+            yield first, f"{said} for {count}: {names}"
         else:
             yield from ((alone, "") for alone in (first, *more))
 

@@ -10,13 +10,14 @@ robot of an enclave needs a list of all enclaves.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from ipaddress import ip_address
 from itertools import permutations
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from sros_tool.errors import DocumentError, InvalidNameError, UsageError
 from sros_tool.names import check_enclave_name, expression_problem
@@ -32,6 +33,8 @@ from sros_tool.policy.placeholders import (
 from sros_tool.validity import parse_duration
 from sros_tool.wording import first_few
 
+_Item = TypeVar("_Item")
+_Kind = TypeVar("_Kind", bound=Hashable)
 MAX_ROBOTS = 100_000
 RENEWAL_ALLOWED, _RENEWAL_REFUSED = "allowed", "refused"
 ROUTERS = "/{robot}/router"
@@ -460,29 +463,47 @@ def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[st
     if fleet is None:
         yield from (text for _, text in lines)
         return
-    read = [(text, _foldings(fleet, enclave, text)) for enclave, text in lines]
-    robots: dict[_Folding, set[str]] = {}
-    for _, foldings in read:
-        for folding, robot in foldings:
-            robots.setdefault(folding, set()).add(robot)
-    chosen = [
-        max(foldings[:2], key=lambda folding: len(robots[folding[0]])) for _, foldings in read
-    ]
-    targets: dict[_Folding, set[_Folding]] = {}
-    for (_, foldings), (folding, _) in zip(read, chosen, strict=True):
-        for pair, _ in foldings[2:]:
-            targets.setdefault(pair, set()).add(folding)
-    groups: dict[_Folding, list[tuple[str, str]]] = {}
-    for (text, foldings), (folding, robot) in zip(read, chosen, strict=True):
-        if foldings[2:] and len(targets[foldings[2][0]]) > _MOST_TARGETS:
-            folding, robot = foldings[2]
-        groups.setdefault(folding, []).append((robot, text))
-    for folding, members in groups.items():
-        names = list(dict.fromkeys(name for name, _ in members))
-        if len(names) == 1:
-            yield from (text for _, text in members)
+    foldings = ((text, _foldings(fleet, enclave, text)) for enclave, text in lines)
+    read = [(text, possible[:2], possible[2:]) for text, possible in foldings]
+    for (folding, _), by_robot in grouped_by_robot(read, _MOST_TARGETS).items():
+        if len(by_robot) == 1:
+            yield from (text for texts in by_robot.values() for text in texts)
         else:
-            yield f"{folding.text}  ({_robots_text(fleet, names, folding)})"
+            yield f"{folding.text}  ({_robots_text(fleet, list(by_robot), folding)})"
+
+
+def grouped_by_robot(
+    items: Iterable[tuple[_Item, Sequence[tuple[_Kind, str]], Sequence[tuple[_Kind, str]]]],
+    most: int,
+) -> dict[tuple[_Kind, bool], dict[str, list[_Item]]]:
+    """Group items that differ only in one robot: kind -> robot -> items.
+
+    Each item has its possible kinds, with the robot in which it differs from others of the kind;
+    the kind with the most robots counts.  It also has kinds of items that differ in further
+    robots: such a kind, marked by True, counts if it joins more than ``most`` groups.
+    """
+    robots: dict[_Kind, set[str]] = defaultdict(set)
+    read = list(items)
+    for _, same, similar in read:
+        for kind, robot in (*same, *similar):
+            robots[kind].add(robot)
+
+    def largest(kinds: Sequence[tuple[_Kind, str]]) -> tuple[_Kind, str]:
+        return max(kinds, key=lambda kind_and_robot: len(robots[kind_and_robot[0]]))
+
+    chosen = [
+        (item, largest(same), largest(similar) if similar else None) for item, same, similar in read
+    ]
+    parts: dict[_Kind, set[_Kind]] = defaultdict(set)
+    for _, (kind, _), wide in chosen:
+        if wide:
+            parts[wide[0]].add(kind)
+    groups: dict[tuple[_Kind, bool], dict[str, list[_Item]]] = {}
+    for item, narrow, wide in chosen:
+        many = wide is not None and len(parts[wide[0]]) > most
+        kind, robot = wide if wide and many else narrow
+        groups.setdefault((kind, many), {}).setdefault(robot, []).append(item)
+    return groups
 
 
 class _Folding(NamedTuple):
