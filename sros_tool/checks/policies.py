@@ -50,7 +50,6 @@ from sros_tool.names import (
     ACTION_SERVICES,
     ACTION_TOPICS,
     GLOBAL_TOPICS,
-    GOAL,
     NODE_SERVICES,
     PARAMETER_SERVICES,
     action_part,
@@ -73,7 +72,7 @@ from sros_tool.policy.model import (
     stated_protections,
 )
 from sros_tool.policy.node_basics import are_basic
-from sros_tool.policy.patterns import ComparisonLimit, Names, covers, literal_prefix
+from sros_tool.policy.patterns import ComparisonLimit, Names, covers, literal_prefix, matches
 from sros_tool.policy.placeholders import parts_of
 from sros_tool.policy.rights import WHOLE, Right, Rules, parts, placed_rights, policy_rights
 from sros_tool.translate import permissions_for
@@ -263,6 +262,7 @@ _LONGEST = 247
 _DIGIT_FIRST = re.compile(r"/(?:[0-9]|\[[0-9-]+\])")
 _DDS_PREFIX = re.compile(r"/?(?:rt|rq|rr|rs)/")
 _ALL = re.compile(r"/?[*?]*\*[*?]*\Z")
+_SETTING = ("set_parameters", "set_parameters_atomically")
 _ASKING_SIDE = {offering: asking for asking, offering in OFFERING_SIDE.items()}
 
 
@@ -489,7 +489,7 @@ def _broad_right_findings(statement: _Statement) -> Iterator[Finding]:
             kind,
             f"{text} has a wildcard in the first part and in the last part of the name",
         )
-    elif right == "request" and covers(name, "/*/set_parameters"):
+    elif right == "request" and any(covers(name, f"/*/{service}") for service in _SETTING):
         yield statement.found(SETS_PARAMETERS, f"{text} matches every node")
 
 
@@ -636,34 +636,48 @@ def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
 def _check_parameters_of_others(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about parameter services of nodes that the enclave does not have.
 
-    A wildcard for nodes of the enclave is such a finding if it matches a node of another enclave.
+    A wildcard is such a finding if it matches one of a node that only other enclaves have.
     """
-    nodes = {
-        enclave.path: {expand("~", profile.ns, profile.node) for profile in enclave.all_profiles()}
-        for enclave in checked_policy.policy.enclaves
-    }
+    nodes: dict[str, set[str]] = defaultdict(set)
+    enclave_by_node: dict[str, str] = {}
+    for enclave in checked_policy.policy.enclaves:
+        for profile in enclave.all_profiles():
+            node = expand("~", profile.ns, profile.node)
+            nodes[enclave.path].add(node)
+            if profile.node and not is_expression(node):
+                enclave_by_node.setdefault(node, enclave.path)
+    services = Names(f"{node}/{name}" for node in enclave_by_node for name in PARAMETER_SERVICES)
+    limit = ComparisonLimit(6_000_000)
+
+    def is_denied(right: Right) -> bool:
+        denied = checked_policy.rules.overlaps(right._replace(qualifier=DENY))
+        if denied:
+            limit.spend(len(right.name))
+        return denied
+
     for statement in checked_policy.statements:
-        enclave, name = statement.right.enclave, statement.name
-        node, _, service = name.rpartition("/")
-        reply = statement.allows and statement.right.right == "reply"
-        if not (reply and service in PARAMETER_SERVICES):
+        right, name = statement.right, statement.name
+        if not statement.allows or right.right != "reply":
             continue
-        if not any(covers(own_node, node) for own_node in nodes[enclave]):
+        node, _, service = name.rpartition("/")
+        is_of_parameters = service in PARAMETER_SERVICES
+        if is_of_parameters and not any(covers(own, node) for own in nodes[right.enclave]):
             text = f"may serve {name}, and has no node {node}"
             yield statement.found(OTHER_NODES_PARAMETERS, text)
-        elif is_expression(node):
+        elif is_expression(name):
             other_nodes = (
-                (other, path)
-                for path, theirs in nodes.items()
-                for other in sorted(theirs - nodes[enclave])
-                if path != enclave and not is_expression(other) and covers(node, other)
+                other
+                for matched in services.overlapping(name)
+                if (other := matched.rpartition("/")[0]) not in nodes[right.enclave]
+                and not is_denied(right._replace(name=matched))
             )
-            for other, path in islice(other_nodes, 1):
-                text = f"may serve {name}, also as the node {other} of {path}"
-                yield statement.found(OTHER_NODES_PARAMETERS, text, _NAME_THE_NODES)
+            for other in islice(other_nodes, 1):
+                text = f"may serve {name}, also as the node {other} of {enclave_by_node[other]}"
+                remedy = _NAME_THEM.format("nodes" if is_of_parameters else "services")
+                yield statement.found(OTHER_NODES_PARAMETERS, text, remedy)
 
 
-_NAME_THE_NODES = "Name the nodes of this enclave in place of the wildcard."
+_NAME_THEM = "Name the {} of this enclave in place of the wildcard."
 
 
 @dataclass(slots=True)
@@ -1082,8 +1096,9 @@ def _statement_findings(statement: _Statement, rules: Rules) -> Iterator[Finding
             yield statement.found(UNREACHABLE, f"{statement.right.describe()} is denied by {shown}")
         return
     enclave, _, right, name = statement.right
-    if name.endswith(GOAL) and right in WHOLE:
-        whole, action = WHOLE[right], name.removesuffix(GOAL)
+    action, separator, ending = name.rpartition(ACTION_SEPARATOR)
+    if separator and matches(ending, "send_goal") and right in WHOLE:
+        whole = WHOLE[right]
         if not rules.allow(enclave, whole, action):
             text = f"{name} is allowed, but not everything needed to {whole} {action}"
             yield statement.found(HALF_ACTION, text)
@@ -1136,6 +1151,16 @@ IN_TWO_FILES = FindingKind(
     "sros.",
     "Define the enclave in one of them; check the policies of each robot by themselves.",
 )
+NODE_IN_TWO_ENCLAVES = FindingKind(
+    "policy.node-in-two-enclaves",
+    WARNING,
+    "a node that several enclaves have",
+    "Names of nodes are unique in ROS, and a process runs in one enclave: `sros run --policy` and "
+    "`ros2 launch --secured` refuse to choose one for the node.",
+    "rcl (node names are unique); sros.",
+    "Leave the profile in the enclave of the node's process. If these are nodes of several robots, "
+    "check the policy of each robot by itself, or write the policy for a fleet.",
+)
 FALLBACK = FindingKind(
     "policy.include-fallback",
     WARNING,
@@ -1184,13 +1209,12 @@ ROBOT_WRITTEN_OUT = FindingKind(
 _CHECKS = (
     _check_rules,
     _check_nodes,
-    _check_parameters_of_others,
     _check_names,
     _check_protection,
     _check_root_enclave,
     _check_portability,
 )
-_CHECKS_TOGETHER = (_check_counterparts, _check_instances)
+_CHECKS_TOGETHER = (_check_counterparts, _check_instances, _check_parameters_of_others)
 """Checks for which the policies of a robot count as one policy."""
 _PLACE = re.compile(r"(?P<file>.+?):(?P<line>\d+): (?P<text>.*)", re.DOTALL)
 _SYNTAX = re.compile(r", line (?P<line>\d+), column \d+")  # in messages of libxml2
@@ -1199,10 +1223,13 @@ _MANY = 1000
 _NUMBER = re.compile(r"[0-9]+")
 
 
-def findings_in(policies: Sequence[Policy], distribution: str = "") -> Iterator[Finding]:
+def findings_in(
+    policies: Sequence[Policy], distribution: str = "", *, of_fleet: bool = False
+) -> Iterator[Finding]:
     """Yield all findings in the parsed policies of a robot, except the findings about includes.
 
-    The counterparts of names are looked for in all the policies together.
+    The counterparts of names are looked for in all the policies together.  With ``of_fleet``, the
+    policies are for several robots, whose nodes may have the same names in different ROS domains.
     """
     checked = [_CheckedPolicy(policy, distribution) for policy in policies]
     for checked_policy in checked:
@@ -1213,6 +1240,8 @@ def findings_in(policies: Sequence[Policy], distribution: str = "") -> Iterator[
         checked = [_CheckedPolicy(replace(policies[0], enclaves=enclaves), distribution)]
         yield from _enclaves_of_two_policies(enclaves)
     for checked_policy in checked:
+        if not of_fleet:
+            yield from _nodes_in_two_enclaves(checked_policy.policy.enclaves)
         for check in _CHECKS_TOGETHER:
             yield from check(checked_policy)
 
@@ -1225,6 +1254,21 @@ def _enclaves_of_two_policies(enclaves: Iterable[Enclave]) -> Iterator[Finding]:
         if earlier.source != enclave.source:
             text = f"{enclave.path} is defined here and at {earlier.source}"
             yield IN_TWO_FILES.found(enclave.path, text, enclave.source.file, enclave.source.line)
+
+
+def _nodes_in_two_enclaves(enclaves: Iterable[Enclave]) -> Iterator[Finding]:
+    """Yield a finding for each node with a certain name that several enclaves have."""
+    by_node: dict[str, dict[str, Source]] = defaultdict(dict)
+    for enclave in enclaves:
+        for profile in enclave.all_profiles():
+            node = expand("~", profile.ns, profile.node)
+            if profile.node and not is_expression(node):
+                by_node[node].setdefault(enclave.path, profile.source)
+    for node, places in by_node.items():
+        if len(places) > 1:
+            path, source = [*places.items()][1]
+            text = f"the node {node} is in {first_few([*places], _NAMES_SHOWN)}"
+            yield NODE_IN_TWO_ENCLAVES.found(path, text, source.file, source.line)
 
 
 def is_mended_by(template: Template | None, finding: Finding) -> bool:
@@ -1270,7 +1314,7 @@ def policy_file_findings(
         yield UNKNOWN_GROUP.found(str(paths[0]), text, str(paths[0]))
     if fleet:
         yield from _robots_that_are_written_out(read, fleet.with_enclaves(patterns))
-    yield from findings_in(read, distribution)
+    yield from findings_in(read, distribution, of_fleet=fleet is not None)
     if on_zenoh:
         yield from _check_zenoh(enclave for policy in read for enclave in policy.enclaves)
 
@@ -1572,7 +1616,7 @@ _MOST_ENCLAVES = 1000  # of each policy: signing must not wait for the check of 
 
 
 def signed_findings(
-    policies: Iterable[Policy | FleetPolicy], enclaves: Collection[str], distribution: str = ""
+    policies: Sequence[Policy | FleetPolicy], enclaves: Collection[str], distribution: str = ""
 ) -> list[tuple[Finding, ...]]:
     """Return the errors and warnings in policies, worst first, grouped by cause.
 
@@ -1595,7 +1639,9 @@ def signed_findings(
             :_MOST_ENCLAVES
         ]
         parts.append(replace(policy, enclaves=tuple(chosen)))
-    shown = [finding for finding in findings_in(parts, distribution) if finding.severity >= WARNING]
+    of_fleet = any(isinstance(policy, FleetPolicy) for policy in policies)
+    found = findings_in(parts, distribution, of_fleet=of_fleet)
+    shown = [finding for finding in found if finding.severity >= WARNING]
     shown.sort(key=lambda finding: -finding.severity.weight)
     return list(group_by_cause(list(dict.fromkeys(shown))))
 

@@ -28,6 +28,7 @@ FOUND_OTHERWISE = {
     "policy.malformed",
     "policy.duplicate-enclave",
     "policy.enclave-in-two-files",
+    "policy.node-in-two-enclaves",
     "policy.include-fallback",
     "policy.redundant-include",
     "portable.enclave-names",
@@ -204,6 +205,43 @@ def test_a_wildcard_for_nodes_that_matches_a_node_of_another_enclave(tmp_path: P
     assert "policy.other-nodes-parameters" not in ids(tmp_path, policy(own, enclave("", "/b")))
 
 
+def test_a_wildcard_poses_as_each_node_that_it_matches(tmp_path: Path) -> None:
+    """Whether a name is written out, or matched, a request to set parameters arrives."""
+    planner = enclave("", "/p").replace('ns="/" node="n"', 'ns="/left" node="planner"')
+    (tmp_path / "other.xml").write_text(policy(planner))
+    kept = services("reply", "/left/planner/*", qualifier="DENY")
+    for reply, poses in {
+        services("reply", "planner/set_parameters"): True,
+        services("reply", "planner/*"): True,
+        services("reply", "*"): True,
+        services("reply", "*") + kept: False,
+        services("reply", "~/*"): False,
+        services("reply", "plan/*"): False,
+    }.items():
+        own = enclave(reply, ns="/left")
+        for other in ([planner], []):
+            (tmp_path / "policy.xml").write_text(policy(own, *other))
+            files = ["policy.xml"] if other else ["policy.xml", "other.xml"]
+            found = policy_file_findings(*(tmp_path / file for file in files))
+            posing = [each for each in found if each.id == "policy.other-nodes-parameters"]
+            assert bool(posing) == poses, (reply, files)
+
+
+def test_a_node_in_two_enclaves(tmp_path: Path) -> None:
+    twice = policy(enclave(""), enclave("", "/b"), enclave("", "/c"))
+    (found,) = findings(tmp_path, twice)
+    assert (found.id, found.line) == ("policy.node-in-two-enclaves", HEAD + 4)
+    assert found.text == "the node /n is in /a, /b, /c"
+    assert ids(tmp_path, policy(enclave(""), enclave("", "/b", ns="/b"))) == set()
+    tools = twice.replace('node="n"', 'node="_ros2cli_*"')
+    assert ids(tmp_path, tools) == set()
+
+    robots = [Robot(f"r{domain}", "/", domain, groups=(f"g{domain}",)) for domain in (1, 2)]
+    text = policy(*(enclave("", f"/{{robot:g{domain}}}/n") for domain in (1, 2)))
+    (tmp_path / "policy.xml").write_text(text)
+    assert not [*policy_file_findings(tmp_path / "policy.xml", fleet=Fleet.of(robots))]
+
+
 def test_malformed(tmp_path: Path) -> None:
     good = policy(enclave(topics("publish", "a")))
     assert ids(tmp_path, good) == set()
@@ -218,7 +256,7 @@ def test_duplicate_enclaves(tmp_path: Path) -> None:
     twice = policy(enclave(""), enclave(topics("publish", "x")))
     found = findings(tmp_path, twice)
     assert [(each.id, each.line) for each in found] == [("policy.duplicate-enclave", 6)]
-    assert ids(tmp_path, policy(enclave(""), enclave("", "/b"))) == set()
+    assert ids(tmp_path, policy(enclave(""), enclave("", "/b", ns="/b"))) == set()
     one, other = tmp_path / "policy.xml", tmp_path / "other.xml"
     other.write_text(policy(enclave("", "/c"), enclave("")))
     (second,) = (each for each in policy_file_findings(one, other) if "two-files" in each.id)

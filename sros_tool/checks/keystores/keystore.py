@@ -173,7 +173,7 @@ def keystore_findings(
             else policy
             for policy in at.policies
         ]
-        all_findings += findings_in(parts, at.distribution)
+        all_findings += findings_in(parts, at.distribution, of_fleet=at.fleet is not None)
     real_root = os.path.realpath(root)
     located = (_with_real_file(finding, opened, real_root) for finding in all_findings)
     all_findings = with_causes(
