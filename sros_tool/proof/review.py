@@ -304,8 +304,8 @@ class StepResult(NamedTuple):
     status: int
     """Exit status of the step: 0, 1 or 2, as for the review."""
     allowed: bool
-    """Whether the step found something that is allowed, by an option or always (``signed``); its
-    status is 0 then.
+    """Whether the step found something that is allowed, by an option or always (``signed``,
+    ``rights``); its status is 0 then.
     """
     result: str
     """The result as a sentence, or why the step could not be decided."""
@@ -370,8 +370,9 @@ class _Review:
         """Return whether the request, or the kind itself, allows what steps of a kind find."""
         if kind == "requirements-before":
             return self.request.allow_dropped_requirements
-        # Whoever changes a policy seldom has the keys of the CAs.
-        return kind == "signed" or (
+        # Whoever changes a policy seldom has the keys of the CAs, and only users know whether they
+        # put the nodes into another namespace.
+        return kind in ("signed", "rights") or (
             kind in ("new-access", "files") and self.request.allow_new_access
         )
 
@@ -927,7 +928,8 @@ class _Review:
         compared = compare_sources(first, second)
         if not compared and not (absolute or relative):
             return None
-        return _OK, RightsChange(first, second, compared, absolute, relative)
+        status = _FOUND if absolute or relative else _OK
+        return status, RightsChange(first, second, compared, absolute, relative)
 
     # ── requirements ───────────────────────────────────────────────────────────────────────
 

@@ -118,7 +118,7 @@ DENIES = '<topics publish="DENY"><topic>/q</topic></topics>'
     [
         ({"robot.xml": policy_text(WIDER)}, "review.new-access", ("robot.xml", 6)),
         (
-            {"robot.xml": policy_text({"/c": publish("/x")})},
+            {"robot.xml": policy_text({"/new/a": publish("/x")})},
             "review.new-access",
             ("robot.xml", 3),
         ),
@@ -240,7 +240,7 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
         }
     )
     ended = change.review("--policy", "robot.xml\nsecond.xml")
-    said = ended.out.partition("\n[ok] rights ")[2].splitlines()
+    said = ended.out.partition("\n[allowed] rights ")[2].splitlines()
     assert "written rights gone, 1 name made absolute" in said[0], ended
     assert "  ! /c may subscribe /x, but no enclave may publish it any more" in said
     assert "  - /a ALLOW publish topic /x" in said
@@ -288,7 +288,7 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
 def test_a_denial_that_a_node_leaves_behind_is_gone(change: Change) -> None:
     """An enclave that gets a node, and has its access already, has to deny what was denied."""
     denies = '<services request="DENY"><service>/*erase</service></services>'
-    other = policy_text({"/d": publish("/x")}).replace('node="n"', 'node="m"')
+    other = policy_text({"/d": publish("/x")})
     one, both = (policy_text({"/a": "", **more}) for more in ({}, {"/c": publish("/x") + denies}))
     change.base = change.commit({"robot.xml": both, "second.xml": other})
     line = "! /d has a node of /c without its DENY request service /*erase: other policies may"
@@ -300,10 +300,10 @@ def test_a_denial_that_a_node_leaves_behind_is_gone(change: Change) -> None:
         return change.review("--policy", "robot.xml\nsecond.xml")
 
     for text, node, rights, lines in (
-        (one, "n", "", [f"  {line} allow it now"]),
-        (both.replace('node="n"', 'node="k"'), "n", "", [f"  {line} allow it now"]),
-        (both, "n", "", []),  # another node of the name, perhaps
-        (one, "n", denies, []),
+        (one, "c", "", [f"  {line} allow it now"]),
+        (both.replace('node="c"', 'node="k"'), "c", "", [f"  {line} allow it now"]),
+        (both, "c", "", []),  # another node of the name, perhaps
+        (one, "c", denies, []),
         (one, "k", "", []),
     ):
         ended = review_of(text, node, publish("/x") + rights)
@@ -341,14 +341,14 @@ def test_a_renamed_policy_is_compared_by_its_folder(change: Change) -> None:
 def test_a_renamed_enclave_is_one_line_and_still_new_access(change: Change) -> None:
     reads = publish("/x").replace("publish", "subscribe")
     change.base = change.commit({"robot.xml": policy_text({"/a": publish("/x"), "/b": reads})})
-    renamed = "  ~ enclave /b is now /c, with the same rights"
+    renamed = "  ~ enclave /b is now /new/b, with the same rights"
     for rights, also in ((publish("/x"), ()), (publish("/x", "/z"), ("/a publish topic /z",))):
-        change.commit({"robot.xml": policy_text({"/a": rights, "/c": reads})})
+        change.commit({"robot.xml": policy_text({"/a": rights, "/new/b": reads})})
         said = change.review("--policy", "robot.xml")
         assert said.status == 1 and f"{12 + len(also)} rights are new; 1 enclave can" in said.out
         lines = [line.partition("  (")[0] for line in said.out.splitlines() if line[:2] == "  "]
         # Whom the enclave is influenced by is only new if other access is.
-        reach = ["  + /a can influence /c: /a -publish /x-> /c"] * len(also)
+        reach = ["  + /a can influence /new/b: /a -publish /x-> /new/b"] * len(also)
         assert lines == [
             f"{renamed}; they count as new, so that a reviewer has to allow them",
             *(*(f"  + {right}" for right in also), *reach),
@@ -928,24 +928,17 @@ def test_a_node_moves_out_of_no_requirement(change: Change) -> None:
     """Of the enclaves that a pattern stands for, one stays, so that the pattern is not empty."""
     inside = {"/third/lidar": publish("/scan"), "/third/cam": publish("/image")}
 
-    def policy(enclaves: dict[str, str]) -> str:
-        text = policy_text(enclaves)
-        for path in enclaves:
-            node = path.rpartition("/")[2]
-            text = text.replace('node="n"', f'node="{node}"', 1)
-        return text
-
     required = '[[nothing_but]]\nenclaves = ["/third/*"]\npublish = ["/scan", "/image"]\n'
     required += 'subscribe = ["/clock"]\nreply = ["*"]\n'
-    change.base = change.commit({"robot.xml": policy(inside), "robot.toml": required})
+    change.base = change.commit({"robot.xml": policy_text(inside), "robot.toml": required})
     words = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
     outside = {"/lidar": publish("/scan", "/cmd_vel"), "/third/cam": publish("/image")}
-    change.commit({"robot.xml": policy(outside)})
+    change.commit({"robot.xml": policy_text(outside)})
     ended = change.review(*words)
     assert "node /lidar moves to enclave /lidar, outside of the requirement" in ended.out, ended
     assert ended.status == 1
     assert change.review(*words, "--dropped-requirements", "allow").status == 0
-    change.commit({"robot.xml": policy({"/third/cam": publish("/image")})})
+    change.commit({"robot.xml": policy_text({"/third/cam": publish("/image")})})
     assert "moves to" not in change.review(*words).ok().out
 
 

@@ -37,10 +37,13 @@ POLICY, REQUIRED = "robot/robot.policy.xml", "robot/robot.requirements.toml"
 
 
 def policy(enclaves: Mapping[str, str]) -> str:
-    """Return the text of a policy, with the rights of a node for each of the enclaves."""
+    """Return the text of a policy, with the rights of a node for each of the enclaves.
+
+    The node has the name of its enclave.
+    """
     parts = "".join(
-        f'<enclave path="{path}"><profiles>\n<profile ns="/" node="n">{NODE}{rights}\n</profile>'
-        "</profiles></enclave>\n"
+        f'<enclave path="{path}"><profiles>\n<profile ns="/" node="{path.rpartition("/")[2]}">'
+        f"{NODE}{rights}\n</profile></profiles></enclave>\n"
         for path, rights in enclaves.items()
     )
     return (
