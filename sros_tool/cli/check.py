@@ -150,9 +150,9 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
     "namespaces",
     metavar="NS",
     multiple=True,
-    help="With --requirements: put the enclaves of the file, and its names without '/' at the "
-    "beginning, into this namespace, such as /left.  Can be repeated: the requirements "
-    "have to hold in each namespace.",
+    help="With --requirements: put the enclaves of the file, and its names without '/' or '*' at "
+    "the beginning, into this namespace, such as /left.  Can be repeated: the requirements have to "
+    "hold in each namespace.",
 )
 @click.option(
     "--template",

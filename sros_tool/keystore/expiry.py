@@ -220,10 +220,12 @@ def refuse_unreadable(unreadable: tuple[UnreadableEnclave, ...], verb: str) -> N
     if unreadable:
         names = ", ".join(enclave.name for enclave in unreadable)
         reasons = " ".join(f"{enclave.error.what}." for enclave in unreadable)
+        first = unreadable[0]
+        how = f" For {first.name}: {first.error.remedy}" if first.error.remedy else ""
         raise KeystoreError(
             f"{len(unreadable)} enclaves cannot be {verb}: {names}",
             f"{reasons} Nothing was changed.",
-            "Repair or revoke them, or name the other enclaves in the command.",
+            f"Repair or revoke them, or name the other enclaves in the command.{how}",
         )
 
 

@@ -9,7 +9,7 @@ A requirement is a table of the file, such as::
 
 Names are ROS names, with the wildcards of policies; enclaves are names or patterns, as for
 ``--match``, and ``!`` before a name excepts an enclave from a list.  A file can be read for a
-namespace: then all enclaves, and the names without ``/`` at their beginning, are below it.
+namespace: then all enclaves, and the names without ``/`` or ``*`` at their beginning, are below it.
 The class of each kind says what such a requirement demands.
 
 Names and enclaves can have the placeholders of policies, which a fleet fills in.  A table with

