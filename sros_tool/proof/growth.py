@@ -711,9 +711,8 @@ def _each_gain(
                 before, after = (world.access(side, enclave, domain) for side in (old, new))
                 gained_topics = {verb: after.topics[verb] - before.topics[verb] for verb in _VERBS}
                 gained = False
-                for gain in _added_gains(
-                    stated, enclave, gained_topics, (before, after), world, domain, limit
-                ):
+                place = _Place(enclave, world, domain, limit)
+                for gain in _added_gains(stated, place, gained_topics, (before, after)):
                     gained = True
                     yield gain
                 if not gained and after.joins and not before.joins:
@@ -722,14 +721,21 @@ def _each_gain(
                     )
 
 
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """An enclave in a domain of a world, and the limit on the search for what it gains there."""
+
+    enclave: str
+    world: _World
+    domain: int
+    limit: SearchLimit
+
+
 def _added_gains(
     stated_rights: _Stated,
-    enclave: str,
+    place: _Place,
     topics: Mapping[AccessVerb, NameSet],
     sides: tuple[_Access, _Access],
-    world: _World,
-    domain: int,
-    limit: SearchLimit,
 ) -> Iterator[Gain]:
     """Yield `Gain` values for ``topics``, which an enclave may use only after a change."""
     before, after = sides
@@ -737,9 +743,9 @@ def _added_gains(
         gained_topics = topics[verb]
         if not before.joins:
             gained_topics -= NameSet((ROS_DISCOVERY_TOPIC,))  # every participant has it
-        for gain in stated_rights.gains(enclave, verb, gained_topics, world, domain, limit):
+        for gain in stated_rights.gains(place, verb, gained_topics):
             if not after.decide(verb, gain.topic) or before.decide(verb, gain.topic):
-                raise AssertionError(f"{gain} is not what {world.title} decides")
+                raise AssertionError(f"{gain} is not what {place.world.title} decides")
             yield gain
 
 
@@ -791,7 +797,8 @@ class AccessByVendors:
             )
             gained = NameSet() if old == new else (new - old) & ROS_TOPICS
             topics[verb] = gained | NameSet(exact)
-        yield from _added_gains(self._stated, enclave, topics, sides, world, domain, SearchLimit())
+        place = _Place(enclave, world, domain, SearchLimit())
+        yield from _added_gains(self._stated, place, topics, sides)
 
 
 def _joined_access(accesses: Sequence[Access]) -> _Access:
@@ -865,45 +872,25 @@ class _Stated:
         topics = {topic for right in rights for side in right.topics for topic in side}
         self._exact = sorted(topic for topic in topics if not is_expression(topic))
 
-    def gains(
-        self,
-        enclave: str,
-        verb: AccessVerb,
-        added_names: NameSet,
-        world: _World,
-        domain: int,
-        limit: SearchLimit,
-    ) -> Iterator[Gain]:
+    def gains(self, place: _Place, verb: AccessVerb, added_names: NameSet) -> Iterator[Gain]:
         """Yield the access that an enclave gains to the topics ``added_names``.
 
         That is one `Gain` for each right of the policy that covers some of these topics, and one
         for the topics that no right covers.
         """
+        enclave, world = place.enclave, place.world
         fitting_others = world.fitting_others(self._new, enclave)
-        key = (
-            enclave,
-            fitting_others,
-            verb,
-            added_names,
-            world.style,
-            world.longest,
-        )  # often in several domains
+        # Often in several domains.
+        key = enclave, fitting_others, verb, added_names, world.style, world.longest
         if key not in self._found:
-            self._found[key] = list(
-                self._searched_gains(enclave, verb, added_names, world, domain, limit)
-            )
+            self._found[key] = list(self._searched_gains(place, verb, added_names))
         for gain in self._found[key]:
-            yield replace(gain, worlds=(world.title,), domains=(domain,))
+            yield replace(gain, worlds=(world.title,), domains=(place.domain,))
 
     def _searched_gains(
-        self,
-        enclave: str,
-        verb: AccessVerb,
-        added_names: NameSet,
-        world: _World,
-        domain: int,
-        limit: SearchLimit,
+        self, place: _Place, verb: AccessVerb, added_names: NameSet
     ) -> Iterator[Gain]:
+        enclave, world = place.enclave, place.world
         allowed = [
             (right, getattr(right.topics, verb))
             for name in (enclave, *world.fitting_others(self._new, enclave))
@@ -913,23 +900,21 @@ class _Stated:
         for right, topics in allowed:
             for expression in topics:
                 own_names = added_names & names_of(world.style, (expression,))
-                topic = self._example(own_names, (enclave, verb, expression), world, limit)
+                topic = self._example(own_names, verb, expression, place)
                 if topic is None:
                     continue
-                gain = self._gain(enclave, verb, right, expression, topic, world, domain)
+                gain = self._gain(place, verb, right, expression, topic)
                 yield gain
                 if gain.denied and is_expression(expression):
                     # Perhaps there is more than a denial that is gone.
-                    topic = self._example(
-                        own_names - denied.names, (enclave, verb, expression), world, limit
-                    )
+                    topic = self._example(own_names - denied.names, verb, expression, place)
                     if topic is not None:
-                        yield self._gain(enclave, verb, right, expression, topic, world, domain)
+                        yield self._gain(place, verb, right, expression, topic)
                 break
         stated = names_of(world.style, (topic for _, topics in allowed for topic in topics))
-        topic = self._example(added_names - stated, (enclave, verb, "*"), world, limit)
+        topic = self._example(added_names - stated, verb, "*", place)
         if topic is not None:
-            yield self._gain(enclave, verb, None, topic, topic, world, domain)
+            yield self._gain(place, verb, None, topic, topic)
 
     def _denials(self, enclave: str, verb: AccessVerb, style: Style) -> _Denials:
         key = enclave, verb, style
@@ -938,17 +923,18 @@ class _Stated:
         return self._denials_of[key]
 
     def _example(
-        self, names: NameSet, key: tuple[str, AccessVerb, str], world: _World, limit: SearchLimit
+        self, names: NameSet, verb: AccessVerb, expression: str, place: _Place
     ) -> str | None:
         """Return an example name; if possible, the same as in another world, or a stated name."""
-        example = _example(names, key[2], world, limit)
+        longest, known = place.world.longest, self._examples[place.enclave, verb, expression]
+        example = _example(names, expression, place.world, place.limit)
         if example is None:
             return None
-        for topic in chain(self._examples[key], self._likely_topics(key[2])):
-            if topic in names and (world.longest is None or len(topic.encode()) <= world.longest):
-                self._examples[key] += [topic] if topic not in self._examples[key] else []
+        for topic in chain(known, self._likely_topics(expression)):
+            if topic in names and (longest is None or len(topic.encode()) <= longest):
+                known += [topic] if topic not in known else []
                 return topic
-        self._examples[key].append(example)
+        known.append(example)
         return example
 
     def _likely_topics(self, expression: str) -> Iterator[str]:
@@ -966,23 +952,16 @@ class _Stated:
             )
 
     def _gain(
-        self,
-        enclave: str,
-        verb: AccessVerb,
-        right: Right | None,
-        expression: str,
-        topic: str,
-        world: _World,
-        domain: int,
+        self, place: _Place, verb: AccessVerb, right: Right | None, expression: str, topic: str
     ) -> Gain:
-        denied = self._denials(enclave, verb, world.style).of(topic)
+        denied = self._denials(place.enclave, verb, place.world.style).of(topic)
         name, action = topic, "write" if verb is AccessVerb.PUBLISH else "read"
         if right:
             at = expression.find(right.name)  # a name in permissions can be empty
             end = len(expression) - at - len(right.name)
             name, action = topic[at : len(topic) - end], right.right
         return Gain(
-            (enclave,),
+            (place.enclave,),
             action,
             right,
             name,
@@ -990,8 +969,8 @@ class _Stated:
             _source(self._new_sources, self._new, right),
             denied,
             _source(self._old_sources, self._old, denied),
-            (world.title,),
-            (domain,),
+            (place.world.title,),
+            (place.domain,),
         )
 
 
