@@ -151,7 +151,7 @@ def look_at_processes(
         tuple(sorted({*map(_enclave_of, elsewhere)})),
         complete,
         problems,
-        robot_dds(running),
+        _robot_dds(running),
     )
 
 
@@ -221,7 +221,7 @@ def enclaves_to_restart(
     )
 
 
-def robot_dds(running: RunningProcesses) -> RobotDds:
+def _robot_dds(running: RunningProcesses) -> RobotDds:
     """Return the DDS libraries that processes of this machine have loaded, or that are
     installed."""
     loaded = [library for process in running.processes for library in process.dds]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -32,6 +33,7 @@ from sros_tool.cli.common import (
     keyring,
     keystore_argument,
     keystore_arguments,
+    local_zone,
     now,
     output_option,
     print_json,
@@ -51,9 +53,9 @@ from sros_tool.wording import counted, first_few
 if TYPE_CHECKING:
     from datetime import datetime
 
+    from sros_tool.agent.running import EnclaveProcesses
     from sros_tool.checks.kind import Finding
     from sros_tool.dds.decision.vendors import Vendor
-    from sros_tool.keystore.confirmation import RobotDds
     from sros_tool.keystore.delivery.collect import CollectedInbox
     from sros_tool.keystore.delivery.publish import PublishedFleet
     from sros_tool.keystore.fleet_status import FleetStatus, RobotStatus
@@ -116,45 +118,64 @@ def _inventory(root: Path, as_yaml: bool, as_list: bool) -> None:
 @fleet.command("report")
 @keystore_argument("folder", "[DIR]")
 @click.option("--robot", metavar="NAME", required=True, help="The name of this robot.")
-def _report(folder: Path, robot: str) -> None:
+@click.option(
+    "--restarted", is_flag=True,
+    help="All processes were restarted since the files were brought, also those that sros cannot "
+        "see.",
+)  # fmt: skip
+def _report(folder: Path, robot: str, restarted: bool) -> None:
     """On a robot, print a report of its enclaves' files and its DDS, for `fleet confirm`.
 
     The report is JSON. It has the time, the SHA-256 of each file of the enclaves in DIR except
-    their keys, and the DDS libraries that processes have loaded or that are installed. Its
-    problems are enclaves in which no process could start, for example because the key does not fit
-    the certificate, and files that other users can read or change. docs/json.md describes the
-    report under "confirmation".
+    their keys, the DDS libraries that processes have loaded or that are installed, and the enclaves
+    whose processes still run with earlier files: root can see all processes. Its problems are
+    enclaves in which no process could start, for example because the key does not fit the
+    certificate, and files that other users can read or change. docs/json.md describes the report
+    under "confirmation".
 
     Example:
-      $ ssh r7 sros fleet report /etc/sros/keystore --robot r7 |
+      $ ssh root@r7 sros fleet report /etc/sros/keystore --robot r7 |
             sros fleet confirm keystore --robot r7 -
     """
+    from sros_tool.agent.running import enclaves_to_restart
     from sros_tool.agent.state import read_state
     from sros_tool.checks.keystores.arrival import installed_sentences
     from sros_tool.keystore.confirmation import (
+        RunningFiles,
         make_confirmation,
         render_confirmation,
         shortened_problems,
     )
+    from sros_tool.keystore.layout import list_enclaves
     from sros_tool.runtime.processes import boot_id
 
     with progress("reading"):
         moment = now()
-        confirmation = make_confirmation(folder, robot, now=moment, dds=_dds_here(moment))
-        problems = shortened_problems(installed_sentences(folder, confirmation.enclaves(), moment))
-    confirmation, agent = replace(confirmation, problems=problems), read_state(folder)
-    if agent.due and agent.boot == boot_id():  # without an agent, nobody knows
-        # Not which of them lack the list: files may have changed since the agent looked.
-        confirmation = replace(confirmation, restart=agent.due)
+        names = list_enclaves(folder)
+        processes = _processes_here(folder, names, moment)
+        confirmation = make_confirmation(folder, robot, now=moment, dds=processes.dds)
+        problems = shortened_problems(installed_sentences(folder, names, moment))
+    confirmation = replace(confirmation, problems=problems)
+    agent, states = read_state(folder), processes.loaded_from_any_folder()
+    noted = agent.due if agent.boot == boot_id() else ()
+    restart = {*noted, *enclaves_to_restart((), states, complete=True)}
+    list_restart = {
+        *processes.elsewhere,
+        *enclaves_to_restart((), processes.list_states, complete=True),
+    }
+    is_known = restarted or processes.complete or RunningFiles.NOT_SEEN not in states.values()
+    if restart or is_known:
+        confirmation = replace(confirmation, restart=tuple(sorted(restart)))
+    if is_known and not noted:  # files may have changed since the agent looked
+        confirmation = replace(confirmation, crl_restart=tuple(sorted(list_restart)))
     echo_document(render_confirmation(confirmation))
 
 
-def _dds_here(moment: datetime) -> RobotDds:
-    """Return the loaded and the installed DDS libraries of this machine."""
-    from sros_tool.agent.running import robot_dds
-    from sros_tool.runtime.processes import ProcessTable
+def _processes_here(folder: Path, names: Iterable[str], moment: datetime) -> EnclaveProcesses:
+    """Return what runs on this machine in the enclaves of a folder."""
+    from sros_tool.agent.running import look_at_processes
 
-    return robot_dds(ProcessTable().look(moment))
+    return look_at_processes(folder, names, now=moment, zone=local_zone(os.environ))
 
 
 # ── in the keystore ─────────────────────────────────────────────────────────────────────────
@@ -587,20 +608,20 @@ def _status(
 ) -> int:
     """Compare the files that each robot last confirmed with the files that it should have.
 
-    A robot should have the files that an export from KEYSTORE would give it now. A file is
-    current; earlier (issued for this enclave before); another's (issued for another enclave);
-    revoked; missing; or unknown (never issued by this keystore). Processes use new files only
-    after a restart. Confirmations by the Ansible collection and `sros agent` say which restarts
-    are due, confirmations by `sros fleet report` do not. A robot without a recent confirmation is
-    offline. Robots with the same state share a line. A robot that reports a release which was never
-    published is shown even if its files are current. The first line also counts the robots whose
-    DDS has known vulnerabilities that a later release of the same major version fixes, by the
-    advisories of sros; --robot and --advisories list them.
+    A robot should have the files that an export from KEYSTORE would give it now. A file is current;
+    earlier (issued for this enclave before); another's (issued for another enclave); revoked;
+    missing; or unknown (never issued by this keystore). Processes use new files only after a
+    restart. Confirmations by the Ansible collection and `sros agent` say which restarts are due,
+    those by `sros fleet report` only if it saw all processes, or with --restarted. A robot without
+    a recent confirmation is offline. Robots with the same state share a line. A robot that reports
+    a release which was never published is shown even if its files are current. The first line also
+    counts the robots whose DDS has known vulnerabilities that a later release of the same major
+    version fixes, by the advisories of sros; --robot and --advisories list them.
 
     The revocation list is in force on a robot if the robot has the list, or an earlier list that
     revokes the same certificates, and confirms that no process has to restart for it. `sros agent`
-    confirms for each process whether the process lacks the list. In other confirmations, every
-    restart that is due counts as one for the list.
+    and `sros fleet report` confirm for each process whether the process lacks the list. In other
+    confirmations, every restart that is due counts as one for the list.
 
     Example:
       $ sros fleet status keystore

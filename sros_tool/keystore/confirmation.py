@@ -80,7 +80,7 @@ _OF_AGENT = (
     "requests",
     "crl",
 )
-"""Keys that only `sros agent` writes, except for ``crl_restart``."""
+"""Keys that only `sros agent` writes, except for ``crl_restart`` and ``problems``."""
 _OPTIONAL_KEYS = {"certificates", "restart", "dds", *_OF_AGENT}
 _CLOCK_TOLERANCE = timedelta(minutes=1)
 _MOST_BOOTS = 8

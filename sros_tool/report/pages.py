@@ -459,8 +459,8 @@ def render_fleet_page(
             trusted = (
                 '<p class="wrong">Until the revocation list is in force on a robot, the robot '
                 "accepts whoever has a revoked key. Deliver the list, restart the processes, and "
-                "confirm by Ansible or <code>sros agent</code>; <code>sros fleet report</code> "
-                "does not tell what runs.</p>"
+                "confirm by Ansible, <code>sros agent</code> or <code>sros fleet report "
+                "--restarted</code>.</p>"
             )
     fact_lines = "".join(f"<br>{_sentence(fact)}" for fact in facts)
     head = (

@@ -15,6 +15,7 @@ import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
+from sros_tool.agent.running import EnclaveProcesses
 from sros_tool.agent.state import AgentState, write_state
 from sros_tool.cli import fleet as fleet_verbs
 from sros_tool.cli.fleet import ComparedFleet, _facts, _joined_durations, _lines, _robot_names
@@ -69,11 +70,19 @@ class Field:
             self.run("distribute_key", "ks", "--robot", robot, robot, "--force")
             self.confirm(robot, **changed)
 
-    def confirm(self, robot: str, **changed: object) -> Ended:
+    def report(self, robot: str, *words: str, **processes: Any) -> dict[str, Any]:
+        """Return what the robot reports if sros sees ``processes`` there; without them, nothing."""
+        states = {f"/{robot}/base": RunningFiles.NOT_SEEN}
+        seen = EnclaveProcesses(states, states, states, (), False, (), SOUND_DDS)
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(fleet_verbs, "_processes_here", lambda *_: seen._replace(**processes))
+            said = self.run("fleet", "report", robot, "--robot", robot, *words).out
+        found: dict[str, Any] = json.loads(said)
+        return found
+
+    def confirm(self, robot: str, *words: str, **changed: object) -> Ended:
         """Confirm what a robot has, with a sound DDS and with ``changed`` values."""
-        with pytest.MonkeyPatch.context() as patched:  # it is replaced below
-            patched.setattr(fleet_verbs, "_dds_here", lambda _: SOUND_DDS)
-            said = json.loads(self.run("fleet", "report", robot, "--robot", robot).out)
+        said = self.report(robot, *words)
         (self.folder / "said.json").write_text(json.dumps(said | {"dds": DDS} | changed))
         return self.run("fleet", "confirm", "ks", "said.json", "--robot", robot)
 
@@ -549,6 +558,31 @@ def test_a_restart_that_is_due(field: Field) -> None:
     assert "not known whether processes of /r1/base have loaded the" in told
     page = field.run("fleet", "status", "ks", "--html", status=1).out
     assert "not known whether processes of /r1/base have loaded the" in page
+
+
+def test_a_report_says_which_restarts_are_due_if_all_processes_were_seen(field: Field) -> None:
+    """Or if somebody says that all were restarted; then the revocation list can be in force."""
+    now, before = ({"/r1/base": state} for state in (RunningFiles.CURRENT, RunningFiles.EARLIER))
+    no_new_list = {"states": before, "list_states": now}
+    due = ["/r1/base"]
+    for words, processes, restart, crl_restart in (
+        ((), {}, None, None),
+        ((), {"complete": True}, [], []),
+        (("--restarted",), {}, [], []),
+        ((), {"states": now, "list_states": now}, [], []),
+        ((), {"states": before, "list_states": before}, due, due),
+        (("--restarted",), {"states": before, "list_states": before}, due, due),
+        (("--restarted",), no_new_list, due, []),
+        ((), {"elsewhere": ("/r1/base",), "complete": True}, due, due),
+    ):
+        said = field.report("r1", *words, **processes)
+        assert (said.get("restart"), said.get("crl_restart")) == (restart, crl_restart)
+    field.run("revoke", "ks", "--robot", "r3")
+    for words, state, in_force in (((), "current", False), (("--restarted",), "current", True)):
+        field.run("distribute_key", "ks", "--robot", "r1", "r1", "--force")
+        field.confirm("r1", *words)
+        robot = field.status()["robots"]["r1"]
+        assert (robot["state"], robot["crl_in_force"]) == (state, in_force)
 
 
 def test_other_permissions_leave_the_list_in_force(field: Field) -> None:
