@@ -332,6 +332,12 @@ def _unknown_process_problems(robot: LocalRobot, state: CloseState) -> Iterator[
     if observed.unknown:
         processes = first_few(observed.unknown, MOST_NAMES)
         undo = f"go back by {close} --undo, and " if state.secured else ""
+        if state.secured and (idle := sorted(state.stopped)):
+            start = observed.command_of_new(robot.export.absolute(), "ENCLAVE")
+            undo = (
+                f"if such a process belongs in {first_few(idle, MOST_NAMES)}, stop it, and start "
+                f"it there: {start}; if not, {undo}"
+            )
         remap = "--ros-args -r __node:=NODE -r __ns:=NAMESPACE"
         advice = f", or name its node in the command of each process ({remap})"
         advice = advice if observed.elsewhere else ""

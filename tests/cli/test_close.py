@@ -558,6 +558,11 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     (robot.folder / "robot/requirements.toml").unlink()
     ended = robot.close()
     assert "  /late: new, start it with: sros run " in ended.out
+    robot.more = (late,)
+    said = robot.close(status=1).out
+    assert "if such a process belongs in /late, stop it, and start it there: sros run /" in said
+    assert "/robot/export ENCLAVE -- COMMAND; if not, go back by sros close robot --undo, " in said
+    robot.more = ()
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert commands.startswith("# /late is new: COMMAND is what starts it\nsros run ")
     assert "enclaves, except for /late (not running); the files" in ended.err
