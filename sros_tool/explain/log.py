@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -53,8 +53,9 @@ from sros_tool.names import (
     right_to_use,
 )
 from sros_tool.pki.certificates import IDENTITY_DIGITS
-from sros_tool.policy.model import ALLOW, Enclave, Policy, policy_in_namespace
+from sros_tool.policy.model import ALLOW, OTHER_SIDE, Enclave, Policy, policy_in_namespace
 from sros_tool.policy.patterns import covers
+from sros_tool.policy.rights import Right
 from sros_tool.runtime.log_texts import NO_ENCLAVE, RUNS_OPEN, UNKNOWN, LogText
 from sros_tool.runtime.vendor_log import (
     CONTINUATION,
@@ -165,6 +166,20 @@ class SearchedKeystore:
         """Return the enclaves whose permissions are only for the node with this full name."""
         return self._by_node.get(node, ())
 
+    def has_other_side(self, right: Right) -> bool | None:
+        """Return whether an enclave has the right that the peers of a right need, by its name.
+
+        None if that is not known, or an enclave has it only by a wildcard.
+        """
+        names = {
+            peer.name
+            for peer in self._rights
+            if peer.right == OTHER_SIDE.get(right.right)
+            and peer.qualifier is ALLOW
+            and covers(peer.name, right.name)
+        }
+        return right.name in names or (None if names or not self._rights else False)
+
     @cached_property
     def zenoh_routers(self) -> frozenset[str]:
         """The enclaves of Zenoh routers: by the settings, by name without them, and by files."""
@@ -192,13 +207,15 @@ class SearchedKeystore:
         return enclaves_by_identity(self._keystore)
 
     @cached_property
+    def _rights(self) -> Collection[Right]:
+        with suppress(SrosError):  # its documents do not tell
+            return load_rights(self._keystore).rights
+        return ()
+
+    @cached_property
     def _by_node(self) -> Mapping[str, tuple[str, ...]]:
         enclaves_by_node: dict[str, set[str]] = {}
-        try:
-            rights = load_rights(self._keystore).rights
-        except SrosError:  # its documents do not tell
-            return {}
-        for right in rights:
+        for right in self._rights:
             if right.qualifier is ALLOW:
                 for node in nodes_served([(right.right, right.name)]):
                     enclaves_by_node.setdefault(node, set()).add(right.enclave)
@@ -903,7 +920,14 @@ class _Examiner:
         denied = question.allowed(enclave.name)
         if other := meaning_of_other_kind(denied, named_rights(asked)):
             return [f"{other}, but {name} is {with_article(question.type)}"], ""
-        names = likely_names(asked)
+        is_used = self._keystore.has_other_side(denied) if self._keystore else None
+        names = () if is_used else likely_names(asked)  # a name that peers have is no mistake
+        if not names and is_used is False:
+            return [f"no enclave may {OTHER_SIDE[denied.right]} {name}"], (
+                "If another name is meant, the node perhaps lacks a remapping: compare its command "
+                "with the one that the robot starts (after `sros close`: start/commands.txt). "
+                f"Otherwise, {remedy}"
+            )
         if not names:
             return [], ""
         rules = (

@@ -52,7 +52,7 @@ from sros_tool.keystore.participant import (
 )
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.names import is_expression
-from sros_tool.policy.model import Policy
+from sros_tool.policy.model import OFFERING_SIDE, OTHER_SIDE, Policy
 from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.values import shows
 from sros_tool.wording import first_few
@@ -210,7 +210,7 @@ def explain_on_dds(
         *_note_on_action(evaluator, answer, kind),
         *_note_on_parts(evaluator, answer),
         *_not_a_topic_notes(answer, asked_enclave),
-        *_similar_name_notes(answer),
+        *_other_name_notes(answer, asked_enclave),
         *_note_on_fitting_permissions(evaluator, answer),
         *(note_on_lacking_keys(copied) if copied else ()),
         *_earlier_permissions_notes(answer, context.at),
@@ -330,13 +330,27 @@ def _not_a_topic_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[
         yield Note("explain.no-topic", text)
 
 
-def _similar_name_notes(answer: Answer) -> Iterator[Note]:
-    """Yield a note with similar names to which the enclave has rights."""
-    if answer.allowed or answer.problems or not answer.question.right:
+def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[Note]:
+    """Yield a note if another name may be meant: by a similar one, or because nobody offers it.
+
+    A name that a peer has is no mistake.
+    """
+    question = answer.question
+    if answer.allowed or answer.problems or not question.right:
+        return
+    needed = OTHER_SIDE[question.right]
+    rights = asked_enclave.other_rights(question.name)
+    if any((right.right, right.name) == (needed, question.name) for right in rights):
         return
     if names := likely_names(answer):
-        text = f"the enclave may {answer.question.word} {' and '.join(names)}: perhaps that is "
-        yield Note("explain.likely-name", f"{text}meant.")
+        text = f"the enclave may {question.word} {' and '.join(names)}: perhaps that is meant."
+        yield Note("explain.likely-name", text)
+    elif question.right in OFFERING_SIDE and (
+        asked_enclave.policy or asked_enclave.enclave.keystore
+    ):
+        text = f"no enclave may {needed} {question.name} by its name: then nobody offers it, unless"
+        text += " a wildcard allows it. Perhaps the node lacks a remapping."
+        yield Note("explain.not-offered", text)
 
 
 def _note_on_fitting_permissions(evaluator: Evaluator, answer: Answer) -> Iterator[Note]:

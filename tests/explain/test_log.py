@@ -25,7 +25,7 @@ from sros_tool.runtime.log_texts import LOG_TEXTS, UNKNOWN, LogText
 from sros_tool.runtime.zenoh_log import ZENOH_TEXTS
 from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
 from tests.support.children import python, run
-from tests.support.harness import copy_of, policy_text, publish, sros
+from tests.support.harness import copy_of, policy_text, publish, sros, subscribe
 from tests.support.long_form import some
 
 LOGS = Path(__file__).with_name("logs")
@@ -1032,6 +1032,32 @@ def test_a_forgotten_remapping_is_shown(keystore: Path, tmp_path: Path) -> None:
         assert (f"the policy lacks one that the node has, write /{topic}" in found) is bool(why)
         assert (f"`--remap /chatter:=/{topic}`" in found) is bool(why)
         assert f"`sros explain {keystore} {ENCLAVE} publish /{topic}`" in found
+
+
+def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
+    tmp_path: Path,
+) -> None:
+    """A name that a peer has is no mistake; without any, the right alone gives a silent node."""
+    camera = publish("/front/image", "/rear/image")
+    enclaves = {"/camera": camera, "/weed": subscribe("/front/image")}
+    (policy := tmp_path / "policy.xml").write_text(policy_text(enclaves))
+    keystore, log = tmp_path / "keystore", tmp_path / "robot.log"
+    sros("create_keystore", keystore).ok()
+    sros("generate_artifacts", "-k", keystore, "-p", policy).ok()
+    for topic, facts in (
+        ("/rear/image", ()),
+        ("/frnt/image", ("-r /frnt/image:=/front/image",)),
+        ("/odometry", ("no enclave may publish /odometry\n", "perhaps lacks a remapping: ")),
+    ):
+        log.write_text(f"rt{topic} topic not found in allow rule. check_create_datareader\n")
+        found = sros("explain", keystore, "/weed", "--log", log).out
+        for fact in ("-r /frnt/image:=", "no enclave may ", "perhaps lacks a remapping"):
+            assert (fact in found) is any(fact in each for each in facts), (topic, found)
+        assert all(fact in found for fact in facts) and "subscribe" in found
+        assert "-r /rear/image" not in found
+        notes = sros("explain", keystore, "/weed", "subscribe", topic).err
+        assert ("[explain.not-offered]: no enclave may publish /odom" in notes) is (len(facts) == 2)
+        assert ("[explain.likely-name]" in notes) is (len(facts) == 1)
 
 
 def test_a_topic_without_a_ros_name_is_looked_up_in_the_folder_of_the_enclave(
