@@ -511,7 +511,8 @@ def _zenoh_worlds(
     """Yield the worlds of Zenoh, one for each domain.
 
     Only rules that other processes enforce on a session count, because a session can ignore its
-    own.
+    own.  The routers that the settings name are part of the network, and no enclaves that a
+    requirement is about: they may pass on what their enclaves may send.
 
     Raises:
         KeystoreError: there are no Zenoh configurations, or it is unclear what they enforce.
@@ -530,23 +531,25 @@ def _zenoh_worlds(
         name: source.configurations[enclave_path(root, name) / ROUTER_FILE].access
         for name in (source.routers if source.links else ())
     }
+    network = keystore.settings.zenoh if keystore.settings else None
+    routers = {*source.routers}.intersection(network.router_names() if network else ())
+    named = {name for enforcer in enforcers for name in enforcer.names()}
     for zenoh_domain in domains:
         title = "Zenoh" if len(domains) == 1 else f"Zenoh in domain {zenoh_domain}"
         crossing = Crossing(source.links.router_of, rules, zenoh_domain) if source.links else None
-        enclaves = {*stated_access}.difference(source.routers)
-        yield _zenoh_world(title, enforcers, enclaves, zenoh_domain, stated_access, crossing)
+        names = {*stated_access, *named} - routers
+        yield _zenoh_world(title, enforcers, names, zenoh_domain, stated_access, crossing)
 
 
 def _zenoh_world(
     title: str,
     enforcers: Sequence[Enforcement],
-    enclaves: Iterable[str],
+    names: Iterable[str],
     domain: int,
     stated_access: Mapping[str, TopicAccess],
     crossing: Crossing | None,
 ) -> World:
-    """Return the Zenoh world of a domain, with all enclaves and with other names in the rules."""
-    names = {*enclaves, *(name for enforcer in enforcers for name in enforcer.names())}
+    """Return the Zenoh world of a domain, with the enclaves ``names``."""
 
     def confirm(enclave: str, writes: bool, topic: str) -> bool:
         return is_enforced(enforcers, enclave, domain, topic, writes=writes)

@@ -188,6 +188,19 @@ def a_second_router(keystore: Path) -> None:
     shutil.copy(keystore / ROUTER, keystore / "enclaves/web/router.json5")
 
 
+def a_router_that_the_settings_do_not_name(keystore: Path) -> None:
+    """Both routers know each other, and the first one lets the second one drive."""
+
+    def driven(document: dict) -> None:  # type: ignore[type-arg]
+        for each in document["access_control"]["policies"]:
+            if each["subjects"] == ["/mux"]:
+                each["subjects"].append("/web")
+
+    rules(keystore, driven)
+    text = (keystore / ROUTER).read_text()
+    (keystore / "enclaves/web/router.json5").write_text(text.replace("/web", "/router"))
+
+
 def a_weaker_governance_of_one_enclave(keystore: Path) -> None:
     weak = "enclaves/mux/governance.p7s"
     signed(keystore, weak, lambda old: old.replace(b">true<", b">false<"))
@@ -214,6 +227,7 @@ def another_router(keystore: Path) -> None:
         (without_keys, "/web: may publish /cmd_vel, but"),
         (a_hidden_enclave, "/.h: may publish /cmd_vel with the permissions of /mux, but"),
         (a_name_without_an_enclave, "/ghost: may publish /cmd_vel, but"),
+        (a_router_that_the_settings_do_not_name, "/web: may publish /cmd_vel, but"),
         (a_weaker_governance_of_one_enclave, "/router: may publish /cmd_vel, and so may /web"),
         (at_many_times, "become valid at more than 10 different times"),
         (a_link_without_tls, "is not known"),
