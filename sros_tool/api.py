@@ -831,6 +831,7 @@ def check_requirements(
     domain: int | None = None,
     now: datetime | None = None,
     zone: tzinfo = UTC,
+    namespaces: Sequence[str] = ("/",),
 ) -> tuple[Finding, ...]:
     """Return a finding for each requirement that a policy or a keystore breaks, for all names.
 
@@ -851,6 +852,9 @@ def check_requirements(
             the keystore's documents treat alike.
         now: The time at which permissions have to be valid; the current time by default.
         zone: The time zone of the robot, in which some vendors read dates.
+        namespaces: Namespaces such as "/left", in each of which the requirements have to hold: the
+            enclaves of the requirements, and their names without a "/" or "*" at the beginning, are
+            below it.
 
     Returns:
         Findings with ``subject``, ``text``, ``file`` and ``line``, and in ``related`` the other
@@ -859,6 +863,7 @@ def check_requirements(
     Raises:
         DocumentError: A file cannot be read, or there are too many wildcards to decide a
             requirement.
+        InvalidNameError: A namespace is not valid, or has a wildcard.
         UsageError: There is no such vendor or distribution, or ``domain`` is not a domain id.
 
     Example:
@@ -869,6 +874,7 @@ def check_requirements(
     from sros_tool.checks.kind import NOTE
     from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.keystore.template import load_template
+    from sros_tool.names import check_plain_namespace
     from sros_tool.proof.findings import requirement_findings
     from sros_tool.proof.requirements import read_all_requirements
     from sros_tool.proof.system import WORLDS, load_system
@@ -888,7 +894,9 @@ def check_requirements(
         at,
         load_template(fspath(template)) if template else None,
     )
-    findings = requirement_findings(read_all_requirements(map(Path, files), system.fleet), system)
+    places = [check_plain_namespace(namespace) for namespace in namespaces] or ["/"]
+    wanted = read_all_requirements(map(Path, files), system.fleet, places)
+    findings = requirement_findings(wanted, system)
     return tuple(
         finding for finding in findings if finding.severity > NOTE or finding.kind.prominent
     )

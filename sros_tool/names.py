@@ -227,6 +227,13 @@ def check_namespace(ns: str) -> str:
     return text
 
 
+def check_plain_namespace(ns: str) -> str:
+    """Return a normalized namespace as `check_namespace`; refuse one with a wildcard, too."""
+    if is_expression(ns):
+        raise InvalidNameError(f"the namespace {ns!r} has a wildcard", "", "Write it as /left.")
+    return check_namespace(ns)
+
+
 def node_name_problem(name: str) -> str:
     """Return why ROS would refuse the name of a node, as a sentence; "" if it is valid.
 

@@ -447,6 +447,13 @@ def test_requirements_are_decided(tmp_path: Path) -> None:
     assert known.subject == "/r1/a"
     with pytest.raises(UsageError, match="unknown vendor"):
         sros_tool.check_requirements(policy, required, vendor="none")
+    policy.write_text(policy_text({"/left/a": publish("/left/x"), "/b": publish("/right/x")}))
+    required.write_text('[[only]]\nname = "x"\nwhy = "x"\npublish = ["x"]\nenclaves = ["/a"]\n')
+    assert not sros_tool.check_requirements(policy, required, namespaces=["/left"])
+    found = sros_tool.check_requirements(policy, required, namespaces=["/left", "/right"])
+    assert "/b" in [each.subject for each in found]
+    with pytest.raises(sros_tool.SrosError, match="has a wildcard"):
+        sros_tool.check_requirements(policy, required, namespaces=["/r*"])
 
 
 def test_new_access_is_what_a_change_adds(tmp_path: Path) -> None:

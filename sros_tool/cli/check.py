@@ -43,7 +43,6 @@ from sros_tool.cli.common import (
     keystore_from_environment,
     local_zone,
     moment_of,
-    namespace_of_option,
     now,
     output_option,
     policy_for,
@@ -385,11 +384,12 @@ def _requirements(
     """
     if not files:
         return None
+    from sros_tool.names import check_plain_namespace
     from sros_tool.proof.findings import requirement_findings
     from sros_tool.proof.requirements import dropped_findings, read_all_requirements
 
     one_robot = _paths_of_one_system(family, paths, "--requirements")
-    places = [namespace_of_option(namespace) for namespace in namespaces] or ["/"]
+    places = [check_plain_namespace(namespace) for namespace in namespaces] or ["/"]
 
     def decide(load: Callable[[Sequence[Path]], System]) -> list[Finding]:
         system = load(one_robot)

@@ -597,20 +597,6 @@ def _clock() -> datetime:
 _YEARS = 1970, 2999
 
 
-def namespace_of_option(text: str) -> str:
-    """Return the namespace that ``--namespace`` names.
-
-    Raises:
-        UsageError: it has a wildcard.
-        InvalidNameError: it is not a namespace.
-    """
-    from sros_tool.names import check_namespace, is_expression
-
-    if is_expression(text):
-        raise UsageError(f"--namespace {text!r} has a wildcard", "", "Write it as /left.")
-    return check_namespace(text)
-
-
 def moment_of(text: str | None) -> datetime:
     """Return the moment that ``--at`` names: a date, or a duration from now; now by default.
 

@@ -23,7 +23,6 @@ from sros_tool.cli.common import (
     fleets_option,
     force_option,
     json_option,
-    namespace_of_option,
     output_option,
     print_json,
     print_notes,
@@ -119,7 +118,7 @@ def merge_policy(
       $ sros merge_policy robot.xml camera.xml --enclave /pipeline \\
             --node driver --node rectify --in-place
     """
-    from sros_tool.names import check_enclave_name
+    from sros_tool.names import check_enclave_name, check_plain_namespace
     from sros_tool.policy.document import read_policy
     from sros_tool.policy.merge import EditedText, MergedPolicy, merge_all
     from sros_tool.policy.model import policy_in_enclave, policy_in_namespace, policy_of_nodes
@@ -142,7 +141,7 @@ def merge_policy(
                 "Write the name as node= has it.",
             )
     if namespace is not None:
-        namespace = namespace_of_option(namespace)
+        namespace = check_plain_namespace(namespace)
         additions = [policy_in_namespace(addition, namespace) for addition in additions]
     notes: list[Note] = []
     if remaps:
