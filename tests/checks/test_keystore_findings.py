@@ -77,15 +77,18 @@ def test_exported_enclaves_of_two_keystores(bench: Bench) -> None:
 
 def test_a_remedy_that_needs_ca_keys_is_for_the_original_keystore(bench: Bench) -> None:
     CASES["enclave.stale-permissions"](bench)
+    CASES["enclave.xml-differs"](bench)
 
-    def remedy() -> str:
+    def remedy(kind: str = "enclave.stale-permissions") -> str:
         options = {"now": bench.now, **bench.options}
         found = keystore_findings(OpenedKeystore(bench.checked), Circumstances(**options))
-        return next(each.remedy for each in found if each.id == "enclave.stale-permissions")
+        return next(each.remedy for each in found if each.id == kind)
 
     assert f"`sros generate_artifacts -k {bench.root} -p POLICY_FILE`" in remedy()
     bench.path("fleet.toml").write_text("[robots.r1]\n")
     assert "-p POLICY_FILE --fleet FLEET_FILE`" in remedy()
+    sign = f"create_permission {bench.root} /base POLICY_FILE --fleet FLEET_FILE`."
+    assert remedy("enclave.xml-differs").endswith(sign)
     bench.path("fleet.toml").unlink()
     bench.export()
     told = remedy()
@@ -93,6 +96,8 @@ def test_a_remedy_that_needs_ca_keys_is_for_the_original_keystore(bench: Bench) 
         "In the keystore that has the CA keys: Run `sros generate_artifacts -k K"
     )
     assert told.endswith("Then export the enclave again.")
+    (bench.checked / "enclaves/base/permissions.xml").write_text("<dds/>")
+    assert remedy("enclave.xml-differs") == "Delete permissions.xml: no export has this file."
 
 
 @pytest.mark.parametrize("expected", some([*CASES], 60))

@@ -211,6 +211,7 @@ XML_DIFFERS = FindingKind(
     "DDS-Security 1.1, 9.4.1.3; rcl 9 (security.c).",
     "Sign the intended permissions with `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`.",
 )
+_NOT_IN_EXPORTS = "Delete permissions.xml: no export has this file."
 CRL_MISSING = FindingKind(
     "enclave.crl-missing",
     ERROR,
@@ -413,7 +414,8 @@ def _copy_findings(enclave: CheckedEnclave) -> Iterator[Finding]:
     xml, signed = enclave.folder / "permissions.xml", enclave.state.permissions_document
     if signed and xml.is_file() and _plain_file(enclave, xml) != plain(signed):
         text = "permissions.xml differs from the content of permissions.p7s"
-        yield XML_DIFFERS.found(enclave.name, text, enclave.file("permissions.xml"))
+        remedy = "" if enclave.keystore.looks_like_original else _NOT_IN_EXPORTS
+        yield XML_DIFFERS.found(enclave.name, text, enclave.file("permissions.xml"), remedy=remedy)
     if enclave.keystore.crl and not (enclave.folder / "crl.pem").exists():
         text = "crl.pem is missing"
         yield CRL_MISSING.found(enclave.name, text, str(enclave.folder))

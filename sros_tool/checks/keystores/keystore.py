@@ -280,6 +280,10 @@ _OF_SEVERAL = re.compile(
     r"(\bsros (?:renew|revoke|create_permission|create_enclave|distribute_key) \S+ )([^\s`]+)"
 )
 """The beginning of a command that takes several enclaves, and its first enclave."""
+_SIGNS_POLICY = re.compile(
+    r"\bsros (?:create_permission|generate_artifacts -k) [^`]*?\bPOLICY(?:_FILE)?\b"
+)
+"""The beginning of a command that signs a policy, which can be that of a fleet."""
 
 
 def _with_enclave_names(finding: Finding, keystore: CheckedKeystore) -> Finding:
@@ -292,8 +296,8 @@ def _with_enclave_names(finding: Finding, keystore: CheckedKeystore) -> Finding:
         remedy = remedy if ORIGINAL_KEYSTORE in remedy else remedy_in_original_keystore(remedy)
     if ORIGINAL_KEYSTORE not in remedy:
         remedy = re.sub(r"\bKEYSTORE\b", lambda _: quote(str(keystore.root)), remedy)
-    if keystore.fleet and "generate_artifacts -k" in remedy and "--fleet" not in remedy:
-        remedy = remedy.replace("-p POLICY_FILE", "-p POLICY_FILE --fleet FLEET_FILE")
+    if keystore.fleet and "--fleet" not in remedy:
+        remedy = _SIGNS_POLICY.sub(r"\g<0> --fleet FLEET_FILE", remedy)
     if finding.subject.startswith("/") and "," not in finding.subject:
         remedy = re.sub(r"\bENCLAVE\b", lambda _: quote(finding.subject), remedy)
     return finding if remedy == finding.remedy else finding._replace(own_remedy=remedy)
