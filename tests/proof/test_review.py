@@ -895,6 +895,17 @@ def test_a_keystore_fails_for_a_finding_an_expiry_and_a_link_out_of_it(
     assert (linked.status, "cert.pem' is a link out of 'ks'" in linked.out) == (2, True), linked
 
 
+def test_no_setting_accepts_a_weakness_that_comes_with_it(change: Change) -> None:
+    """The template for ros2/sros2 has one CA for both jobs, which its settings accept."""
+    sros("generate_artifacts", "-k", "ks", "-e", "/a", cwd=change.folder).ok()
+    for key in (change.folder / "ks").rglob("*key.pem"):
+        key.unlink()
+    settings = (change.folder / "ks/sros.toml").read_text()
+    change.base = change.commit({})
+    change.commit({"ks/sros.toml": f"# changed\n{settings}"})
+    assert "keystore ks: 2 warnings" in change.review("--keystore", "ks").out, "not 1"
+
+
 def test_a_change_renames_nothing_out_of_a_requirement(change: Change) -> None:
     """A wildcard matches the old name still, so that the requirement is about something."""
     enclaves = {"/a": publish("/x"), "/b": publish("/*")}
