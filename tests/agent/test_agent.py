@@ -211,6 +211,8 @@ def test_rounds_follow_what_home_publishes(home: Home, r1: Robot) -> None:
     assert r1.asked == [0, 1, 3]
     sros("agent", "status", r1.folder).ok()
     end = validity_of(read_certificate(r1.folder / "enclaves/r1/a/cert.pem")).not_after
+    early = agent_status(r1.folder, now=moment() - timedelta(days=2), oldest=timedelta(days=1))
+    assert not early.well, "when the source was reached is not known by such a clock"
     late = agent_status(r1.folder, now=end + timedelta(minutes=1), oldest=timedelta(days=9999))
     assert not late.well
     assert sum("has expired, at" in problem for problem in late.problems) == len(NAMES)

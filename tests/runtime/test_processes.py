@@ -187,6 +187,16 @@ def test_what_proc_hides_is_said(proc: Proc) -> None:
     assert proc.look().hidden
 
 
+@pytest.mark.parametrize(("number", "alone"), [(4026531836, False), (4026532311, True)])
+def test_a_namespace_of_processes_does_not_show_those_of_others(
+    proc: Proc, number: int, alone: bool
+) -> None:
+    assert not proc.look().container
+    (proc.path / "self/ns").mkdir(parents=True)
+    (proc.path / "self/ns/pid").symlink_to(f"pid:[{number}]")
+    assert proc.look().container is alone
+
+
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
 def test_processes_of_other_users_are_named_and_not_passed_over() -> None:
     reading, writing = os.pipe()
