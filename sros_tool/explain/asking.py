@@ -275,17 +275,16 @@ def planned_enclave(
     policy demands.
     """
     from sros_tool.keystore.participant import plan_enclave
-    from sros_tool.keystore.protection import with_stated
+    from sros_tool.keystore.protection import governance_with_stated
     from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
     from sros_tool.policy.model import stated_protections
-    from sros_tool.translate import governance_for
 
     if keystore:
         return plan_enclave(policy, keystore.governance, moment=asking.at)
     domain = asking.context(None).domain
     stated = stated_protections([policy])
-    protection = with_stated(load_template(DEFAULT_TEMPLATE).protection, stated)
-    governance = governance_for(protection, DomainSet.of((domain, domain)))
+    protection = load_template(DEFAULT_TEMPLATE).protection
+    governance = governance_with_stated(protection, stated, domain)
     return plan_enclave(policy, governance, moment=asking.at)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
+from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule
 from sros_tool.errors import PolicyError
 from sros_tool.names import ACTION_PARTS
@@ -82,10 +83,21 @@ def with_stated(
     return result
 
 
+def governance_with_stated(
+    protection: DomainProtection, stated_protections: Sequence[StatedProtection], domain: int = 0
+) -> Governance:
+    """Return the governance of a protection in a domain, raised as by `with_stated`.
+
+    Raises:
+        PolicyError: as `with_stated`.
+    """
+    return governance_for(
+        with_stated(protection, stated_protections), DomainSet.of((domain, domain))
+    )
+
+
 def governance_for_all(protection: DomainProtection) -> Governance:
     """Return the governance of a protection for any domain."""
-    from sros_tool.dds.domains import DomainSet
-
     return governance_for(protection, DomainSet.of((0, 0)))
 
 

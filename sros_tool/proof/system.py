@@ -38,7 +38,7 @@ from sros_tool.keystore.layout import (
     is_original_keystore,
 )
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, deciding_enclave
-from sros_tool.keystore.protection import with_stated
+from sros_tool.keystore.protection import governance_with_stated
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, Template, load_template
@@ -71,7 +71,7 @@ from sros_tool.proof.worlds import (
     topics_of,
     zenoh_message,
 )
-from sros_tool.translate import governance_for, permissions_for, protected_topics
+from sros_tool.translate import permissions_for, protected_topics
 from sros_tool.translate_zenoh.rights import remote_rights, stated_rights
 from sros_tool.validity import window
 from sros_tool.zenoh.access import AccessControl, Enforcement
@@ -162,7 +162,7 @@ def policy_system(policy: Policy, at: Circumstances, template: Template | None =
     stated = _stated_topics([enclave.path for enclave in policy.enclaves], rights)
     protections = stated_protections(policy.enclaves)
     protection = (template or load_template(DEFAULT_TEMPLATE)).protection
-    governance = governance_for(with_stated(protection, protections), domains)
+    governance = governance_with_stated(protection, protections, domain)
     demanded = None if template else _demanded_topics(protections)
     subjects = {enclave.path: f"CN={enclave.path}" for enclave in policy.enclaves}
     unique = template is not None and template.unique_subject

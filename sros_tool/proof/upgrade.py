@@ -41,7 +41,6 @@ from sros_tool.dds.advisories import Advisory, known_vulnerabilities
 from sros_tool.dds.decision.access import Access, Outcome
 from sros_tool.dds.decision.grants import other_fitting_enclaves
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.dds.domains import DomainSet
 from sros_tool.distributions import (
     Distribution,
     Shipped,
@@ -65,7 +64,7 @@ from sros_tool.keystore.participant import (
     deciding_enclave,
     plan_enclave,
 )
-from sros_tool.keystore.protection import with_stated
+from sros_tool.keystore.protection import governance_with_stated
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
@@ -75,7 +74,6 @@ from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.proof.growth import AccessByVendors, Gain
 from sros_tool.proof.sources import AccessSource
 from sros_tool.proof.worlds import domains_of, zenoh_message
-from sros_tool.translate import governance_for
 from sros_tool.wording import first_few
 from sros_tool.zenoh.access import Enforcement, Remote
 from sros_tool.zenoh.releases import version_text
@@ -155,10 +153,9 @@ def signed_files(keystore: OpenedKeystore, at: Circumstances) -> DecidedFiles:
 
 def _planned_files(policy: Policy, at: Circumstances) -> DecidedFiles:
     """Return the enclaves of a policy as they would be signed, with the default template."""
-    template, domain = load_template(DEFAULT_TEMPLATE), at.domain or 0
-    domains = DomainSet.of((domain, domain))
-    protection = with_stated(template.protection, stated_protections(policy.enclaves))
-    governance = governance_for(protection, domains)
+    template = load_template(DEFAULT_TEMPLATE)
+    stated = stated_protections(policy.enclaves)
+    governance = governance_with_stated(template.protection, stated, at.domain or 0)
     enclaves = {
         enclave.path: plan_enclave(enclave, governance, moment=at.now)
         for enclave in policy.enclaves

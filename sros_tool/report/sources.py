@@ -27,7 +27,7 @@ from sros_tool.graph.observation import observation_from_json
 from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.layout import PUBLIC, ROUTER_FILE, is_keystore
 from sros_tool.keystore.participant import evaluated
-from sros_tool.keystore.protection import with_stated
+from sros_tool.keystore.protection import governance_with_stated
 from sros_tool.keystore.reader import (
     OpenedEnclave,
     OpenedKeystore,
@@ -44,7 +44,6 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.keys import algorithm
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.minimize import enclaves_of_nodes
-from sros_tool.policy.model import StatedProtection
 from sros_tool.policy.patterns import Names
 from sros_tool.policy.rights import RightsDifference, policy_rights
 from sros_tool.report.compose import (
@@ -69,7 +68,6 @@ from sros_tool.report.picture import (
     Validity,
 )
 from sros_tool.report.sampling import SampledKeystore, sample_of
-from sros_tool.translate import governance_for
 from sros_tool.validity import iso
 from sros_tool.values import parse_json
 from sros_tool.wording import enumerated, first_few
@@ -134,11 +132,11 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
     observed = [read_source(path, now=drawing.now) for path in drawing.observed]
     if drawing.template:
         _check_no_governance(sources, read)
-        template = drawing.template
+        protection = load_template(drawing.template).protection
         read = [
             source
             if source.governance
-            else replace(source, governance=_template_governance(template, source.protections))
+            else replace(source, governance=governance_with_stated(protection, source.protections))
             for source in read
         ]
     robots: dict[str, Robot] = {}
@@ -542,22 +540,6 @@ def _printable(name: str) -> str:
     return "".join(
         letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in name
     )
-
-
-def _template_governance(
-    choice: str, stated_protections: Sequence[StatedProtection] = ()
-) -> Governance:
-    """Return the governance that a keystore with this template would have.
-
-    Args:
-        choice: the name or path of the template.
-        stated_protections: the protection of names that a policy states; it is added to the
-            template's.
-    """
-    from sros_tool.dds.domains import DomainSet
-
-    protection = with_stated(load_template(choice).protection, stated_protections)
-    return governance_for(protection, DomainSet.of((0, 0)))
 
 
 def _observation(path: Path) -> PictureSource:
