@@ -121,7 +121,18 @@ def _tell(lines: Iterable[str]) -> None:
 
 
 def print_plan(root: Path, changes: Sequence[Change]) -> None:
-    """Print the files that a dry run would change.
+    """Print the files that a dry run would change, as `print_files` does."""
+    plan: dict[str, list[str]] = {}
+    for change in changes:
+        plan.setdefault(change.action, []).append(change.path)
+    for action, paths in plan.items():
+        print_files(root, f"would {action}", paths)
+    if not changes:
+        echo("nothing would change")
+
+
+def print_files(root: Path, words: str, paths: Sequence[str]) -> None:
+    """Print ``words`` with the path of each file in the keystore ``root``.
 
     Files that differ only in the robot of a fleet share a line, and of many files only the first
     ones are named.  If steps are logged, all files are printed.
@@ -129,20 +140,14 @@ def print_plan(root: Path, changes: Sequence[Change]) -> None:
     import logging
 
     is_verbose = logging.getLogger("sros_tool").isEnabledFor(logging.INFO)
-    plan: dict[str, list[str]] = {}
-    for change in changes:
-        plan.setdefault(change.action, []).append(change.path)
-    for action, paths in plan.items():
-        shown = paths if is_verbose else list(_change_lines(root, paths))
-        if len(shown) > MAX_NAMES and not is_verbose:
-            places = [str(root / path) for path in paths]
-            shown_files = first_few(places, _NAMES_SHOWN)
-            echo(f"would {action} {counted(len(paths), 'file')}: {shown_files} (-v lists all)")
-            continue
-        for path in shown:
-            echo(f"would {action} {root / path}")
-    if not changes:
-        echo("nothing would change")
+    shown = paths if is_verbose else list(_change_lines(root, paths))
+    if len(shown) > MAX_NAMES and not is_verbose:
+        places = [str(root / path) for path in paths]
+        shown_files = first_few(places, _NAMES_SHOWN)
+        echo(f"{words} {counted(len(paths), 'file')}: {shown_files} (-v lists all)")
+        return
+    for path in shown:
+        echo(f"{words} {root / path}")
 
 
 def _change_lines(root: Path, paths: Sequence[str]) -> Iterator[str]:

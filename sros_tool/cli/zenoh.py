@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sros_tool.cli.changed import print_follow_up, print_plan
+from sros_tool.cli.changed import enclave_lines, print_files, print_follow_up, print_plan
 from sros_tool.cli.common import (
     PATH,
     change_options,
@@ -195,12 +195,14 @@ def zenoh(
     elif dry_run and not only_check:
         print_plan(root, result.changes)
     else:
-        for name in result.created:
-            echo(f"{'missing:' if only_check else 'created'} enclave {name}")
-        for path in changed:
-            action = actions.get(path, "replace")
-            word = f"{_FOUND[action]}:" if only_check else _DONE[action]
-            echo(f"{word} {root / path}")
+        for line in enclave_lines(
+            result.created, f"{'missing:' if only_check else 'created'} enclave {{}}"
+        ):
+            echo(line)
+        for action, done in _DONE.items():
+            words = f"{_FOUND[action]}:" if only_check else done
+            of_action = [path for path in changed if actions.get(path, "replace") == action]
+            print_files(root, words, of_action)
     left_out = result.zenoh.left_out
     if only_check and not as_json:
         for name, why in left_out.items():

@@ -73,6 +73,14 @@ def test_files_are_signed_whole_and_the_same_again(folder: Path) -> None:
     assert snapshot(folder) == before
 
 
+def test_many_files_are_counted(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sros_tool.cli.changed.MAX_NAMES", 2)
+    names = ("router/router.json5", "a/session.json5", "b/session.json5")
+    files = ", ".join(f"ks/enclaves/{each}" for each in names) + " (-v lists all)\n"
+    checked, written = (sros("zenoh", "ks", *more, cwd=folder) for more in (("--check",), ()))
+    assert (checked.out, written.out) == (f"missing: 3 files: {files}", f"wrote 3 files: {files}")
+
+
 def test_every_file_has_the_rights_of_all_by_name_and_denies_the_rest(folder: Path) -> None:
     sros("zenoh", "ks", "--mode", "peer", cwd=folder).ok()
     names = {
