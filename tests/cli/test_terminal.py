@@ -17,7 +17,7 @@ from sros_tool.cli import common as showing
 from sros_tool.cli import main
 from sros_tool.files import policies_dir
 from sros_tool.parallel import map_slices, tick
-from sros_tool.terminal import Colored, echo, echo_document
+from sros_tool.terminal import Colored, echo, echo_document, visible_line
 from tests.support.harness import sros
 
 ERASE = "\r\x1b[K"
@@ -153,6 +153,14 @@ def test_a_document_is_exact_but_on_a_terminal(capsysbinary: pytest.CaptureFixtu
     echo_document(os.fsdecode(document[:12]))
     assert capsysbinary.readouterr().out == document + document[:12]
     assert on_terminal(lambda: echo_document(document)) == "export A='\\x1b]0;x\\x07\\xff'\r\n"
+
+
+def test_no_character_controls_a_terminal_or_reverses_a_name() -> None:
+    controls = "\x00\x07\x08\r\n\x1b\x7f\x85\x9b"
+    directions = "\u061c\u200e\u200f\u202a\u202e\u2066\u2069"
+    for character in (*controls, *directions, "\u2028", "\u2029", "\udc9b", "\ud800", "\ufffe"):
+        assert re.fullmatch(r"a\\(x|u..)[0-9a-f]{2}b", visible_line(f"a{character}b")), character
+    assert visible_line("\tä中") == "\tä中"
 
 
 def test_a_name_cannot_color_itself() -> None:
