@@ -112,6 +112,8 @@ _MOST_OUTSIDE = 32 * 1024 * 1024
 
 No policy is larger.
 """
+_PACKED = (b"\x1f\x8b", b"PK\x03\x04", b"\xfd7zXZ", b"BZh", b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf")
+"""How files of gzip, ZIP, xz, bzip2, Zstandard and 7z begin."""
 _LONGEST = 200  # characters of the target of a link that are shown
 _NOT_USED = (
     "changes and is not reviewed: no reviewed policy uses it. Name it with --policy, leave it out "
@@ -680,6 +682,8 @@ class _Review:
                 named.append(("changes and is too large to be reviewed", path))
             if clause := self._hidden_entry_clause(path, entry):
                 lines.append((f"changes and is not reviewed: it is {clause}", path))
+        for path in self._paths_of(changed, _is_packed):
+            named.append(("changes and is an archive, or compressed: nothing looks into it", path))
         gone = [(path, entry) for path, entry in earlier if not self._has(self.head, path)]
         for path in self._policies_among(gone, self.base, known=False):
             new = names.get(dict(gone)[path].id)
@@ -798,19 +802,24 @@ class _Review:
         self, entries: Iterable[tuple[str, TreeEntry]], side: CommitFiles, *, known: bool = True
     ) -> list[str]:
         """Return the paths of entries that may be policies, or parts of policies."""
+        unknown = ((path, entry) for path, entry in entries if not (known and path in side.files))
+        return self._paths_of(unknown, may_be_policy)
+
+    def _paths_of(
+        self, entries: Iterable[tuple[str, TreeEntry]], fits: Callable[[bytes], bool]
+    ) -> list[str]:
+        """Return the sorted paths of the files that are not left out, and whose content fits."""
         wanted = {
             path: entry
             for path, entry in entries
-            if entry.mode in FILES
-            and not (known and path in side.files)
-            and not _is_below(path, self.request.left_out)
+            if entry.mode in FILES and not _is_below(path, self.request.left_out)
         }
-        of_policies = {
+        fitting = {
             digits
             for digits, content in self._contents(entry.id for entry in wanted.values())
-            if may_be_policy(content)
+            if fits(content)
         }
-        return sorted(path for path, entry in wanted.items() if entry.id in of_policies)
+        return sorted(path for path, entry in wanted.items() if entry.id in fitting)
 
     def left_out(self) -> Iterator[str]:
         """Yield clauses on the parts that were not reviewed."""
@@ -1131,6 +1140,11 @@ def _keystore_with(path: str) -> str | None:
         return keystore[1:]
     trusted = next((name for name in _TRUSTED if f"/{path}".endswith(f"/{name}")), "")
     return f"/{path}".removesuffix(f"/{trusted}")[1:] if trusted else None
+
+
+def _is_packed(content: bytes) -> bool:
+    """Return whether a file is an archive, or compressed."""
+    return content.startswith(_PACKED) or content[257:262] == b"ustar"
 
 
 def _is_below(path: str, folders: Iterable[str]) -> bool:

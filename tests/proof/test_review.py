@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import os
 import shutil
@@ -474,6 +475,9 @@ def test_what_is_no_part_of_a_policy_and_what_is_too_large(change: Change) -> No
     )
     said = change.review("--policy", "robot.xml").ok().out
     assert "files: 'large.xml' changes and is too large to be reviewed\n" in said
+    change.commit({"large.xml": None, "hidden.xml.gz": gzip.compress(policy_text(WIDER).encode())})
+    said = change.review("--policy", "robot.xml").ok().out
+    assert "'hidden.xml.gz' changes and is an archive, or compressed: nothing looks into" in said
 
 
 def test_a_keystore_fits_on_a_disk(change: Change) -> None:
