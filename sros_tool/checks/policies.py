@@ -310,6 +310,7 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         if not _is_service_of_every_node(statement.name):
             offered[statement.name].append(statement)
     near = NearNames(offered)
+    spelled = cache(lambda side: NearNames(e for e in names[side] if not is_expression(e)))
     for statement in checked_policy.statements:
         other = OFFERING_SIDE.get(statement.right.right)
         if not other or not is_alone(statement, other):
@@ -350,6 +351,8 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             yield _misspelt_name_finding(statement, other, candidates)
         else:
             hint = f"; {_candidates_text(same_end)}" if same_end else ""
+            if similar := spelled(other).similar_names(statement.name):  # of which all are used
+                hint = f"; perhaps you mean {' or '.join(similar[:_NAMES_SHOWN])} ({other})"
             yield statement.found(NO_COUNTERPART, f"no enclave may {other} {statement.name}{hint}")
     for statement in checked_policy.statements:
         other, name = OFFERING_SIDE.get(statement.right.right), statement.name

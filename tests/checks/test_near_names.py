@@ -146,6 +146,10 @@ def test_a_name_with_a_counterpart_is_no_typing_error(tmp_path: Path) -> None:
         "policy.no-counterpart"
     }
     assert found(tmp_path / "p.xml", used + topics("publish", "scam")) == {}
+    heard = topics("subscribe", "front/image") + topics("subscribe", "frnt/image")
+    said = found(tmp_path / "p.xml", topics("publish", "front/image", "rear/image") + OTHER + heard)
+    near = "no enclave may publish /frnt/image; perhaps you mean /front/image (publish)"
+    assert said["policy.no-counterpart"] == near
 
 
 def test_the_shipped_policies_have_none() -> None:
