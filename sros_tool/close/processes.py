@@ -291,11 +291,16 @@ class ObservedProcesses(NamedTuple):
         )
 
     def enclaves_outside(self, policy: Policy) -> list[str]:
-        """Return the enclaves of processes with nodes that the policy does not have.
+        """Return the enclaves of observed processes with nodes that the policy does not have.
 
-        A Zenoh router has no node, so no policy has its enclave.
+        A Zenoh router has no node, so no policy has its enclave.  What first ran in its enclave was
+        added to the policy by hand, and not observed.
         """
-        nodes = {process.enclave for process in self.processes if not process.is_router}
+        nodes = {
+            process.enclave
+            for process in self.processes
+            if not process.is_router and process.known_by != "enclave"
+        }
         return sorted(nodes.difference(enclave.path for enclave in policy.enclaves))
 
     def command_of_new(self, export: Path, enclave: str) -> str:

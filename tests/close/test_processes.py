@@ -97,7 +97,8 @@ def test_commands_name_the_rmw_and_on_zenoh_the_enclave() -> None:
     other = replace(on_cyclone, environment={"RMW_IMPLEMENTATION": "rmw_other"})
     assert ClosedProcess.from_process(other, "/talker", origin, "program").rmw == ""
     empty = Policy(())
-    assert ObservedProcesses(0, [talker, router]).enclaves_outside(empty) == ["/talker"]
+    later = talker._replace(enclave="/later", known_by="enclave")
+    assert ObservedProcesses(0, [talker, router, later]).enclaves_outside(empty) == ["/talker"]
     assert ObservedProcesses(0, [router._replace(rmw="")]).enclaves_outside(empty) == ["/router"]
     in_domain = "cd /opt && env ROS_DOMAIN_ID=7 RMW_IMPLEMENTATION=rmw_zenoh_cpp python3 talk"
     assert talker.open_command(7) == in_domain
