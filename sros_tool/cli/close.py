@@ -368,7 +368,12 @@ def _until(closed: CloseState) -> str:
     """Return until when the files of closed processes are valid."""
     if not (closed.secured and closed.valid_until):
         return ""
-    return f"; the files are valid until {iso(closed.valid_until)}"
+    from sros_tool.keystore.expiry import renewal_command
+
+    soon = f", so renew them now: {renewal_command(closed.folder / 'keystore')}"
+    return (
+        f"; the files are valid until {iso(closed.valid_until)}{soon * bool(closed.expires_soon)}"
+    )
 
 
 def _started_together(processes: Sequence[ClosedProcess]) -> str:

@@ -17,12 +17,13 @@ from sros_tool.close.processes import (
     is_in_domain,
 )
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot, check_enclaves
+from sros_tool.keystore.expiry import Threshold, survey
 from sros_tool.keystore.layout import (
     KEY_FILE,
     enclave_path,
     list_enclaves,
 )
-from sros_tool.keystore.reader import FilesReadOnce, open_enclave
+from sros_tool.keystore.reader import FilesReadOnce, OpenedKeystore, open_enclave
 from sros_tool.policy.model import Policy
 from sros_tool.runtime.processes import (
     Process,
@@ -272,6 +273,8 @@ class CloseState(NamedTuple):
     machine that got earlier ones still trusts what was revoked since, and needs these."""
     valid_until: datetime | None
     """When the first enclave of the export expires, in UTC; null without an export."""
+    expires_soon: Sequence[str]
+    """The enclaves of the export that should be renewed now, because they expire soon."""
     denied: Sequence[str]
     """What the observed nodes do although the keystore denies it, as sentences."""
     newly_denied: Sequence[str]
@@ -354,7 +357,8 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
             for name in sorted(robot.not_here)
             if (times := _file_times(enclave_path(robot.keystore, name)))
         },
-        valid_until=_valid_until(robot),
+        valid_until=(until := _valid_until(robot)),
+        expires_soon=_expiring(robot) if until else (),
         denied=(),
         newly_denied=(),
         problems=(),
@@ -379,3 +383,10 @@ def _valid_until(robot: LocalRobot) -> datetime | None:
         for name in list_enclaves(robot.export)
     ]
     return min(filter(None, moments), default=None) if all(moments) else None
+
+
+def _expiring(robot: LocalRobot) -> Sequence[str]:
+    """Return the enclaves of the export that expire soon, as `sros renew` decides."""
+    lifetimes, _ = survey(OpenedKeystore(robot.export))
+    now = robot.shell.now()
+    return [lifetime.name for lifetime in lifetimes if lifetime.due(Threshold(), now)]

@@ -1341,6 +1341,20 @@ def test_what_is_exported_without_the_enclaves_of_other_machines(tmp_path: Path)
     assert "restarted: /b (2027-01-15T08:00:00Z): sros distr" in close._elsewhere(robot, state_now)
 
 
+def test_a_robot_whose_files_expire_soon(keystore: Path, tmp_path: Path) -> None:
+    sros("distribute_key", keystore, "/a", tmp_path / "export").ok()
+
+    def state_at(moment: datetime) -> state.CloseState:
+        shell = Shell(close._run, print, {}, lambda: moment, UTC)
+        found = state.current_state(LocalRobot(tmp_path, 0, shell), None)
+        return found._replace(folder=Path("robot"), secured={"/a": True})
+
+    now = state_at(datetime.now(UTC))
+    assert now.valid_until and close._until(now).endswith("Z")
+    soon = close._until(state_at(now.valid_until - timedelta(days=1)))
+    assert soon.endswith("Z, so renew them now: sros renew robot/keystore --all-expiring soon")
+
+
 @sometimes("an_enclave_that_belongs_to_another_machine")
 def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     """Seen while sros watched, it has to be seen again; another one may be away, as a laptop."""
