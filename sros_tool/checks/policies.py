@@ -257,6 +257,15 @@ SEVERAL_INSTANCES = FindingKind(
     "Give each instance an enclave of its own, with its namespace also in path=, unless one "
     "process runs all of them.",
 )
+NODE_MISSPELT = FindingKind(
+    "policy.node-misspelt",
+    NOTE,
+    "a node whose name differs from the path of its enclave by a letter",
+    "If one of them has a typing error, the node is refused when it starts: in the names of its "
+    "own services, or because it has no enclave.",
+    "sros: compares path= with ns= and node=.",
+    "Write the name that the node has when it runs.",
+)
 
 _LONGEST = 247
 _DIGIT_FIRST = re.compile(r"/(?:[0-9]|\[[0-9-]+\])")
@@ -444,6 +453,23 @@ def _check_instances(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         source = profiles[-1].source
         text = f"{enclave} has the node {node} in {first_few(names, _NAMES_SHOWN)}"
         yield SEVERAL_INSTANCES.found(enclave, text, source.file, source.line)
+
+
+def _check_node_names(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
+    """Yield findings about nodes that have nearly the name of their enclave, if none has it."""
+    for enclave in checked_policy.policy.enclaves:
+        own = enclave.path.rpartition("/")[2]
+        near = []
+        for profile in enclave.all_profiles():
+            full = expand("~", profile.ns, profile.node)
+            if enclave.path == full or (own == profile.node and not _is_typed(enclave.path, full)):
+                break
+            if _is_typed(own, profile.node) or _is_typed(enclave.path, full):
+                near.append((profile, full))
+        else:
+            for profile, full in near:
+                text, source = f"{enclave.path} has the node {full}", profile.source
+                yield NODE_MISSPELT.found(enclave.path, text, source.file, source.line)
 
 
 def _check_protection(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
@@ -1213,6 +1239,7 @@ _CHECKS = (
     _check_rules,
     _check_nodes,
     _check_names,
+    _check_node_names,
     _check_protection,
     _check_root_enclave,
     _check_portability,
@@ -1604,6 +1631,11 @@ def _is_near(first_name: str, second_name: str) -> bool:
     if len(b) < _SHORTEST or _DIGITS.sub("", a) == _DIGITS.sub("", b):
         return False
     return _one_edit(a, b)
+
+
+def _is_typed(a: str, b: str) -> bool:
+    """Return whether two names are near other than in capitals and separators."""
+    return _without_separators(a) != _without_separators(b) and _is_near(a, b)
 
 
 def _one_edit(a: str, b: str) -> bool:

@@ -15,6 +15,7 @@ from tests.checks.policy_cases import (
     CASES,
     EVENTS,
     LOG,
+    OTHER,
     PARAMETERS,
     TYPES,
     Case,
@@ -29,6 +30,7 @@ FOUND_OTHERWISE = {
     "policy.duplicate-enclave",
     "policy.enclave-in-two-files",
     "policy.node-in-two-enclaves",
+    "policy.node-misspelt",
     "policy.include-fallback",
     "policy.redundant-include",
     "portable.enclave-names",
@@ -240,6 +242,22 @@ def test_a_node_in_two_enclaves(tmp_path: Path) -> None:
     text = policy(*(enclave("", f"/{{robot:g{domain}}}/n") for domain in (1, 2)))
     (tmp_path / "policy.xml").write_text(text)
     assert not [*policy_file_findings(tmp_path / "policy.xml", fleet=Fleet.of(robots))]
+
+
+def test_a_node_with_nearly_the_name_of_its_enclave(tmp_path: Path) -> None:
+    for path, ns, node, is_near in (
+        ("/left/gripper", "/left", "griper", True),
+        ("/letf/gripper", "/left", "gripper", True),
+        ("/robot/griper", "/", "gripper", True),
+        ("/left/gripper", "/left", "gripper", False),
+        ("/left_gripper", "/left", "gripper", False),
+        ("/camera1", "/", "camera2", False),
+        ("/arm/gripper", "/left", "gripper", False),
+    ):
+        text = policy(enclave("", path, ns).replace('node="n"', f'node="{node}"'))
+        assert ("policy.node-misspelt" in ids(tmp_path, text)) == is_near, (path, ns, node)
+    both = enclave(OTHER, "/gripper").replace('"n"', '"griper"').replace('"m"', '"gripper"')
+    assert "policy.node-misspelt" not in ids(tmp_path, policy(both))
 
 
 def test_malformed(tmp_path: Path) -> None:
