@@ -90,6 +90,7 @@ def loadable_environment(
     """
     from sros_tool.distributions import unknown_distribution
     from sros_tool.keystore.issuing.tokens import pin_notes
+    from sros_tool.keystore.known_keys import other_enclave
     from sros_tool.keystore.layout import (
         KEY_FILE,
         enclave_path,
@@ -173,6 +174,12 @@ def loadable_environment(
     if rmw:
         variables[RMW] = rmw
     notes = () if target else tuple(unknown_distribution(environment))
+    if state.certificate and (other := other_enclave(keystore, name, state.certificate)):
+        text = (
+            f"a process in enclave {name} has the rights of {other}: the files of {name} are those "
+            f"of the other enclave. See `sros check {quote(str(keystore.root))}`."
+        )
+        notes += (Note("env.other-enclave", text),)
     if wanted is None and any(other_domain != domain for other_domain in domains or ()):
         text = (
             f"a process in enclave {name} may run in any of the domains {domains}, and runs in "

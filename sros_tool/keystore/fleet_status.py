@@ -89,7 +89,8 @@ class State(StrEnum):
     EARLIER = "earlier"
     """An earlier file that the keystore issued for the same enclave."""
     DIFFERENT = "different"
-    """A Zenoh file that is not the current one; the ledger does not record earlier Zenoh files."""
+    """A Zenoh file that is not the current one (the ledger does not record earlier Zenoh files), or
+    a file of another enclave of the robot."""
     MISSING = "missing"
     EXPIRED = "expired"
     """A file on the robot has expired, even if it is the current one."""
@@ -171,7 +172,8 @@ class ConfirmedFile:
     """Kind of the file."""
     state: State
     """The file that the robot has instead: an ``earlier`` file of the same enclave; a ``different``
-    Zenoh file (the ledger does not record earlier Zenoh files); no file (``missing``); a file that
+    Zenoh file (the ledger does not record earlier Zenoh files), or a file of another enclave of the
+    robot; no file (``missing``); a file that
     the keystore did not issue (``unknown``); a ``revoked`` file; a file of ``another`` robot, or of
     no robot. ``broken``: the file in the keystore is missing or cannot be read."""
     since: str = ""
@@ -1119,6 +1121,8 @@ class _KeystoreRecords:
             ):
                 state, owner = State.ANOTHER, name
         other_robot = robot_of(self._fleet, owner) if owner else None
+        if state is State.ANOTHER and other_robot == robot:
+            state = State.DIFFERENT
         return ConfirmedFile(
             difference.path,
             kind,

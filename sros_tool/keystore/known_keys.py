@@ -43,6 +43,18 @@ from sros_tool.pki.keys import PublicKey, load_key
 from sros_tool.validity import iso, parse_iso
 
 
+def other_enclave(keystore: OpenedKeystore, name: str, certificate: x509.Certificate) -> str:
+    """Return the enclave whose certificate the enclave ``name`` has; "" for one of its own.
+
+    Other PKIs have names of their own, which no vendor compares with the folder.
+    """
+    common_name = common_name_of(certificate.subject)
+    certified = f"/{common_name.removeprefix('/')}"
+    if certified == name or not (common_name.startswith("/") or certified in keystore.names):
+        return ""
+    return certified
+
+
 def revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
     """Return the serial numbers of all revoked certificates, also of those that were replaced."""
     entries = keystore.ledger_with("what", "revocation").entries

@@ -163,6 +163,8 @@ def open_zenoh(folder: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
     )
     configurations: dict[str, Configuration] = {}
     problems: list[ZenohProblem] = []
+    certified = common_name_of(state.certificate.subject) if state.certificate else name
+    identity = certified if certified.startswith("/") else name
     if not present:
         text = "the enclave has neither this file nor router.json5"
         problems.append(ZenohProblem(SESSION_FILE, text, ZenohFault.MISSING))
@@ -173,10 +175,9 @@ def open_zenoh(folder: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
             continue
         configurations[file] = read
         if (text := _before_revocation_clause(read, state)) or (
-            text := _out_of_date(read, file, name, state)
+            text := _out_of_date(read, file, identity, state)
         ):
             problems.append(ZenohProblem(file, text, ZenohFault.OUT_OF_DATE))
-    certified = common_name_of(state.certificate.subject) if state.certificate else name
     if configurations and certified != name:
         text = f"Zenoh identifies the process by its common name, which is {certified or '(none)'}"
         problems.append(ZenohProblem(CERTIFICATE_FILE, text, ZenohFault.OTHER_NAME))

@@ -101,6 +101,28 @@ def test_a_session_of_earlier_permissions_on_a_robot(folder: Path) -> None:
     ]
 
 
+def test_an_enclave_with_the_files_of_another(folder: Path) -> None:
+    """All of them fit together; the node would have the rights of the other enclave."""
+    sros("distribute_key", "ks", "/b", "robot", cwd=folder).ok()
+    enclaves = folder / "robot/enclaves"
+    shutil.copytree(enclaves / "a", enclaves / "b", dirs_exist_ok=True)
+    checked = json.loads(sros("check", "robot", "--json", cwd=folder).out)["findings"]
+    remedies = {each["id"]: each["remedy"] for each in checked if each["severity"] != "note"}
+    again = {
+        "keystore.key-twice": "Export these enclaves again.",
+        "enclave.name-mismatch": "Export the enclave again.",
+    }
+    assert remedies.items() & again.items() == again.items()
+    assert remedies.keys().isdisjoint({"keystore.serial-twice", "zenoh.out-of-date"})
+    other = "a process in enclave /b has the rights of /a: the files of /b are those of the other"
+    assert [other in sros("env", "robot", name, cwd=folder).ok().err for name in ("/a", "/b")] == [
+        False,
+        True,
+    ]
+    sros("distribute_key", "ks", "/b", "robot", "--force", cwd=folder).ok()
+    assert other not in sros("env", "robot", "/b", cwd=folder).err
+
+
 def test_a_configuration_of_another_keystore(folder: Path) -> None:
     sros("generate_artifacts", "-k", "foreign", "-p", "p.xml", cwd=folder).ok()
     sros("zenoh", "foreign", cwd=folder).ok()

@@ -222,6 +222,19 @@ def test_a_robot_that_got_the_files_of_another_one(field: Field) -> None:
     assert "2 files of r2" in field.run("fleet", "status", "ks", status=1).out
 
 
+def test_files_of_another_enclave_of_the_robot_are_none_of_another_robot(field: Field) -> None:
+    policy = policy_text({"/{robot}/base": publish("/x"), "/{robot}/arm": publish("/z")})
+    (field.folder / "policy.xml").write_text(policy)
+    field.run("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    field.deliver("r1")
+    place = field.folder / "r1" / ENCLAVES / "r1"
+    shutil.copytree(place / "base", place / "arm", dirs_exist_ok=True)
+    field.confirm("r1")
+    robot = field.status()["robots"]["r1"]
+    assert (robot["state"], robot["to_do"]) == ("different", "deliver")
+    assert {each["enclave"] for each in robot["pending"]} == {"/r1/base"}
+
+
 def test_a_robot_without_a_key_that_fits(field: Field) -> None:
     """Its confirmed files are current, and no process would start with them."""
     for robot in ("r1", "r2"):

@@ -25,6 +25,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.permissions import Grant, Rule
 from sros_tool.errors import SrosError
 from sros_tool.faults import VENDOR_FAULTS, Fault
+from sros_tool.keystore.known_keys import other_enclave
 from sros_tool.keystore.layout import (
     IDENTITY,
     IDENTITY_CA_FILE,
@@ -39,7 +40,7 @@ from sros_tool.keystore.layout import (
     waits_for_answer,
 )
 from sros_tool.keystore.reader import weaknesses
-from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
+from sros_tool.pki.certificates import subject_text, validity_of
 from sros_tool.pki.token import TokenUri, pin_file_problem, pin_line_break
 from sros_tool.translate import allows_everything
 from sros_tool.validity import BACKDATE, Span, iso, parse_iso
@@ -317,12 +318,10 @@ def _certificate_findings(
     enclave: CheckedEnclave, certificate: x509.Certificate
 ) -> Iterator[Finding]:
     name, file = enclave.name, enclave.file("cert.pem")
-    # Other PKIs have names of their own, which no vendor compares with the folder.
-    certified_name = common_name_of(certificate.subject)
-    of_another = certified_name.startswith("/") or f"/{certified_name}" in enclave.keystore.names
-    if of_another and certified_name.removeprefix("/") != name.removeprefix("/"):
+    if other_enclave(enclave.keystore.opened, name, certificate):
         text = f"its subject is {subject_text(certificate.subject)}"
-        yield NAME_MISMATCH.found(name, text, file)
+        remedy = "" if enclave.keystore.looks_like_original else "Export the enclave again."
+        yield NAME_MISMATCH.found(name, text, file, remedy=remedy)
     yield from key_findings(certificate, name, file)
     for extension in certificate.extensions:
         value = extension.value

@@ -62,6 +62,9 @@ KEY_TWICE = FindingKind(
     "RFC 5280, 4.1.2.6 (the subject is the holder of the key); DDS-Security 1.1, 9.3.",
     "Run `sros renew KEYSTORE ENCLAVE --new-key` for one of them.",
 )
+_RESTORE = (
+    "Restore the files of the others, or run `sros renew KEYSTORE ENCLAVE --new-key` for them."
+)
 UNEXPLAINED = FindingKind(
     "keystore.not-in-ledger",
     WARNING,
@@ -268,10 +271,17 @@ def check_issued(
     keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
 ) -> Iterator[Finding]:
     """Yield findings from comparing enclaves with each other, the ledger and the policies."""
-    for (_, serial), names in _shared_values(((t.issuer, t.serial), t.name) for t in summaries):
+    certificates = {summary.name: summary.certificate for summary in summaries}
+    different = {summary.certificate: summary for summary in summaries}.values()
+    for (_, serial), names in _shared_values(((t.issuer, t.serial), t.name) for t in different):
         yield SERIAL_TWICE.found(", ".join(names), f"the serial number is {serial:x}")
     for _, names in _shared_values((summary.key, summary.name) for summary in summaries):
-        yield KEY_TWICE.found(", ".join(names), "their certificates have the same public key")
+        if len({certificates[name] for name in names}) > 1:
+            text, remedy = "their certificates have the same public key", ""
+        else:
+            text = "they have the same certificate: the files of one were copied to the others"
+            remedy = _RESTORE if keystore.looks_like_original else "Export these enclaves again."
+        yield KEY_TWICE.found(", ".join(names), text, remedy=remedy)
     # A subject with a unique part matches no other one.
     plain = {summary.name for summary in summaries if not summary.unique}
     names = [summary.name for summary in summaries]
