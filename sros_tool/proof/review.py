@@ -307,7 +307,7 @@ class StepResult(NamedTuple):
     """Exit status of the step: 0, 1 or 2, as for the review."""
     allowed: bool
     """Whether the step found something that is allowed, by an option or always (``signed``,
-    ``rights``); its status is 0 then.
+    ``rights``, and private keys that were there before); its status is 0 then.
     """
     result: str
     """The result as a sentence, or why the step could not be decided."""
@@ -470,7 +470,9 @@ class _Review:
             decided = _UNDECIDED, DocumentError(f"'{error.filename}': {error.strerror}")
         if decided:
             status, content = decided
-            allowed = status == _FOUND and can_be_allowed and self._allows(kind)
+            only_named = isinstance(content, Facts) and not content.failing
+            is_allowed = can_be_allowed and (self._allows(kind) or only_named)
+            allowed = status == _FOUND and is_allowed
             yield ReviewStep(
                 kind,
                 subject,
@@ -643,7 +645,7 @@ class _Review:
         ]
         failing = tuple(line for line in lines if line[1] in entries)
         named = tuple(line for line in lines if line[1] not in entries)
-        return (_FOUND if failing else _OK, Facts(failing, named)) if lines else None
+        return (_FOUND, Facts(failing, named)) if lines else None
 
     def _unreviewed_step(
         self, reviewed: Sequence[Path], fleet: Fleet | None

@@ -1062,9 +1062,10 @@ def test_private_keys_in_a_commit_are_named(change: Change, made_keystores: Path
     assert "cannot start" not in ended.out, ended
     change.base = change.commit({})
     change.commit({"README": "x"})
-    for status, more in ((0, ()), (1, ("--keystore", "ks"))):
+    for status, word, more in ((0, "allowed", ()), (1, "FAILED", ("--keystore", "ks"))):
         ended = change.review("--policy", "robot.xml", *more)
-        assert ended.status == status and f"'{keys[1]}' has a private key, " in ended.out, ended
+        assert ended.status == status and f"\n[{word}] keystore" in ended.out, ended
+        assert f"  '{keys[1]}' has a private key, " in ended.out, ended
     left = change.review("--policy", "robot.xml", "--leave-out", "ks").ok().out
     assert "has a private key" not in left
 
