@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 from cryptography import x509
+from tuf.api.metadata import Metadata, Root
 
 from sros_tool.agent.fetch import FetchProblem
 from sros_tool.cli.fleet import _published_lines
@@ -37,7 +38,13 @@ from sros_tool.keystore.delivery.release import (
     seal_problem,
     seal_releases,
 )
-from sros_tool.keystore.delivery.repository import Composer, Roots, load_signer, read_present
+from sros_tool.keystore.delivery.repository import (
+    Composer,
+    Roots,
+    load_signer,
+    new_key,
+    read_present,
+)
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.layout import CRL, ca_key
@@ -674,7 +681,15 @@ def test_a_keystore_that_was_restored_from_before_its_keys_were_replaced(publish
     shutil.rmtree(publisher.root)
     backup.rename(publisher.root)
     foreign = publisher.pub / "metadata/3.root.json"
-    foreign.write_bytes((publisher.pub / "metadata/1.root.json").read_bytes())
+    forged = Metadata[Root].from_file(str(foreign.with_name("2.root.json")))
+    thief = load_signer(new_key(), "the key of a thief")
+    forged.signed.version = 3
+    forged.signed.add_key(thief.public_key, "root")
+    forged.sign(thief)
+    forged.to_file(str(foreign))
+    roots = Roots(json.loads((publisher.root / "fleet_root.json").read_text())["roots"])
+    roots.follow(publisher.pub)
+    assert roots.last.version == 2, "the key of 2 did not sign 3"
     with pytest.raises(KeystoreError, match="is not the timestamp key with which"):
         publisher.publish()
     foreign.unlink()
@@ -1035,6 +1050,16 @@ def test_releases_that_are_none(publisher: Home) -> None:
     for data in (b"", b"x", nested, pack_release(Release("r1", 1, good, b"x"))):
         with pytest.raises(SrosError):
             read_release(data)
+
+
+def test_a_snapshot_of_a_thief_is_not_what_the_timestamp_names(publisher: Home) -> None:
+    thief = Thief(publisher, publisher.pub, "snapshot")
+    version = thief.present("snapshot").signed.version
+    thief.sign(
+        "snapshot", lambda snapshot: setattr(snapshot, "unrecognized_fields", {"x": 1}), version
+    )
+    with pytest.raises(KeystoreError, match="metadata that this keystore did not write"):
+        publisher.publish()
 
 
 def test_bins_grow_with_the_fleet(publisher: Home) -> None:

@@ -838,9 +838,14 @@ def test_requests_that_are_refused(home: Home) -> None:
     assert refused(home, "r1", requests=(named_r2,)) == "/r2/base is an enclave of r2"
     stranger = make_request(new, "/dispatcher").decode()
     assert refused(home, "r1", requests=(stranger,)) == "/dispatcher is not an enclave of a robot"
+    twice = "the message has another request for this enclave"
+    assert refused(home, "r1", requests=(of_r2, named_r2)) == twice
+    kept = copy_of(home.root / "enclaves/r1/arm", home.folder / "kept")
     home.run("revoke", "ks", "/r1/arm")
     gone = home.request("r1", "/r1/arm")
     assert "or it was revoked" in refused(home, "r1", requests=(gone,))
+    copy_of(kept, home.root / "enclaves/r1/arm")
+    assert refused(home, "r1", requests=(gone,)) == "its current certificate was revoked"
     garbage = "-----BEGIN CERTIFICATE REQUEST-----\nAAAA\n-----END CERTIFICATE REQUEST-----\n"
     assert "cannot be read" in refused(home, "r1", requests=(garbage,))
 
