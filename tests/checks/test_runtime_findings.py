@@ -419,6 +419,20 @@ def test_a_node_that_asks_for_security_and_runs_without(
     assert ("runtime.process-runs-unsecured" in ids(state)) is unsecured
 
 
+@pytest.mark.parametrize(("hours", "unsecured"), [(1, True), (-1, False)])
+def test_a_node_whose_folder_was_another_one_at_its_start_may_run_secured(
+    hours: int, unsecured: bool, sound_one: RuntimeState
+) -> None:
+    folder = Path(sound_one.environment[KEYSTORE], "enclaves/base")
+    (folder / "permissions.p7s").unlink()
+    os.utime(folder, (0, 0))  # its last change is not that a file was removed
+    node = sound_one.running.processes[0]
+    environment = {**node.environment, STRATEGY: "Permissive"}
+    started = datetime.now(UTC) + timedelta(hours=hours)
+    state = with_processes(sound_one, replace(node, environment=environment, started=started))
+    assert ("runtime.process-runs-unsecured" in ids(state)) is unsecured
+
+
 def test_a_missing_enclave_says_what_the_strategy_makes_of_it(sound_one: RuntimeState) -> None:
     for strategy, unsecured in (("Enforce", False), ("Permissive", True)):
         environment = {**sound_one.environment, ENCLAVE: "/gone", "ROS_SECURITY_STRATEGY": strategy}
