@@ -113,6 +113,10 @@ def contradiction(side: AccessSource) -> str:
     return ""
 
 
+def _looser(key: str, before: str, after: str, meaning: str) -> SettingChange:
+    return SettingChange(Effect.LOOSER, key, before, after, meaning)
+
+
 def less_protection(
     old: AccessSource, new: AccessSource, limit: SearchLimit
 ) -> Iterator[SettingChange]:
@@ -126,8 +130,7 @@ def less_protection(
         yield from _looser_governance(least, _payload_governance(new.governance), limit)
     if old.authorities is not None and new.authorities is not None:
         for role, fingerprint in sorted(new.authorities - old.authorities):
-            yield SettingChange(
-                Effect.LOOSER,
+            yield _looser(
                 f"{role} CA {fingerprint[:16]}...",
                 "unknown",
                 "trusted",
@@ -139,11 +142,11 @@ def less_protection(
     yield from _certified_otherwise(old, new)
     if old.kind == new.kind == "keystore" and old.zenoh is not None and new.zenoh is None:
         text = "nothing enforces any more what its Zenoh files enforced"
-        yield SettingChange(Effect.LOOSER, "Zenoh files", "present", "missing", text)
+        yield _looser("Zenoh files", "present", "missing", text)
     if old.routers and not {*new.routers} <= {*old.routers}:
         text = "anyone who poses as the router reads and changes everything that passes"
         before, after = (", ".join(side.routers) for side in (old, new))
-        yield SettingChange(Effect.LOOSER, "Zenoh router", before, after, text)
+        yield _looser("Zenoh router", before, after, text)
     if new.zenoh_files:
         yield from looser_settings(old.zenoh_files, new.zenoh_files)
     if old.protections and new.protections is not None:
@@ -173,8 +176,7 @@ def _looser_later(
             known = old.fleet.robots.get(name)
             if known and known.domain is not None and known.domain != robot.domain:
                 domain = "all of the keystore" if robot.domain is None else str(robot.domain)
-                yield SettingChange(
-                    Effect.LOOSER,
+                yield _looser(
                     f"later enclaves: domain of robot {name}",
                     str(known.domain),
                     domain,
@@ -193,7 +195,7 @@ def _certified_otherwise(old: AccessSource, new: AccessSource) -> Iterator[Setti
                 f"certificate of {enclave}",
                 "anyone who has its key can act as that enclave",
             )
-            yield SettingChange(Effect.LOOSER, key, before, new_one.name, text)
+            yield _looser(key, before, new_one.name, text)
 
 
 def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
@@ -219,10 +221,10 @@ def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChan
             f"{names[0]} again trusts" if len(names) == 1 else f"{len(names)} enclaves again trust"
         )
         text = f"{who} anyone who has its key"
-        yield SettingChange(Effect.LOOSER, f"certificate {serial:x}", "revoked", "trusted", text)
+        yield _looser(f"certificate {serial:x}", "revoked", "trusted", text)
     if (more := len(trusted) - _MOST_SERIALS) > 0:
         text = "enclaves again trust anyone who has their keys"
-        yield SettingChange(Effect.LOOSER, f"{more} certificates more", "revoked", "trusted", text)
+        yield _looser(f"{more} certificates more", "revoked", "trusted", text)
 
 
 _MOST_SERIALS = 20
@@ -301,8 +303,7 @@ def _dropped_statements(
                 if name in _set_of_names(_names_of_kind(later, protection.kind))
                 else "nothing"
             )
-            yield SettingChange(
-                Effect.LOOSER,
+            yield _looser(
                 f"protect {protection}",
                 protection.word,
                 less,
@@ -349,9 +350,7 @@ def added_crossing(
     if after is None:
         if new.later is not None and new.zenoh_files:
             meaning = "what passes between routers is not known"
-            yield SettingChange(
-                Effect.LOOSER, "Zenoh settings", "limit crossing", "missing", meaning
-            )
+            yield _looser("Zenoh settings", "limit crossing", "missing", meaning)
         return
     kept = {*before.router_names()} & {*after.router_names()}
     for router in sorted(kept):
@@ -360,12 +359,8 @@ def added_crossing(
             name := _newly_passing_name(old_crossing, new_crossing, limit)
         ):
             meaning = f"{name} may pass between this router and others"
-            yield SettingChange(
-                Effect.LOOSER,
-                f"crossing of router {router}",
-                _text(old_crossing),
-                _text(new_crossing),
-                meaning,
+            yield _looser(
+                f"crossing of router {router}", _text(old_crossing), _text(new_crossing), meaning
             )
     yield from _moved_enclaves(before, after, {*new.permissions, *new.certified, *kept}, limit)
 
@@ -388,8 +383,7 @@ def _moved_enclaves(
                 _crossing_of_both(before, old_router, old_place), has, limit
             ):
                 crossing = _text(_crossing_of_both(before, old_router, old_place))
-                yield SettingChange(
-                    Effect.LOOSER,
+                yield _looser(
                     f"router of {enclave}",
                     f"{old_router}, which passes on {crossing}",
                     new_router,
@@ -409,9 +403,7 @@ def looser_router_rules(
     if new.routers and not (states_routers(old) and states_routers(new)):
         for router in sorted({*old.passing} - {*new.routers}):
             meaning = "its enclaves may now be at the same router as others"
-            yield SettingChange(
-                Effect.LOOSER, f"router {router} of Zenoh", "present", "missing", meaning
-            )
+            yield _looser(f"router {router} of Zenoh", "present", "missing", meaning)
     routers: dict[tuple[str, str], list[str]] = defaultdict(list)
     for router in sorted(old.passing.keys() & new.passing.keys()):
         had = old.passing[router]
@@ -422,8 +414,7 @@ def looser_router_rules(
             if name := _newly_passing_name(((right.name,), tuple(known)), ((right.name,),), limit):
                 routers[router, right.enclave].append(name)
     for (router, other), names in routers.items():
-        yield SettingChange(
-            Effect.LOOSER,
+        yield _looser(
             f"rules of router {router} for router {other}",
             "without",
             f"with {names[0]}",
