@@ -32,13 +32,13 @@ from sros_tool.errors import SrosError
 from sros_tool.files import policies_dir
 from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
 from sros_tool.keystore.template import load_template
+from sros_tool.parallel import end_with_starter
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, Enclave, Group, Policy, Profile, Profiles
 from sros_tool.runtime.environment import secured_environment
 from sros_tool.runtime.netns import (
     Progress,
     RowNetwork,
-    end_with_starter,
     run_isolated,
     try_isolation,
 )

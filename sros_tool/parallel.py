@@ -164,7 +164,7 @@ def _fork(
     """
     import pickle
 
-    parent = os.getpid()
+    follow_parent = end_with_starter()
     reader, writer = os.pipe()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOP_SIGNALS)
     worker = os.fork()
@@ -175,7 +175,9 @@ def _fork(
         return
     try:
         os.close(reader)
-        _die_with(parent)
+        follow_parent()  # so that it stops writing
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it, too, and kills workers
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         for tally in _tallies:
             tally.use_worker_slot(len(workers) + 1)
@@ -194,15 +196,28 @@ def _result_or_error(
         return error
 
 
-def _die_with(parent: int) -> None:
-    """Have the kernel kill this process when its parent dies, so that it stops writing."""
+def end_with_parent() -> None:
+    """Ask the kernel to kill this process when the thread that started it ends."""
     import ctypes
 
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(1)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets SIGINT, too, and kills workers
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
+
+
+def end_with_starter() -> Callable[[], None]:
+    """Return a function for a child process to call first.
+
+    It makes the kernel kill the child when this process ends.
+    """
+    import ctypes  # noqa: F401 - here, because a lock may be held when the child is forked
+
+    starter = os.getpid()
+
+    def follow() -> None:
+        end_with_parent()
+        if os.getppid() != starter:
+            os._exit(1)
+
+    return follow
 
 
 def _end_text(exit_code: int) -> str:

@@ -28,10 +28,10 @@ from sros_tool.demo.nodes import STRING
 from sros_tool.demo.scenarios.model import Condition, Role
 from sros_tool.errors import SrosError, UnavailableError, UsageError
 from sros_tool.keystore.template import EVERYTHING, Template
+from sros_tool.parallel import end_with_starter
 from sros_tool.policy.patterns import matches
 from sros_tool.runtime.cyclone import INSTALL_ADVICE, load_cyclone
 from sros_tool.runtime.events import Event, EventKind, ProcessStage, parse_event
-from sros_tool.runtime.netns import end_with_starter
 from sros_tool.runtime.rmw import (
     RMW,
     built_without_security,

@@ -84,13 +84,13 @@ from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.issuing.keyring import Secrets, no_secrets
 from sros_tool.keystore.template import Template, load_template
 from sros_tool.names import dds_names
+from sros_tool.parallel import end_with_starter
 from sros_tool.runtime.events import Event, EventKind, EventReader
 from sros_tool.runtime.netns import (
     ENDING_SIGNALS,
     Isolation,
     Progress,
     RowNetwork,
-    end_with_starter,
     run_isolated,
     try_isolation,
 )

@@ -27,10 +27,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from sros_tool.errors import SrosError
+from sros_tool.parallel import end_with_starter
 
 _CLONE_NEWUSER = 0x10000000
 _CLONE_NEWNET = 0x40000000
-_PR_SET_PDEATHSIG = 1
 
 _SIOCADDRT = 0x890B
 _SIOCGIFFLAGS = 0x8913
@@ -116,11 +116,6 @@ def enter_isolation() -> None:
         Path("/proc/self/gid_map").write_text(f"{group} {group} 1", encoding="ascii")
     _bring_up_loopback()
     _keep_off_ports_of_dds()
-
-
-def end_with_parent() -> None:
-    """Ask the kernel to kill this process when the thread that started it ends."""
-    _libc().prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
 
 
 def _libc() -> ctypes.CDLL:
@@ -216,8 +211,7 @@ class RowNetwork:
 
 
 def _enter(descriptor: int) -> None:
-    library = ctypes.CDLL(None, use_errno=True)
-    if library.setns(descriptor, _CLONE_NEWNET) != 0:
+    if _libc().setns(descriptor, _CLONE_NEWNET) != 0:
         number = ctypes.get_errno()
         raise OSError(number, f"setns: {os.strerror(number)}")
 
@@ -230,21 +224,6 @@ Progress = Callable[[str], None]
 ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 _SECONDS_TO_END = 8.0
-
-
-def end_with_starter() -> Callable[[], None]:
-    """Return a function for a child process to call first.
-
-    It makes the kernel kill the child when this process ends.
-    """
-    starter = os.getpid()
-
-    def follow() -> None:
-        end_with_parent()
-        if os.getppid() != starter:
-            os._exit(1)
-
-    return follow
 
 
 def run_isolated(

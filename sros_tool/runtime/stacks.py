@@ -29,6 +29,7 @@ from tempfile import TemporaryDirectory
 from typing import Annotated, NamedTuple
 
 from sros_tool.errors import SrosError
+from sros_tool.parallel import end_with_parent
 from sros_tool.runtime.cyclone import (
     INSTALL_ADVICE,
     Participant,
@@ -46,7 +47,7 @@ from sros_tool.runtime.events import (
     read_events,
     signal_name,
 )
-from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
+from sros_tool.runtime.netns import enter_isolation, try_isolation
 from sros_tool.runtime.rmw import (
     MIDDLEWARE,
     RMW,

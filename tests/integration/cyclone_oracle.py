@@ -27,6 +27,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from sros_tool.parallel import end_with_parent
 from sros_tool.runtime.cyclone import (
     STRING_TYPE,
     CycloneLibrary,
@@ -36,7 +37,6 @@ from sros_tool.runtime.cyclone import (
     load_cyclone,
     security_properties,
 )
-from sros_tool.runtime.netns import end_with_parent
 
 PATIENCE = 120.0
 OPS = (ctypes.c_uint32 * 3)(0x01 << 24 | 0x05 << 16, 0, 0)

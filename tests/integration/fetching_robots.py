@@ -24,8 +24,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from sros_tool.parallel import end_with_parent
 from sros_tool.runtime.events import EventKind, read_events
-from sros_tool.runtime.netns import end_with_parent
 from tests.integration.robots import FAKETIME
 from tests.support.children import importing, run, wait_for
 from tests.support.harness import Ended, sros

@@ -19,7 +19,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sros_tool.runtime.netns import end_with_parent, try_isolation
+from sros_tool.parallel import end_with_parent
+from sros_tool.runtime.netns import try_isolation
 from tests.support.children import PATIENCE, run, wait_for
 
 CHECKOUT = Path(__file__).parents[2]
@@ -37,7 +38,8 @@ MISSING = [
 
 _HOLDER = """
 import signal, sys
-from sros_tool.runtime.netns import enter_isolation, end_with_parent
+from sros_tool.parallel import end_with_parent
+from sros_tool.runtime.netns import enter_isolation
 end_with_parent()
 enter_isolation()
 print("ready", flush=True)

@@ -17,8 +17,8 @@ import pytest
 
 from sros_tool.close.processes import read_processes
 from sros_tool.demo.backend import CYCLONE, RCLPY
+from sros_tool.parallel import end_with_parent
 from sros_tool.runtime.events import EventKind, read_events
-from sros_tool.runtime.netns import end_with_parent
 from tests.integration.enforcing import enforces, enforcing_backend
 from tests.support.children import apart, has_isolation, importing, wait_for
 from tests.support.harness import Ended, sros

@@ -21,9 +21,10 @@ from pathlib import Path
 from typing import Any
 
 from sros_tool.files import templates_dir
+from sros_tool.parallel import end_with_parent
 from sros_tool.runtime.environment import secured_environment
 from sros_tool.runtime.events import EventKind, read_events
-from sros_tool.runtime.netns import end_with_parent, enter_isolation
+from sros_tool.runtime.netns import enter_isolation
 from sros_tool.runtime.rmw import RMW
 from tests.support.children import LONG, importing, wait_for
 from tests.support.harness import Running, policy_text, publish, sros

@@ -20,7 +20,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
-from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
+from sros_tool.parallel import end_with_parent
+from sros_tool.runtime.netns import enter_isolation, try_isolation
 
 PATIENCE = 300.0
 """Seconds after which a process is taken to hang."""

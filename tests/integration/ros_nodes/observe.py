@@ -15,7 +15,7 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from sros_tool.names import NODE_SERVICES, dds_names, expand
-from sros_tool.runtime.netns import end_with_parent
+from sros_tool.parallel import end_with_parent
 from tests.integration.ros_nodes.run_nodes import Nodes, load_types
 from tests.support.children import importing
 

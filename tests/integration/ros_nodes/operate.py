@@ -15,7 +15,8 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
+from sros_tool.parallel import end_with_parent
+from sros_tool.runtime.netns import enter_isolation, try_isolation
 from tests.support.children import LATE, run, wait_for
 
 NODE = "machine"

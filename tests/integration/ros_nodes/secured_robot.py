@@ -18,9 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from sros_tool.errors import SrosError
+from sros_tool.parallel import end_with_parent
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
-from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
+from sros_tool.runtime.netns import enter_isolation, try_isolation
 from tests.support.children import run
 
 RUN_NODES = Path(__file__).with_name("run_nodes.py")
