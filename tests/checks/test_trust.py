@@ -93,6 +93,8 @@ def test_an_export_from_before_a_revocation(keystore: Path, tmp_path: Path) -> N
     (early / "enclaves/a/crl.pem").unlink()
     assert strangers(late, early) == [f"{accepts} {late} revokes"]
     assert strangers(late, keystore) == strangers(late, early, vendors=("zenoh",)) == []
+    (early / "enclaves/a/identity_ca.cert.pem").write_text("broken")
+    assert strangers(late, early) == []
 
 
 def test_protection_and_domains_that_keep_nodes_apart(keystore: Path, tmp_path: Path) -> None:

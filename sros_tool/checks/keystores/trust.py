@@ -266,19 +266,19 @@ def _names_revoked(data: bytes, keystore: OpenedKeystore, enclaves: Sequence[str
 
 def _earlier_lists(targets: Targets) -> Iterator[Finding]:
     """Yield findings about targets without what the newer list of another target revokes."""
-    holders: dict[tuple[bytes, bytes], dict[str, None]] = defaultdict(dict)
+    holders: dict[tuple[_Certificates, bytes], dict[str, None]] = defaultdict(dict)
     for shown, (keystore, enclaves) in targets.items():
         for name in enclaves:
             folder = keystore.folder(name)
-            with suppress(SrosError):
+            with suppress(SrosError, ValueError, OSError):
                 trusted = keystore.read(folder / IDENTITY_CA_FILE, "CA certificate")
                 lists = [trusted]  # which has a list, too, in a rotation
                 if (folder / CRL_FILE).exists():
                     lists.append(keystore.read(folder / CRL_FILE, "revocation list"))
-                holders[trusted, b"\n".join(lists)][shown] = None
+                holders[_certificates(trusted), b"\n".join(lists)][shown] = None
     found: dict[tuple[str, str], None] = {}
-    for (trusted, own_lists), earlier in holders.items():
-        for authority in _certificates(trusted):
+    for (authorities, own_lists), earlier in holders.items():
+        for authority in authorities:
             signer = authority.public_bytes(Encoding.PEM)
             own = _newest_list(own_lists, signer)
             newest = max(
@@ -297,7 +297,7 @@ def _earlier_lists(targets: Targets) -> Iterator[Finding]:
                 f"accept {counted(len(lacking), 'certificate')} that the newer revocation list of "
                 f"{names_text(later)} revokes"
             )
-            found |= {(shown, f"nodes of {shown} {text}"): None for shown in earlier.keys() - later}
+            found |= {(e, f"nodes of {e} {text}"): None for e in earlier if e not in later}
     for shown, text in found:
         yield PEERS_ACCEPT.found(shown, text, shown)
 
