@@ -635,9 +635,9 @@ def _status(
       $ sros fleet status keystore --prometheus -o /var/lib/.../fleet.prom
 
     The exit status is 0 if every robot that is not revoked has confirmed the files that it should
-    have, no restart is due, no agent reports a problem, and robots still accept what was
-    published. Otherwise it is 1. With --fail-on vulnerabilities, it is also 1 if a robot has a DDS
-    to upgrade.
+    have, no restart is due, no agent reports a problem, and robots still accept what was published,
+    of which no file is missing in its folder. Otherwise it is 1. With --fail-on vulnerabilities, it
+    is also 1 if a robot has a DDS to upgrade.
     """
     from sros_tool.checks.vulnerabilities import is_fixed_later, robot_findings
     from sros_tool.keystore.fleet_status import fleet_status
@@ -785,6 +785,9 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         yield f"the keystore is older than its robots: {status.older}. Publish with {restored}"
     elif any(robot.state == "later" for robot in status.robots):
         yield f"the keystore may be older than its robots: if it was restored, {restored}"
+    elif publication and publication.lacks:
+        publish += " --new-folder" if publication.lacks.startswith("metadata/") else ""
+        yield f"'{folder}' lacks {publication.lacks}, which robots fetch: `{publish}`"
     elif publication and publication.accepted is False and publication.expires:
         ago = elapsed(compared_fleet.at - publication.expires)
         yield f"what was published expired {ago} ago, so robots get no new files: `{publish}`"

@@ -399,7 +399,10 @@ class RobotStatus:
         return "wait: it fetches" if all(passes) else "look into it"
 
 
-@shows("folder", "expires", "root_expires", "accepted", null_if_empty=("folder",))
+@shows(
+    *("folder", "expires", "root_expires", "accepted", "lacks"),
+    null_if_empty=("folder", "lacks"),
+)
 @dataclass(frozen=True, slots=True)
 class PublishedMetadata:
     """What was published last for the robots that fetch."""
@@ -415,6 +418,14 @@ class PublishedMetadata:
     earlier release of sros published last, which recorded no expiry."""
     accepted: bool | None = None
     """Whether robots still accept the metadata; null if ``expires`` is null."""
+    lacks: str = ""
+    """Path of a published file that is missing in ``folder``, such as the metadata or the archive
+    of a robot. Null if none is missing, or the folder is not on this machine."""
+
+    @property
+    def is_in_order(self) -> bool:
+        """Whether robots still accept the metadata, and no file is known to be missing."""
+        return bool(self.accepted and not self.lacks)
 
     def at(self, now: datetime) -> PublishedMetadata:
         """Return the publication as robots see it at ``now``."""
@@ -504,7 +515,7 @@ class FleetStatus:
     @property
     def complete(self) -> bool:
         """Whether every robot that has enclaves confirmed the current files in time, says that no
-        restart is due and that its agent has no problem, robots still accept what was published,
+        restart is due and that its agent has no problem, robots can still fetch what was published,
         and nothing else casts doubt on it; if not, the exit status is 1. Robots of which all
         enclaves were revoked do not count.
         """
@@ -513,7 +524,7 @@ class FleetStatus:
             or self.older
             or self.clock
             or self.edited
-            or (self.publication and not self.publication.accepted)
+            or (self.publication and not self.publication.is_in_order)
         ):
             return False
         return all(robot.settled for robot in self.robots)
@@ -538,7 +549,7 @@ class FleetStatus:
             for robot in self.robots
         )
         publication = self.publication and self.publication.at(now)
-        is_accepted = publication is None or bool(publication.accepted)
+        is_accepted = publication is None or publication.is_in_order
         to_do = tuple(robot.with_to_do(now, is_accepted=is_accepted) for robot in robots)
         received = max((robot.received for robot in self.robots if robot.received), default=None)
         clock = behind_clause(now, self.recorded, "the last entry of the ledger")
@@ -842,7 +853,9 @@ class _KeystoreRecords:
         self.published = {name: robot.release.number for name, robot in published.robots.items()}
         """Number of the release that was published last, by robot."""
         self.publication = (
-            PublishedMetadata(published.folder, published.until, published.root_until)
+            PublishedMetadata(
+                published.folder, published.until, published.root_until, lacks=published.lacking()
+            )
             if published.robots
             else None
         )

@@ -958,6 +958,27 @@ def test_what_was_renewed_is_published_at_once(home: Home) -> None:
     assert "not published yet" in sros("fleet", "status", "ks", cwd=home.folder).out
 
 
+def test_a_publishing_folder_that_lost_its_files_is_not_in_order(home: Home) -> None:
+    home.run("fleet", "publish", "ks", "pub")
+    published = read_published(OpenedKeystore(home.root))
+    for robot in ROBOTS:
+        home.send(robot, datetime.now(UTC), release=published.number)
+    home.run("fleet", "collect", "ks", "inbox")
+    status = ("fleet", "status", "ks")
+    sros(*status, cwd=home.folder).ok()
+    pub, archive = home.folder / "pub", published.robots["r2"].release.path("r2")
+    for lost, option in ((archive, ""), ("metadata/timestamp.json", " --new-folder")):
+        (pub / lost).unlink()
+        ended = sros(*status, cwd=home.folder)
+        command = f"sros fleet publish ks {pub}{option}"
+        assert f"'{pub}' lacks {lost}, which robots fetch: `{command}`" in ended.out
+        assert ended.status == 1
+        sros(*command.split()[1:], cwd=home.folder).ok()
+    assert "lacks" not in sros(*status, cwd=home.folder).out
+    pub.rename(home.folder / "elsewhere")
+    assert "lacks" not in sros(*status, cwd=home.folder).out, "it may be on another disk"
+
+
 def test_what_was_published_expires(home: Home) -> None:
     """Robots then refuse it: a fleet whose files are all current is not in order."""
     status = ("fleet", "status", "ks")

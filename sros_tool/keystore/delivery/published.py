@@ -36,6 +36,7 @@ MOST_NUMBER = 10**12 - 1
 """Highest number of a release, as a seal can state it, and highest version of metadata."""
 BEGIN_AGAIN = "Start again as after a theft of all keys: docs/fetching.md says how."
 """Remedy if somebody has used up the numbers."""
+_TIMESTAMP = "metadata/timestamp.json"
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 
 
@@ -121,6 +122,18 @@ class Published:
         """The highest number of a release; 0 without one."""
         return max((robot.release.number for robot in self.robots.values()), default=0)
 
+    def lacking(self) -> str:
+        """Return the first file that is missing in the publishing folder; "" if none is.
+
+        Also "" if the folder is not here, such as one on a disk that is not mounted.
+        """
+        releases = sorted(self.robots.items())
+        paths = (_TIMESTAMP, *(robot.release.path(name) for name, robot in releases))
+        with suppress(OSError):
+            if self.folder and Path(self.folder).is_dir():
+                return next((path for path in paths if not Path(self.folder, path).exists()), "")
+        return ""
+
     def document(self, now: datetime) -> bytes:
         """Return the content of the file."""
         robots = {name: _as_json(robot) for name, robot in sorted(self.robots.items())}
@@ -170,7 +183,7 @@ def may_have_later_releases(keystore: OpenedKeystore) -> bool:
     with suppress(SrosError, ValueError, OSError, KeyError, TypeError):
         known = read_published(keystore)
         if known.folder:
-            path = Path(known.folder) / "metadata" / "timestamp.json"
+            path = Path(known.folder) / _TIMESTAMP
             version = parse_json(read_bytes(path, "timestamp", max_bytes=_SMALL))["signed"][
                 "version"
             ]
