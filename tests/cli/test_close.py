@@ -1342,7 +1342,7 @@ def test_what_is_exported_without_the_enclaves_of_other_machines(tmp_path: Path)
 
 
 def test_a_robot_whose_files_expire_soon(keystore: Path, tmp_path: Path) -> None:
-    sros("distribute_key", keystore, "/a", tmp_path / "export").ok()
+    sros("distribute_key", keystore, "/a", "/b", tmp_path / "export").ok()
 
     def state_at(moment: datetime) -> state.CloseState:
         shell = Shell(close._run, print, {}, lambda: moment, UTC)
@@ -1353,6 +1353,8 @@ def test_a_robot_whose_files_expire_soon(keystore: Path, tmp_path: Path) -> None
     assert now.valid_until and close._until(now).endswith("Z")
     soon = close._until(state_at(now.valid_until - timedelta(days=1)))
     assert soon.endswith("Z, so renew them now: sros renew robot/keystore --all-expiring soon")
+    (tmp_path / "export/enclaves/b/permissions.p7s").write_bytes(b"damaged")
+    assert state_at(datetime.now(UTC)).valid_until is None, "nobody knows until when /b works"
 
 
 @sometimes("an_enclave_that_belongs_to_another_machine")
