@@ -451,6 +451,12 @@ class _WithCommandAfterDashes(_WithCommand):
     help="With --job collect: folder in which to publish releases.",
 )
 @click.option(
+    "--max-age",
+    metavar="DURATION",
+    help="With --job fleet: robots without a confirmation for longer than this are offline. "
+    "[default: 1d for robots that fetch]",
+)
+@click.option(
     "--target",
     "target_dir",
     metavar="DIR",
@@ -491,6 +497,7 @@ def units(
     jobs: tuple[str, ...],
     inbox: Path | None,
     publishing: Path | None,
+    max_age: str | None,
     target_dir: str | None,
     user: str | None,
     program: str | None,
@@ -525,6 +532,7 @@ def units(
         unit_changes,
         write_units,
     )
+    from sros_tool.validity import parse_duration
 
     root, rest = split_root(arguments)
     command = tuple(ctx.meta[_COMMAND])
@@ -536,6 +544,8 @@ def units(
         raise UsageError("--passphrase-file is only for --job renew and --job collect")
     if {inbox is not None, publishing is not None} != {Job.COLLECT in jobs}:
         raise UsageError("--job collect needs --inbox INBOX and --publish PUB; no other job does")
+    if max_age is not None and Job.FLEET not in jobs:
+        raise UsageError("--max-age is only for --job fleet")
     if user is not None and Job.GUARD in jobs:
         raise UsageError(
             "--user is not for --job guard",
@@ -587,6 +597,7 @@ def units(
             writable=_inbox(root) if job == Job.AGENT else (),
             inbox=str(inbox.absolute()) if inbox else "",
             publishing=str(publishing.absolute()) if publishing else "",
+            max_age=parse_duration(max_age) if max_age is not None else None,
         )
     changes = unit_changes(folder, files, force=force)
     if not dry_run:

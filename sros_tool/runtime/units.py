@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from datetime import timedelta
 from enum import StrEnum
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +21,7 @@ from sros_tool.files import new_files, replace_file, write_new_folder
 from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.runtime.environment import render_environment
 from sros_tool.runtime.variables import DOMAIN, ENABLE, KEYSTORE, STRATEGY
+from sros_tool.validity import duration_text
 from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes
 from sros_tool.xml import read_bytes
 
@@ -245,6 +247,7 @@ def job_units(
     writable: Sequence[str] = (),
     inbox: str = "",
     publishing: str = "",
+    max_age: timedelta | None = None,
 ) -> dict[str, str]:
     """Return the service and the timer of a job by their names; the guard has no timer.
 
@@ -258,6 +261,8 @@ def job_units(
         writable: folders besides the keystore in which the agent writes.
         inbox: the path of the folder with the messages of robots, for `Job.COLLECT`.
         publishing: the path of the folder in which `Job.COLLECT` publishes releases.
+        max_age: the age of a confirmation from which a robot is offline for `Job.FLEET`; None for
+            that of `sros fleet status`.
 
     Raises:
         UsageError: a path cannot be written in a unit.
@@ -271,6 +276,7 @@ def job_units(
         _check_path(keystore, "the keystore"),
         _check_program(sros),
     )
+    oldest = ("--max-age", duration_text(max_age)) if max_age else ()
     description, words, own_lines = {
         Job.RENEW: (
             f"Renew the enclaves of {root} that expire soon",
@@ -289,7 +295,7 @@ def job_units(
         ),
         Job.FLEET: (
             f"Write the metrics of the fleet of {root}",
-            ("fleet", "status", root, "--prometheus", "-o", FLEET_FILE),
+            ("fleet", "status", root, *oldest, "--prometheus", "-o", FLEET_FILE),
             [
                 "PrivateNetwork=yes",
                 "StateDirectory=sros-metrics",

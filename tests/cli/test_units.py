@@ -89,6 +89,10 @@ def test_jobs_are_of_this_keystore_and_its_owner(made: Path, tmp_path: Path) -> 
     fleet = (tmp_path / "units/sros-fleet.service").read_text()
     assert f"ExecStart=/usr/bin/sros fleet status {made} --prometheus -o {FLEET_FILE}\n" in fleet
     assert "\nSuccessExitStatus=1\n" in fleet
+    often = ("--job", "fleet", "--max-age", "15m", "--sros", "/usr/bin/sros", "--force")
+    sros("units", made, *often, tmp_path / "units").ok()
+    fleet = (tmp_path / "units/sros-fleet.service").read_text()
+    assert f"fleet status {made} --max-age 900s --prometheus -o {FLEET_FILE}\n" in fleet
 
 
 def test_messages_are_collected_and_releases_published(made: Path, tmp_path: Path) -> None:
@@ -148,6 +152,8 @@ def test_the_agent_is_of_the_owner_and_may_write_into_its_inbox(made: Path, tmp_
         (("--job", "check", "F", "--passphrase-file", "/x"), "only for --job renew"),
         (("--job", "collect", "F", "--inbox", "/in"), "needs --inbox INBOX and --publish PUB"),
         (("--job", "check", "F", "--publish", "/pub"), "no other job does"),
+        (("--job", "check", "F", "--max-age", "15m"), "only for --job fleet"),
+        (("--job", "fleet", "F", "--max-age", "15m\nUser=root"), "is not a duration"),
         (("/leg", "F", "--target", "/a b"), "cannot be written in a unit"),
         (("/leg", "F", "--target", "k"), "--target 'k'"),
         (("/leg", "F", "--user", "a b"), "name of a user"),
