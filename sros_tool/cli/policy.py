@@ -275,9 +275,10 @@ def diff_policy(
     or Zenoh configurations such as router.json5. Permissions and Zenoh rules are shown in ROS
     terms; the signature of permissions is verified if the permissions CA is next to them. "!" marks
     a right of B whose counterpart, such as the subscriber, only A has. If A or B covers only some
-    enclaves, as an export does, only these are compared. Lines that differ only in the robot of a
-    fleet are shown as one. Two policies are also compared by the protection that they demand, two
-    keystores by their governance.
+    enclaves, as an export does, only these are compared. A note names Zenoh routers that a policy
+    lacks and that have no more rights than every node needs: they do not count. Lines that differ
+    only in the robot of a fleet are shown as one. Two policies are also compared by the protection
+    that they demand, two keystores by their governance.
 
     The exit status is 1 if they differ, or if DDS would refuse A or B.
 
@@ -304,7 +305,12 @@ def diff_policy(
       + /talker publish topic /arm_*  (robot.xml:7): such as /arm_c
       1 right is new
     """
-    from sros_tool.keystore.rights import compare_sources, load_rights, policy_difference
+    from sros_tool.keystore.rights import (
+        compare_sources,
+        load_rights,
+        policy_difference,
+        without_added,
+    )
 
     check_one_format()
     form = "json" if as_json else form
@@ -314,6 +320,7 @@ def diff_policy(
     with progress("reading"):
         fleets = fleets_of(fleet_files)
         first, second = load_rights(a, fleets[0]), load_rights(b, fleets[-1])
+    first, second = without_added(first, second), without_added(second, first)
     compared = compare_sources(first, second, governance=True)
     difference, protections = compared.rights, compared.protections
     if form == "json":

@@ -56,13 +56,16 @@ from sros_tool.policy.model import (
     StatedProtection,
     stated_protections,
 )
+from sros_tool.policy.node_basics import are_basic
 from sros_tool.policy.patterns import Names
 from sros_tool.policy.rights import Right, RightsDifference, Rules, compare, policy_rights, unfolded
 from sros_tool.translate import grant_rights
 from sros_tool.values import Words, shows
+from sros_tool.wording import counted, first_few
 from sros_tool.xml import parse, read_bytes
 
 if TYPE_CHECKING:
+    from sros_tool.keystore.template import Template
     from sros_tool.translate_zenoh.rights import RouterLinks
     from sros_tool.zenoh.access import Enforcement
     from sros_tool.zenoh.document import ConfigurationDocument
@@ -664,14 +667,9 @@ def compare_sources(
 ) -> SourcesDifference:
     """Return the difference between two sources of rights.
 
-    If a source is only for some enclaves, only these are compared.  The observer of a closed robot
-    is left out, because only its keystore and export have it.  With ``governance``, the governance
-    documents of two keystores are compared, too.
+    If a source is only for some enclaves, only these are compared.  With ``governance``, the
+    governance documents of two keystores are compared, too.
     """
-    first_source, second_source = (
-        _without_observer(first_source, second_source),
-        _without_observer(second_source, first_source),
-    )
     sides = first_source, second_source
     scope = compared_enclaves(*((side.kind, side.scope) for side in sides))
     difference = compare(first_source.rights, second_source.rights, scope)
@@ -719,18 +717,47 @@ def _governances(source: RightsSource) -> set[Governance]:
     }
 
 
-def _without_observer(source: RightsSource, other: RightsSource) -> RightsSource:
-    """Return a source without the observer of a closed robot, unless ``other`` has it, too."""
-    if folder_of_closed_robot(source.path) and not any(
-        e.enclave == CLOSED_OBSERVER for e in other.rights
-    ):
-        stated_rights = (right for right in source.rights if right.enclave != CLOSED_OBSERVER)
-        scope = None if source.scope is None else source.scope - {CLOSED_OBSERVER}
-        documents = {**source.documents}
-        documents.pop(CLOSED_OBSERVER, None)
-        own = frozenset(stated_rights)
-        return replace(source, rights=own, scope=scope, documents=documents)
-    return source
+def without_added(source: RightsSource, other: RightsSource) -> RightsSource:
+    """Return a source without the enclaves that sros adds to a policy, unless ``other`` has them.
+
+    These are the observer of a closed robot, and, compared with a policy, the `_plain_routers`,
+    which a note names.
+    """
+    observer = {CLOSED_OBSERVER} if folder_of_closed_robot(source.path) else set()
+    routers = _plain_routers(source) if other.kind == "policy" else set()
+    left_out = observer | routers
+    left_out -= other.stated_enclaves() | {right.enclave for right in other.rights}
+    if not left_out:
+        return source
+    notes = source.notes
+    if named := sorted(left_out & routers):
+        number = counted(len(named), "Zenoh router")
+        text = (
+            f"left out: {number} that the policy lacks, with no more rights than every node needs"
+        )
+        notes = (*notes, Note("rights.routers", f"{text}: {first_few(named, 5)}."))
+    return replace(
+        source,
+        rights=frozenset(right for right in source.rights if right.enclave not in left_out),
+        scope=None if source.scope is None else source.scope - left_out,
+        documents={name: of for name, of in source.documents.items() if name not in left_out},
+        notes=notes,
+    )
+
+
+def _plain_routers(source: RightsSource) -> set[str]:
+    """Return the routers of a keystore that have no rights but those that every node needs."""
+    settings = OpenedKeystore(source.path).settings if source.kind == "keystore" else None
+    rights = defaultdict(set)
+    for right in source.rights:
+        rights[right.enclave].add(right)
+    return {name for name in source.documents if is_plain_router(settings, name, rights[name])}
+
+
+def is_plain_router(settings: Template | None, name: str, rights: Iterable[Right]) -> bool:
+    """Return whether an enclave is the Zenoh router that sros made, without rights of its own."""
+    routers = settings.zenoh.router_names() if settings and settings.zenoh else ()
+    return name in routers and are_basic(rights)
 
 
 def _domain_differences(

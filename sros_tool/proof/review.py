@@ -56,7 +56,12 @@ from sros_tool.keystore.layout import (
     is_keystore,
 )
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.keystore.rights import RightsSource, SourcesDifference, compare_sources
+from sros_tool.keystore.rights import (
+    RightsSource,
+    SourcesDifference,
+    compare_sources,
+    without_added,
+)
 from sros_tool.keystore.template import Template, load_template, read_template, template_names
 from sros_tool.names import expand
 from sros_tool.policy.document import read_policy
@@ -936,6 +941,7 @@ class _Review:
         first, second = before().as_rights(), after().as_rights()
         absolute = tuple(moved for moved in moving() if moved.written.startswith("/"))
         relative = tuple(moved for moved in moving() if not moved.written.startswith("/"))
+        first, second = without_added(first, second), without_added(second, first)
         compared = compare_sources(first, second)
         if not compared and not (absolute or relative):
             return None

@@ -81,6 +81,24 @@ def test_many_files_are_counted(folder: Path, monkeypatch: pytest.MonkeyPatch) -
     assert (checked.out, written.out) == (f"missing: 3 files: {files}", f"wrote 3 files: {files}")
 
 
+def test_a_router_without_rights_of_its_own_does_not_differ_from_the_policy(folder: Path) -> None:
+    compare = ("diff_policy", "p.xml", "ks")
+    assert "+ /router ALLOW publish" in sros(*compare, cwd=folder).out
+    sros("zenoh", "ks", cwd=folder).ok()
+    ended = sros(*compare, cwd=folder).ok()
+    left_out = "left out: 1 Zenoh router that the policy lacks, with no more rights than every node"
+    assert (ended.out, f"{left_out} needs: /router." in ended.err) == ("", True)
+    sros(
+        "update_keystore",
+        "ks",
+        "--set",
+        "permissions.default=everything",
+        "--allow-looser",
+        cwd=folder,
+    ).ok()
+    assert "+ /router ALLOW publish topic /*" in sros(*compare, cwd=folder).out
+
+
 def test_every_file_has_the_rights_of_all_by_name_and_denies_the_rest(folder: Path) -> None:
     sros("zenoh", "ks", "--mode", "peer", cwd=folder).ok()
     names = {

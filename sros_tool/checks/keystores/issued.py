@@ -18,7 +18,7 @@ from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import parse_governance
-from sros_tool.dds.permissions import Grant, mistaken_names, pairs_text
+from sros_tool.dds.permissions import mistaken_names, pairs_text
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import robot_of
 from sros_tool.keystore.known_keys import removed_enclaves, unknown_authorities
@@ -463,8 +463,11 @@ def check_policy(
         return
     name, grant = enclave.name, grant_of(enclave)
     if name not in wanted_rights:
+        from sros_tool.keystore.rights import is_plain_router
+
         of_close = name == CLOSED_OBSERVER and folder_of_closed_robot(enclave.keystore.root)
-        if of_close or _is_plain_router(enclave, grant):
+        settings = enclave.keystore.settings
+        if of_close or (grant and is_plain_router(settings, name, grant_rights(name, grant))):
             return
         yield NOT_IN_POLICY.found(name, "none of the given policies names it", str(enclave.folder))
         return
@@ -486,17 +489,6 @@ def check_policy(
         rights = first_few(shown, _RIGHTS_SHOWN, "; ")
         text = f"permissions (-) and policy (+) differ: {rights}"
         yield STALE.found(name, text, enclave.file("permissions.p7s"))
-
-
-def _is_plain_router(enclave: CheckedEnclave, grant: Grant | None) -> bool:
-    """Return whether an enclave is the Zenoh router that sros made, without rights of its own."""
-    settings = enclave.keystore.settings
-    network = settings.zenoh if settings else None
-    if not (network and enclave.name in network.router_names() and grant):
-        return False
-    from sros_tool.policy.node_basics import are_basic
-
-    return are_basic(grant_rights(enclave.name, grant))
 
 
 def wanted_rights(keystore: CheckedKeystore) -> dict[str, frozenset[Right]]:
