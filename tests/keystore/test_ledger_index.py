@@ -265,9 +265,20 @@ def test_a_key_that_was_put_into_another_enclave_is_found_by_check(root: Path) -
     sign_request(root, make_request(key, "/other"), now=NOW)
 
 
-def test_check_knows_the_index_and_the_lock_of_a_writer(root: Path) -> None:
+def test_check_knows_the_index_and_the_lock_of_a_writer(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in (LOCK, ".sros-other"):
         (root / name).touch()
     found = sros("check", root, "--severity", "note").out.splitlines()
     unknown = [line.partition(": ")[0] for line in found if "[keystore.unknown-file]" in line]
     assert unknown == [str(root / ".sros-other")] and (root / LEDGER_INDEX).exists()
+
+    def as_the_writer_ends(path: str) -> os.stat_result:
+        if Path(path).name == LOCK:
+            (root / LOCK).unlink(missing_ok=True)
+        return Path(path).lstat()
+
+    monkeypatch.setattr("sros_tool.checks.keystores.files.os.lstat", as_the_writer_ends)
+    assert "unknown-file" in sros("check", root, "--severity", "note").out
+    assert not (root / LOCK).exists()

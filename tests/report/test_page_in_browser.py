@@ -743,7 +743,7 @@ def test_a_robot_of_unknown_names_says_who_may_do_most_and_equal_findings_are_on
         said = page.inner_text("#headlines").split("\n")
         unknown = "What strangers may do is not stated here: a keystore's governance says it."
         node = "/a: p.xml:1: node /n may not reply /n/get_type_description"
-        wrong = f"Looks wrong: 20 errors ({node})"
+        wrong = f"Looks wrong: 20 errors, 1 warning ({node})"
         assert [line for line in said if line] == [*most, wrong, unknown]
     with opened(browser, tmp_path / "ks.html") as page:
         said = page.inner_text("#headlines").split("\n")

@@ -324,7 +324,10 @@ def _folder_findings(
         inside = os.path.relpath(parent, root)
         for name in sorted(files):
             path = os.path.join(parent, name)
-            info = os.lstat(path)
+            try:
+                info = os.lstat(path)
+            except FileNotFoundError:  # removed since, as a writing process removes its lock
+                continue
             if stat.S_ISLNK(info.st_mode):
                 yield from links.check(path)
                 continue
