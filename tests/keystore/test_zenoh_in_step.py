@@ -183,7 +183,7 @@ def test_expired_permissions_give_no_rights(folder: Path) -> None:
     in_step(root)
     later = datetime.now(UTC) + timedelta(days=181)
     due = set_zenoh(root, ZenohNetwork(), now=later, dry_run=True)
-    assert "/a gets no configuration for Zenoh" in due.notes[0].text
+    assert "/a, /b get no configuration for Zenoh" in due.notes[0].text
     assert "its permissions expired at" in due.notes[0].text
     set_zenoh(root, ZenohNetwork(), now=later)
     router = json.loads((root / "enclaves/router/router.json5").read_text())

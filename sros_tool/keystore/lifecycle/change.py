@@ -9,7 +9,7 @@ same transaction, DDS and Zenoh enforce the same rights at any moment.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -741,11 +741,16 @@ def _remove(transaction: Transaction, path: str) -> None:
 
 
 def _left_out_notes(left_out: Mapping[str, str]) -> Iterable[Note]:
+    """Yield a note for each reason, with the enclaves that have it."""
+    names_of: defaultdict[str, list[str]] = defaultdict(list)
     for name, why in left_out.items():
+        names_of[why.rstrip(".")].append(name)
+    for why, names in names_of.items():
+        get, of_each = ("gets", "it") if len(names) == 1 else ("get", "each")
         yield Note(
             "zenoh.left-out",
-            f"{name} gets no configuration for Zenoh, and all others deny it everything there: "
-            f"{why}.".replace("..", "."),
+            f"{first_few(names, 5)} {get} no configuration for Zenoh, and all others deny "
+            f"{of_each} everything there: {why}.",
         )
 
 
