@@ -163,7 +163,10 @@ def _report(folder: Path, robot: str, restarted: bool) -> None:
         *processes.elsewhere,
         *enclaves_to_restart((), processes.list_states, complete=True),
     }
-    is_known = restarted or processes.complete or RunningFiles.NOT_SEEN not in states.values()
+    # Where nothing runs in these enclaves, this may be another machine than the robot.
+    seen = {*states.values()} - {RunningFiles.NOT_SEEN}
+    all_seen = processes.complete or RunningFiles.NOT_SEEN not in states.values()
+    is_known = restarted or (bool(seen) and all_seen)
     if restart or is_known:
         confirmation = replace(confirmation, restart=tuple(sorted(restart)))
     if is_known and not noted:  # files may have changed since the agent looked
