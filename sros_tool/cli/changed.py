@@ -172,7 +172,9 @@ def print_closed(root: Path, changes: Sequence[Change], *, keystore: Path | None
         echo(
             f"took over '{root}', which ros2/sros2 made: it has settings and a ledger from now on. "
             "The existing certificates and permissions that its CA signed are trusted: nothing "
-            "shows whether somebody put back a file that had been replaced or withdrawn.",
+            "shows whether somebody put back a file that had been replaced or withdrawn. Compare "
+            "the rights of each enclave with your policy: `sros diff_policy "
+            f"{quote(str(keystore or root))} POLICY_FILE`.",
             err=True,
         )
     closed = [str(root / change.path) for change in changes if change.action == "close"]

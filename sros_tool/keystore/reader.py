@@ -60,6 +60,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import Ledger, LedgerFile
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
+    extension,
     is_for_pss,
     issued_by,
     load_certificate,
@@ -280,20 +281,21 @@ class OpenedKeystore:
     def is_of_ros2(self) -> bool:
         """Whether ros2/sros2 made the keystore, and sros has not written to it yet.
 
-        Such a keystore has neither settings nor a ledger, and its CA has no key identifier.  sros
+        Such a keystore has neither settings nor a ledger, and its CAs have no key identifier.  sros
         gives a key identifier to every CA, so removing the ledger of an sros keystore does not make
-        it look like a keystore of ros2/sros2.
+        it look like a keystore of ros2/sros2.  Nor does a CA certificate without one: only the key
+        of the CA can sign it.
         """
         if any(os.path.lexists(self.root / name) for name in (SETTINGS, LEDGER, LEDGER_HEAD)):
             return False
         try:
-            authority = self.ca_certificate(IDENTITY)
-            authority.extensions.get_extension_for_class(x509.SubjectKeyIdentifier)
-        except x509.ExtensionNotFound:
-            return True
+            return all(
+                issued_by(authority, authority)
+                and extension(authority, x509.SubjectKeyIdentifier) is None
+                for authority in map(self.ca_certificate, ROLES)
+            )
         except (SrosError, OSError, ValueError):
             return False
-        return False
 
     @_Part
     def names(self) -> tuple[str, ...]:

@@ -34,7 +34,6 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_FILE,
     ROUTER_FILE,
     SESSION_FILE,
-    SETTINGS,
     enclave_names,
     enclave_path,
     folder_of_closed_robot,
@@ -912,8 +911,8 @@ class _LedgerPermissions:
         self.unchained = ledger.unchained
         chained = ledger.entries[ledger.unchained :]
         self.chained = {entry.enclave for entry in chained if entry.what == "permissions"}
-        # A keystore of ros2/sros2 has enclaves that no ledger records.
-        self.complete = keystore.has(SETTINGS) or not (keystore.is_of_ros2 or ledger.lines)
+        # What ros2/sros2 made is recorded by the first write of sros.
+        self.complete = not keystore.is_of_ros2
         self.last = {
             entry.enclave: entry for entry in ledger.entries if entry.what == "permissions"
         }

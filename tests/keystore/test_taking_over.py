@@ -6,10 +6,14 @@ import json
 import re
 import shlex
 import shutil
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 
 from sros_tool.keystore.reader import OpenedKeystore
 from tests.support.harness import copy_of, policy_text, publish, sros
@@ -104,22 +108,56 @@ def test_an_enclave_that_ros2_adds_later_is_one_finding(tmp_path: Path) -> None:
     assert "keystore.not-in-ledger" not in found
 
 
-def test_a_keystore_of_sros_without_its_records_is_not_one_of_ros2(tmp_path: Path) -> None:
+def _ca_without_identifier(root: Path) -> None:
+    """Give the identity CA a certificate that anybody can make, because its key signs nothing."""
+    path = root / "public/identity_ca.cert.pem"
+    real = x509.load_pem_x509_certificate(path.read_bytes())
+    builder = x509.CertificateBuilder(real.issuer, real.subject, real.public_key())
+    builder = builder.serial_number(real.serial_number).not_valid_before(real.not_valid_before_utc)
+    builder = builder.not_valid_after(real.not_valid_after_utc)
+    builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=1), critical=True)
+    forged = builder.sign(ec.generate_private_key(ec.SECP256R1()), hashes.SHA256())
+    path.write_bytes(forged.public_bytes(serialization.Encoding.PEM))
+
+
+def _identity_ca_of_ros2(root: Path) -> None:
+    """Give the keystore an identity CA and certificates of somebody else's keystore."""
+    other = made_by_ros2(root.parent / "other")
+    for file in ("public/identity_ca.cert.pem", "private/identity_ca.key.pem"):
+        (root / file).write_bytes((other / file).read_bytes())
+    shutil.copy(other / "enclaves/a/cert.pem", root / "enclaves/a/cert.pem")
+
+
+@pytest.mark.parametrize("forge", [None, _ca_without_identifier, _identity_ca_of_ros2])
+def test_a_keystore_of_sros_without_its_records_is_not_one_of_ros2(
+    forge: Callable[[Path], None] | None, tmp_path: Path
+) -> None:
     """Whoever removes settings and ledger would have older permissions signed again."""
     root, policy = tmp_path / "ks", tmp_path / "policy.xml"
-    sros("create_keystore", root, "--template", "sros2").ok()
+    sros("create_keystore", root, "--template", "development").ok()
     for names in (("x", "wide"), ("x",)):
-        policy.write_text(policy_text({"/a": publish(*names)}))
+        policy.write_text(policy_text({"/a": publish(*names), "/b": publish("y")}))
         sros("generate_artifacts", "-k", root, "-p", policy).ok()
         if "wide" in names:
             older = (root / "enclaves/a/permissions.p7s").read_bytes()
     (root / "enclaves/a/permissions.p7s").write_bytes(older)
     for file in ("sros.toml", "ledger.jsonl", "ledger.p7s"):
         (root / file).unlink()
+    if forge:
+        forge(root)
     ended = sros("renew", root, "/a")
     assert ended.status == 2
     assert "not certain that the permissions" in ended.err
     assert "ros2/sros2 made" not in sros("check", root).out
+    if forge:
+        return
+    # The lines that one enclave gets in the ledger vouch for no other.
+    sros("create_permission", root, "/b", policy).ok()
+    separate = ("--set", "authorities.layout=separate")
+    ended = sros("update_keystore", root, "--discard-edits", *separate)
+    assert ended.status == 2
+    assert "not certain that the permissions of enclave /a" in ended.err
+    assert (root / "enclaves/a/permissions.p7s").read_bytes() == older
 
 
 # ── version 0.1 of sros ────────────────────────────────────────────────────────────────────
