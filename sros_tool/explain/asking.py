@@ -98,6 +98,12 @@ class AskedEnclave(NamedTuple):
     enclave: LoadedEnclave
     policy: Policy | None = None
 
+    @property
+    def has_peers(self) -> bool:
+        """Whether the enclave's peers are in the policy or the keystore: an export lacks some."""
+        keystore = self.enclave.keystore
+        return self.policy is not None or bool(keystore and keystore.has_all_enclaves)
+
     def other_rights(self, name: str) -> frozenset[Right]:
         """Return all rights to a name in the policy and the keystore that can be read."""
         rights: frozenset[Right] = frozenset()

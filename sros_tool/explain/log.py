@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict, deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -43,7 +43,7 @@ from sros_tool.keystore.layout import ROUTER_FILE, is_keystore, is_original_keys
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.keystore.rights import load_rights
+from sros_tool.keystore.rights import RightsSource, load_rights
 from sros_tool.keystore.selection import likely_names as likely_enclaves
 from sros_tool.names import (
     ACTION_PARTS,
@@ -169,16 +169,19 @@ class SearchedKeystore:
     def has_other_side(self, right: Right) -> bool | None:
         """Return whether an enclave has the right that the peers of a right need, by its name.
 
-        None if that is not known, or an enclave has it only by a wildcard.
+        None if that is not known, as in an export or with unreadable permissions, or if an enclave
+        has it only by a wildcard.
         """
+        source = self._rights
         names = {
             peer.name
-            for peer in self._rights
+            for peer in (source.rights if source else ())
             if peer.right == OTHER_SIDE.get(right.right)
             and peer.qualifier is ALLOW
             and covers(peer.name, right.name)
         }
-        return right.name in names or (None if names or not self._rights else False)
+        is_whole = source is not None and source.sound and source.scope is None
+        return right.name in names or (False if is_whole and not names else None)
 
     @cached_property
     def zenoh_routers(self) -> frozenset[str]:
@@ -207,15 +210,15 @@ class SearchedKeystore:
         return enclaves_by_identity(self._keystore)
 
     @cached_property
-    def _rights(self) -> Collection[Right]:
+    def _rights(self) -> RightsSource | None:
         with suppress(SrosError):  # its documents do not tell
-            return load_rights(self._keystore).rights
-        return ()
+            return load_rights(self._keystore)
+        return None
 
     @cached_property
     def _by_node(self) -> Mapping[str, tuple[str, ...]]:
         enclaves_by_node: dict[str, set[str]] = {}
-        for right in self._rights:
+        for right in self._rights.rights if self._rights else ():
             if right.qualifier is ALLOW:
                 for node in nodes_served([(right.right, right.name)]):
                     enclaves_by_node.setdefault(node, set()).add(right.enclave)
@@ -923,7 +926,7 @@ class _Examiner:
         is_used = self._keystore.has_other_side(denied) if self._keystore else None
         names = () if is_used else likely_names(asked)  # a name that peers have is no mistake
         if not names and is_used is False:
-            return [f"no enclave may {OTHER_SIDE[denied.right]} {name}"], (
+            return [f"no enclave of the keystore may {OTHER_SIDE[denied.right]} {name}"], (
                 "If another name is meant, the node perhaps lacks a remapping: compare its command "
                 "with the one that the robot starts (after `sros close`: start/commands.txt). "
                 f"Otherwise, {remedy}"

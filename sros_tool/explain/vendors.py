@@ -345,11 +345,9 @@ def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[N
     if names := likely_names(answer):
         text = f"the enclave may {question.word} {' and '.join(names)}: perhaps that is meant."
         yield Note("explain.likely-name", text)
-    elif question.right in OFFERING_SIDE and (
-        asked_enclave.policy or asked_enclave.enclave.keystore
-    ):
-        text = f"no enclave may {needed} {question.name} by its name: then nobody offers it, unless"
-        text += " a wildcard allows it. Perhaps the node lacks a remapping."
+    elif question.right in OFFERING_SIDE and asked_enclave.has_peers:
+        text = f"no enclave that was read may {needed} {question.name} by its name: perhaps nobody "
+        text += "offers it, and the node lacks a remapping, or a wildcard allows it."
         yield Note("explain.not-offered", text)
 
 

@@ -1047,17 +1047,28 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     for topic, facts in (
         ("/rear/image", ()),
         ("/frnt/image", ("-r /frnt/image:=/front/image",)),
-        ("/odometry", ("no enclave may publish /odometry\n", "perhaps lacks a remapping: ")),
+        (
+            "/odometry",
+            ("no enclave of the keystore may publish /odometry\n", "perhaps lacks a remapping: "),
+        ),
     ):
         log.write_text(f"rt{topic} topic not found in allow rule. check_create_datareader\n")
         found = sros("explain", keystore, "/weed", "--log", log).out
-        for fact in ("-r /frnt/image:=", "no enclave may ", "perhaps lacks a remapping"):
+        for fact in ("-r /frnt/image:=", "no enclave ", "perhaps lacks a remapping"):
             assert (fact in found) is any(fact in each for each in facts), (topic, found)
         assert all(fact in found for fact in facts) and "subscribe" in found
         assert "-r /rear/image" not in found
         notes = sros("explain", keystore, "/weed", "subscribe", topic).err
-        assert ("[explain.not-offered]: no enclave may publish /odom" in notes) is (len(facts) == 2)
+        assert ("not-offered]: no enclave that was read may publish /odom" in notes) is (
+            len(facts) == 2
+        )
         assert ("[explain.likely-name]" in notes) is (len(facts) == 1)
+    export = tmp_path / "export"
+    sros("distribute_key", keystore, "/weed", export).ok()
+    (keystore / "enclaves/camera/permissions.p7s").write_text("damaged")
+    for part in (export, keystore):  # from which nothing follows for the name
+        assert "no enclave" not in sros("explain", part, "/weed", "--log", log).out
+    assert "no enclave" not in sros("explain", export, "/weed", "subscribe", "/odometry").err
 
 
 def test_a_topic_without_a_ros_name_is_looked_up_in_the_folder_of_the_enclave(
