@@ -285,7 +285,7 @@ def action_part(name: str) -> tuple[str, str]:
     The part is a name such as ``send_goal``.  Both are "" if ``name`` belongs to no action.
     """
     action, _, part = name.rpartition(ACTION_SEPARATOR)
-    return (action, part) if part in (*ACTION_SERVICES, *ACTION_TOPICS) else ("", "")
+    return (action, part) if action and part in (*ACTION_SERVICES, *ACTION_TOPICS) else ("", "")
 
 
 ACTION_PARTS: dict[str, tuple[tuple[str, str], ...]] = {

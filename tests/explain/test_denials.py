@@ -174,6 +174,8 @@ def test_processes_that_write_at_the_same_time(one: str, other: str) -> None:
         ("rr/f/_action/get_resultReply", "publish", NodeRight("execute", "/f")),
         ("rt/f/_action/status", "subscribe", NodeRight("subscribe", "/f/_action/status")),
         ("rt/f/_action/status", "publish", NodeRight("execute", "/f")),
+        ("rt/_action/status", "publish", NodeRight("publish", "/_action/status")),
+        ("rr/_action/send_goalReply", "publish", NodeRight("reply", "/_action/send_goal")),
     ],
 )
 def test_one_half_asks_for_the_whole(topic: str, direction: str, right: NodeRight) -> None:
