@@ -130,8 +130,8 @@ def _report(folder: Path, robot: str, restarted: bool) -> None:
     their keys, the DDS libraries that processes have loaded or that are installed, and the enclaves
     whose processes still run with earlier files: root can see all processes. Its problems are
     enclaves in which no process could start, for example because the key does not fit the
-    certificate, and files that other users can read or change. docs/json.md describes the report
-    under "confirmation".
+    certificate, files that other users can read or change, and what `sros check runtime` finds in
+    the processes of these enclaves. docs/json.md describes the report under "confirmation".
 
     Example:
       $ ssh root@r7 sros fleet report /etc/sros/keystore --robot r7 |
@@ -154,10 +154,11 @@ def _report(folder: Path, robot: str, restarted: bool) -> None:
         names = list_enclaves(folder)
         processes = _processes_here(folder, names, moment)
         confirmation = make_confirmation(folder, robot, now=moment, dds=processes.dds)
-        problems = shortened_problems(installed_sentences(folder, names, moment))
-    confirmation = replace(confirmation, problems=problems)
+        running = (f"{problem}." for problem in processes.problems)
+        problems = (*running, *installed_sentences(folder, names, moment))
+    confirmation = replace(confirmation, problems=shortened_problems(problems))
     agent, states = read_state(folder), processes.loaded_from_any_folder()
-    noted = agent.due if agent.boot == boot_id() else ()
+    noted = agent.due if agent.boot == boot_id() and not restarted else ()
     restart = {*noted, *enclaves_to_restart((), states, complete=True)}
     list_restart = {
         *processes.elsewhere,
@@ -165,8 +166,7 @@ def _report(folder: Path, robot: str, restarted: bool) -> None:
     }
     # Where nothing runs in these enclaves, this may be another machine than the robot.
     seen = {*states.values()} - {RunningFiles.NOT_SEEN}
-    all_seen = processes.complete or RunningFiles.NOT_SEEN not in states.values()
-    is_known = restarted or (bool(seen) and all_seen)
+    is_known = restarted or (bool(seen) and processes.complete)
     if restart or is_known:
         confirmation = replace(confirmation, restart=tuple(sorted(restart)))
     if is_known and not noted:  # files may have changed since the agent looked
