@@ -179,7 +179,7 @@ CASES |= {
     "portable.signature-hash": lambda b: b.trust(
         "identity", b.new_authority(IS_CA, digest=hashes.SHA384())[0]
     ),
-    "keystore.clock-behind": lambda b: at(b, -1),
+    "keystore.clock-behind": lambda b: at(b, -0.5),
     "keystore.revocation-list-ends": lambda b: b.revoke(end=b.now + DAY / 4),
     "keystore.revocation-list-issuer": lambda b: b.revoke(by=b.foreign()),
     "keystore.enclave-removed": lambda b: shutil.rmtree(b.path("enclaves/base")),
