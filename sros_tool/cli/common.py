@@ -261,14 +261,17 @@ def fleet_policies(
 ) -> list[FleetPolicy]:
     """Return the policies in files, expanded for the fleet in the --fleet file.
 
-    With ``robots``, only the enclaves of these robots count.
+    With ``robots``, only the enclaves of these robots count, and each has to have one.
     """
-    from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.fleet.expansion import FleetPolicy, check_choice
     from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.policy.document import read_policy
 
     fleet = read_fleet(fleet_file)
-    return [FleetPolicy(read_policy(file, placeholders=True), fleet, robots) for file in files]
+    policies = [FleetPolicy(read_policy(file, placeholders=True), fleet, robots) for file in files]
+    if robots:
+        check_choice(policies, fleet, robots)
+    return policies
 
 
 def policy_for(file: Path, fleet_file: Path | None) -> Policy:

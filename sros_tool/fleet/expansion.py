@@ -7,20 +7,28 @@ grammar of a policy, so that no value can add an element, a right or a wildcard.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sros_tool.errors import DocumentError, InvalidNameError, PolicyError, SrosError
-from sros_tool.fleet.robots import MAX_ENCLAVES, Fleet, Robot, group_of, path_for
+from sros_tool.fleet.robots import (
+    MAX_ENCLAVES,
+    Fleet,
+    Robot,
+    group_of,
+    path_for,
+    unrecorded_enclaves,
+)
 from sros_tool.names import check_enclave_name, check_namespace, expression_problem, is_expression
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, Enclave, Group, Policy, Profile, Source, with_profiles
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.placeholders import Parts, fill, has_placeholder, parts_of, placeholders_of
 from sros_tool.policy.rights import Right, Rules, parts, policy_rights, unfolded
+from sros_tool.wording import first_few
 
 if TYPE_CHECKING:
     from sros_tool.policy.minimize import MinimizedPolicy
@@ -92,6 +100,10 @@ class FleetPolicy(Mapping[str, Enclave]):
     def stated(self, path: str) -> tuple[Enclave, Robot | None]:
         """Return the enclave, with placeholders, that a path comes from, and the path's robot."""
         return self._of[path]
+
+    def without_robot(self) -> list[str]:
+        """Return the paths that the policy states without a placeholder."""
+        return [e.path for e in self._policy.enclaves if not has_placeholder(e.path)]
 
     def policy(self) -> Policy:
         """Return the policy with all enclaves expanded; raise `PolicyError` if there is none."""
@@ -201,6 +213,33 @@ class FleetPolicy(Mapping[str, Enclave]):
             if problem := _name_problem(name):
                 raise _invalid_name_error(name, problem, source)
             yield name
+
+
+def check_choice(policies: Sequence[FleetPolicy], fleet: Fleet, robots: Collection[str]) -> None:
+    """Raise `PolicyError` if the choice of ``robots`` leaves out one of them, or its enclaves.
+
+    ``policies`` are all policies of the fleet, expanded for these robots alone.
+    """
+    owners = {policy.stated(path)[1] for policy in policies for path in policy}
+    patterns = [pattern for policy in policies for pattern in policy.patterns]
+    written = [path for policy in policies for path in policy.without_robot()]
+    lost = unrecorded_enclaves(fleet.with_enclaves(patterns), written, robots)
+    for name, (below, naming) in lost.items():
+        has_enclave = fleet.robots[name] in owners
+        if left_out := below if has_enclave else (*below, *naming):
+            raise PolicyError(
+                f"the robot {name} would be chosen without {first_few(left_out, 5)}",
+                "A path without a placeholder belongs to no robot.",
+                "Write the path with {robot}, or {robot:GROUP} for the robots of a group in the "
+                "fleet file, or leave out --robot.",
+            )
+        if not has_enclave:
+            raise PolicyError(
+                f"the policies have no enclave for the robot {name}",
+                "No path with a placeholder is for all robots, or for a group of this robot.",
+                "Choose another robot, correct the robot's groups in the fleet file, or name the "
+                "policy that has its enclaves.",
+            )
 
 
 def read_policy_for(path: Path, fleet: Fleet | None) -> Policy:

@@ -185,7 +185,7 @@ def unrecorded_notes(
             text += f"this path: it is not in what `--robot {robot}` chooses, nor in a release, "
             text += "and an agent removes it. To make it an enclave of the robot: `sros "
             text += f"generate_artifacts -k {quote(str(keystore.root))} -p POLICY --fleet FILE "
-            text += f"--robot {robot}`, with a policy that has it."
+            text += f"--robot {robot}`, with a policy that has its path with {{robot}}."
             yield Note("fleet.unrecorded", text)
 
 

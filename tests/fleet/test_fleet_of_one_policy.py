@@ -20,7 +20,7 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
 from sros_tool.policy.document import read_policy
 from tests.support.children import LONG
-from tests.support.harness import copy_of, snapshot, sros, topics_of
+from tests.support.harness import copy_of, policy_text, publish, snapshot, sros, topics_of
 
 ROBOTS = sorted(f"r{number}" for number in range(1, 51 if LONG else 17))
 CARRIERS = [name for name in ROBOTS if int(name[1:]) % 2]
@@ -291,6 +291,21 @@ def test_a_new_node_comes_to_one_robot_first(made: Path, tmp_path: Path) -> None
         said = sros(*verb, cwd=folder).ok().err
         assert "note [fleet.unrecorded]: /r7/lamp: of no robot" in said, verb
         assert "robots that fetch" not in said
+
+
+def test_a_robot_is_not_chosen_without_its_enclaves(made: Path, tmp_path: Path) -> None:
+    policy = tmp_path / "policy.xml"
+    chosen = ("generate_artifacts", "-k", "ks", "-p", policy, *FLEET, "--robot", "r8", "--dry-run")
+    for paths, expected in (
+        (("/{robot}/base", "/r8/lift"), "without /r8/lift. A path without"),
+        (("/{robot:carriers}/lift", "/r8/base"), "without /r8/base. A path without"),
+        (("/desk/r8",), "without /desk/r8. A path without"),
+        (("/{robot}/base", "/desk/r8"), ""),
+        (("/{robot:carriers}/lift",), "no enclave for the robot r8"),
+    ):
+        policy.write_text(policy_text({path: publish("x") for path in paths}))
+        ended = sros(*chosen, cwd=made)
+        assert ended.status == (2 if expected else 0) and expected in ended.err, ended.err
 
 
 def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
