@@ -300,6 +300,8 @@ _MOST_DOMAINS = 16
 
 
 Result = TypeVar("Result")
+OTHER_DOMAINS = "its permissions are for no domain of the network"
+"""Why an enclave gets no configuration if the settings state the ROS domains of the network."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -851,7 +853,8 @@ class _RightsReader:
     def _domains_of_grant(self, grant: Grant) -> tuple[int, ...]:
         domains = _joined_domains(grant, self._domains)
         if not domains:
-            raise KeystoreError("its permissions are for no domain of the network")
+            elsewhere = "its permissions are for no domain of the keystore"
+            raise KeystoreError(OTHER_DOMAINS if self._network.domains else elsewhere)
         return domains
 
     def _nodes(self, name: str) -> str:

@@ -21,7 +21,7 @@ from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import key_pem, load_key
 from sros_tool.policy.document import read_policy
 from tests.checks.bench import DAY, SECRET, Bench, name_of, new_key
-from tests.support.harness import sros
+from tests.support.harness import policy_text, publish, sros
 
 Break = Callable[[Bench], object]
 CASES: dict[str, Break] = {}
@@ -663,6 +663,19 @@ def _(bench: Bench) -> None:
 def _(bench: Bench) -> None:
     with_zenoh(bench)
     bench.path("enclaves/base/permissions.p7s").unlink()
+
+
+@case("zenoh.other-domain")
+def _(bench: Bench) -> None:
+    fleet, policy = bench.root.with_name("fleet.toml"), bench.root.with_name("fleet.xml")
+    fleet.write_text("[robots]\nbase = { domain = 0 }\narm = { domain = 5 }\n")
+    policy.write_text(policy_text({"/{robot}": publish("status")}))
+    for words in (
+        ("update_keystore", bench.root, "--domain", "0,5", "--allow-looser"),
+        ("generate_artifacts", "-k", bench.root, "-p", policy, "--fleet", fleet),
+        ("zenoh", bench.root, "--domain", "5"),
+    ):
+        sros(*words, env={"SROS_CA_PASSPHRASE": SECRET}).ok()
 
 
 @case("zenoh.shared-node")

@@ -247,6 +247,23 @@ def test_an_enclave_without_a_file_is_told_and_not_up_to_date(folder: Path) -> N
     sros("zenoh", "ks", "--check", cwd=folder).ok()
 
 
+def test_enclaves_outside_the_domains_of_the_network_lack_no_file(tmp_path: Path) -> None:
+    (tmp_path / "fleet.toml").write_text("[robots]\nd1 = { domain = 0 }\nz1 = { domain = 5 }\n")
+    (tmp_path / "p.xml").write_text(policy_text({"/{robot}": publish("x")}))
+    for line in (
+        "create_keystore ks --template production --domain 0,5",
+        "generate_artifacts -k ks -p p.xml --fleet fleet.toml",
+        "zenoh ks --domain 5",
+        "zenoh ks --check",
+    ):
+        ended = sros(*line.split(), cwd=tmp_path).ok()
+    said = "no file: enclave /d1: its permissions are for no domain of the network\n"
+    assert ended.out == said
+    (tmp_path / "ks/enclaves/z1/permissions.p7s").unlink()
+    sros("zenoh", "ks", cwd=tmp_path).ok()
+    assert sros("zenoh", "ks", "--check", cwd=tmp_path).status == 1
+
+
 def test_the_router_is_moved_before_its_enclave_is_revoked(folder: Path) -> None:
     sros("zenoh", "ks", cwd=folder).ok()
     refused = sros("revoke", "ks", "/router", cwd=folder)

@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING
 
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
-from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.dds.decision.vendors import ZENOH
 from sros_tool.errors import SrosError
 from sros_tool.faults import ORIGINAL_KEYSTORE, Fault
@@ -73,6 +73,15 @@ LEFT_OUT = FindingKind(
     _SOURCE,
     "State the enclave's rights with `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`, or "
     "revoke it if nobody needs it.",
+)
+OTHER_DOMAIN = FindingKind(
+    "zenoh.other-domain",
+    NOTE,
+    "an enclave outside the ROS domains of the Zenoh network",
+    "The enclave gets no configuration, and all enclaves of the network deny it everything.",
+    _SOURCE,
+    "An enclave that runs on DDS needs none. For one that runs on Zenoh, name all domains of the "
+    "network: `sros zenoh KEYSTORE --domain IDS`.",
 )
 SHARED_NODE = FindingKind(
     "zenoh.shared-node",
@@ -153,7 +162,7 @@ def check_network(
     authorities = keystore.authorities.get(PERMISSIONS)
     if network is None or not authorities:
         return
-    from sros_tool.keystore.zenoh_files import zenoh_drift
+    from sros_tool.keystore.zenoh_files import OTHER_DOMAINS, zenoh_drift
     from sros_tool.translate_zenoh.graph import shared_nodes
 
     try:
@@ -175,12 +184,15 @@ def check_network(
             first = shared.enclaves[0]
             yield SHARED_NODE.found(first, str(shared), str(keystore.opened.folder(first)))
     for name, why in drift.left_out.items():
-        if only_enclaves is None or name in only_enclaves:
+        if only_enclaves is not None and name not in only_enclaves:
+            continue
+        folder = str(keystore.opened.folder(name))
+        if why == OTHER_DOMAINS:
+            yield OTHER_DOMAIN.found(name, why, folder)
+        else:
             faults = {e.fault for e in keystore.enclave(name).problems_in_keystore}
             remedy = _RENEW if faults and faults <= _EXPIRED else ""
-            yield LEFT_OUT.found(
-                name, why.rstrip("."), str(keystore.opened.folder(name)), remedy=remedy
-            )
+            yield LEFT_OUT.found(name, why.rstrip("."), folder, remedy=remedy)
 
 
 def _drift_findings(keystore: CheckedKeystore, drifted: Drifted) -> Iterator[Finding]:
