@@ -6,6 +6,7 @@ import hashlib
 import os
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
@@ -280,28 +281,27 @@ def test_a_bad_enclave_keeps_nothing_from_the_others(
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs files of another user")
 def test_files_of_another_user_keep_nothing_from_the_others(home: Home, robot: Path) -> None:
     """As the owner of the folder, in which root made an enclave's files its own."""
-    for path in (robot.parent, robot, *robot.rglob("*")):
-        os.chown(path, 1000, 1000)
-    (robot / A / "permissions.p7s").chmod(0o600)
-    os.chown(robot / A / "permissions.p7s", 0, 0)
-    os.chown(robot / B, 0, 0)
-    (robot / B).chmod(0o755)
-    for above in robot.parents:
-        if above.stat().st_uid == 0 and not above.stat().st_mode & 0o001:
-            above.chmod(above.stat().st_mode | 0o001)
+    with tempfile.TemporaryDirectory() as name:  # pytest's own folders are closed to others
+        robot = copy_of(robot, Path(name) / "robot")
+        for path in (robot.parent, robot, *robot.rglob("*")):
+            os.chown(path, 1000, 1000)
+        (robot / A / "permissions.p7s").chmod(0o600)
+        os.chown(robot / A / "permissions.p7s", 0, 0)
+        os.chown(robot / B, 0, 0)
+        (robot / B).chmod(0o755)
 
-    def as_owner() -> tuple[list[str], list[str]]:
-        os.setgroups([])
-        os.setresgid(1000, 1000, 0)
-        os.setresuid(1000, 1000, 0)
-        done = install(robot, home.revoked)
-        os.setresuid(0, 0, 0)
-        os.setresgid(0, 0, 0)
-        return sorted(done.kept), list(done.changed)
+        def as_owner() -> tuple[list[str], list[str]]:
+            os.setgroups([])
+            os.setresgid(1000, 1000, 0)
+            os.setresuid(1000, 1000, 0)
+            done = install(robot, home.revoked)
+            os.setresuid(0, 0, 0)
+            os.setresgid(0, 0, 0)
+            return sorted(done.kept), list(done.changed)
 
-    kept, changed = apart(as_owner)
-    assert kept == ["/r1/a", "/r1/b"]
-    assert "/r1/c" in changed and has(robot, home.revoked, ("/r1/c",))
+        kept, changed = apart(as_owner)
+        assert kept == ["/r1/a", "/r1/b"]
+        assert "/r1/c" in changed and has(robot, home.revoked, ("/r1/c",))
 
 
 def test_an_enclave_that_home_could_not_mean_keeps_its_files(home: Home, robot: Path) -> None:
