@@ -275,7 +275,7 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
         echo(f"{_state(closed, apply=apply)}; fix this first:")
         for problem in closed.problems:
             echo(f"  {problem}")
-        echo(f"next: sros close {folder}{' --apply' if apply else ''}", err=True)
+        answer = f"next: sros close {folder}{' --apply' if apply else ''}"
     elif holds:
         is_asked = all(proof.holds for proof in closed.proofs)
         exceptions = "" if is_asked else ", except for what was not checked"
@@ -283,19 +283,18 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
             exceptions += f", without a process of {', '.join(missing)}"
         following = f"; next: bring {folder}/keystore to another machine: it has the CA keys"
         following = following if robot.keystore.exists() else ""
-        following += _elsewhere(robot, closed)
-        echo(f"the robot is closed{exceptions}{_until(closed)}{following}", err=True)
+        answer = f"the robot is closed{exceptions}{_until(closed)}{following}"
     elif closed.proofs:
         accept = _ACCEPT if closed.is_proved(partial=True) else ""
         next_command = f"mend what the lines name, and ask again with sros close {folder} --proof, "
         next_command += "or go back with --undo"
-        echo(f"the robot is not proved closed; next: {accept}{next_command}", err=True)
+        answer = f"the robot is not proved closed; next: {accept}{next_command}"
     elif apply:
         for command, processes in closed.pending_by_hand.items():
             stop = _started_together(processes)
             echo(f"stop {stop}, and start it with:" if stop else "start again with:")
             echo(f"  {command}")
-        echo(f"next: these commands, and then {ask}{_elsewhere(robot, closed)}", err=True)
+        answer = f"next: these commands, and then {ask}"
     else:
         steps = f"stop the robot, start each process by the commands in {robot.commands_file}"
         if closed.secured:
@@ -311,8 +310,8 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
             following = f"{steps}, and ask {ask}"
         if not closed.secured and rmws_without_security(robot, observed):
             following = "sros doctor, to find an RMW that enforces security, and set it"
-        following += _elsewhere(robot, closed)
-        echo(f"{_state(closed, apply=apply)}{_until(closed)}; next: {following}", err=True)
+        answer = f"{_state(closed, apply=apply)}{_until(closed)}; next: {following}"
+    echo(f"{answer}{_elsewhere(robot, closed)}", err=True)
 
 
 def _show_undone(robot: LocalRobot, closed: CloseState) -> None:

@@ -1312,7 +1312,9 @@ def test_no_command_of_another_user_is_proposed(robot: Robot) -> None:
     assert "evil" not in ended.out and "restart it open: cd /opt && /opt/run talker" in ended.out
 
 
-def test_what_is_exported_without_the_enclaves_of_other_machines(tmp_path: Path) -> None:
+def test_what_is_exported_without_the_enclaves_of_other_machines(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The key of a laptop, or of a computer to which a process moved, is not on this one."""
     enclaves = "".join(
         f'<enclave path="/{name}"><profiles><profile ns="/" node="n"/></profiles></enclave>'
@@ -1338,7 +1340,11 @@ def test_what_is_exported_without_the_enclaves_of_other_machines(tmp_path: Path)
     (folder / "crl.pem").symlink_to(shared)
     state_now = state.current_state(robot, None)
     assert state_now.needed_elsewhere == {"/b": datetime.fromtimestamp(revoked, UTC)}
-    assert "restarted: /b (2027-01-15T08:00:00Z): sros distr" in close._elsewhere(robot, state_now)
+    for problems in ((), ("the policy is broken",)):
+        close._show_end(robot, state_now._replace(problems=problems), apply=False, holds=False)
+        said = capsys.readouterr()
+        assert ("fix this first" in said.out) is bool(problems)
+        assert "restarted: /b (2027-01-15T08:00:00Z): sros distr" in said.err
 
 
 def test_a_robot_whose_files_expire_soon(keystore: Path, tmp_path: Path) -> None:
