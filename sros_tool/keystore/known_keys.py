@@ -26,7 +26,7 @@ from sros_tool.keystore.layout import (
     REVOKED,
     revoked_certificates,
 )
-from sros_tool.keystore.ledger import REPORTED, RESTORED, Entry
+from sros_tool.keystore.ledger import REPORTED, RESTORED, SAME_KEY, Entry
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import (
@@ -72,17 +72,22 @@ def restored_at(keystore: OpenedKeystore) -> str:
 def _since_trusted(keystore: OpenedKeystore, entries: Sequence[Entry]) -> Sequence[Entry]:
     """Return the entries from when the key of an identity CA that is trusted was recorded.
 
-    ``entries`` are of a reading of the ledger, each of which has all CAs; all are returned if a
-    trusted CA is not recorded, or CAs are recorded without keys, as by earlier versions of sros.
+    ``entries`` are of a reading of the ledger, each of which has all CAs; all are returned if there
+    is no trusted CA, if a trusted CA was recorded only when it was renewed, because the ledger from
+    before was lost, or if CAs are recorded without keys, as by earlier versions of sros.
     """
     file = keystore.identity_file
     trusted = {_digest_of(ca) for ca in (keystore.certificates_of(file) if file else ())}
-    authorities = [place for place, entry in enumerate(entries) if entry.what == "ca"]
+    authorities = [
+        place
+        for place, entry in enumerate(entries)
+        if entry.what == "ca" and entry.reason != SAME_KEY
+    ]
     places = (
         next((place for place in authorities if entries[place].key in (key, "")), 0)
         for key in trusted
     )
-    return entries[min(places, default=len(entries)) :]
+    return entries[min(places, default=0) :]
 
 
 def revoked_issues(keystore: OpenedKeystore, listed: Collection[str] = ()) -> Iterator[Entry]:

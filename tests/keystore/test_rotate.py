@@ -537,6 +537,19 @@ def test_the_renewal_of_a_ca_brings_no_removed_enclave_of_an_earlier_ca_back(
     assert not removed()
 
 
+def test_a_ledger_that_begins_after_its_ca_has_the_certificates_from_before_its_renewal(
+    separate: Path,
+) -> None:
+    for file in ("ledger.jsonl", "ledger.p7s"):
+        (separate / file).unlink()
+    create_enclaves(separate, ["/late"], now=NOW)
+    shutil.rmtree(enclave_path(separate, "/late"))
+    renew_identity_ca(separate, now=NOW + timedelta(days=1))
+    assert [*removed_enclaves(OpenedKeystore(separate), NOW)] == ["/late"]
+    (separate / "public/identity_ca.cert.pem").unlink()
+    assert [*removed_enclaves(OpenedKeystore(separate), NOW)] == ["/late"], "nothing tells the CA"
+
+
 def test_what_the_old_ca_issued_during_a_rotation_and_was_revoked_keeps_no_export(
     separate: Path, tmp_path: Path
 ) -> None:
