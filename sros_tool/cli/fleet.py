@@ -789,8 +789,8 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     elif any(robot.state == "later" for robot in status.robots):
         yield f"the keystore may be older than its robots: if it was restored, {restored}"
     elif publication and publication.lacks:
-        publish += " --new-folder" if publication.lacks.startswith("metadata/") else ""
-        yield f"'{folder}' lacks {publication.lacks}, which robots fetch: `{publish}`"
+        decide = " says what to check first" if publication.lacks.startswith("metadata/") else ""
+        yield f"'{folder}' lacks {publication.lacks}, which robots fetch: `{publish}`{decide}"
     elif publication and publication.accepted is False and publication.expires:
         ago = elapsed(compared_fleet.at - publication.expires)
         yield f"what was published expired {ago} ago, so robots get no new files: `{publish}`"

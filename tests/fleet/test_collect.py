@@ -967,13 +967,19 @@ def test_a_publishing_folder_that_lost_its_files_is_not_in_order(home: Home) -> 
     status = ("fleet", "status", "ks")
     sros(*status, cwd=home.folder).ok()
     pub, archive = home.folder / "pub", published.robots["r2"].release.path("r2")
-    for lost, option in ((archive, ""), ("metadata/timestamp.json", " --new-folder")):
-        (pub / lost).unlink()
-        ended = sros(*status, cwd=home.folder)
-        command = f"sros fleet publish ks {pub}{option}"
-        assert f"'{pub}' lacks {lost}, which robots fetch: `{command}`" in ended.out
-        assert ended.status == 1
-        sros(*command.split()[1:], cwd=home.folder).ok()
+    publish = ("fleet", "publish", "ks", str(pub))
+    command = f"`sros {' '.join(publish)}`"
+    (pub / archive).unlink()
+    ended = sros(*status, cwd=home.folder)
+    assert f"'{pub}' lacks {archive}, which robots fetch: {command}\n" in ended.out
+    assert ended.status == 1
+    sros(*publish, cwd=home.folder).ok()
+    (pub / "metadata/timestamp.json").unlink()
+    found = sros(*status, cwd=home.folder).out
+    assert f"metadata/timestamp.json, which robots fetch: {command} says what to check" in found
+    refused = sros(*publish, cwd=home.folder)
+    assert "if the keystore was restored, first repeat its later revocations" in refused.err
+    sros(*publish, "--new-folder", cwd=home.folder).ok()
     assert "lacks" not in sros(*status, cwd=home.folder).out
     pub.rename(home.folder / "elsewhere")
     assert "lacks" not in sros(*status, cwd=home.folder).out, "it may be on another disk"
