@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from sros_tool.checks.requirements import VIOLATED
+from sros_tool.checks.requirements import VACUOUS, VIOLATED
 from sros_tool.close.nodes import ObservedNodes
 from sros_tool.close.processes import ROUTER, ClosedProcess, ObservedProcesses, run_words
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, TEMPLATE, LocalRobot
@@ -221,10 +221,12 @@ def _do(robot: LocalRobot, step: CommandStep) -> tuple[str, list[str]]:
         robot.shell.say_lines("" if step.into else f"{output}{messages}")
     elif step.signs and output:
         robot.shell.say_lines(messages)
+    needed = shlex.quote(str(robot.requirements))
+    if step.guards and VACUOUS.id in output:
+        robot.shell.say(f"`sros review` fails for a requirement that cannot fail: edit {needed}")
     if status:
         remedy = "; nothing was signed" if step.guards else ""
         if VIOLATED.id in output:
-            needed = shlex.quote(str(robot.requirements))
             remedy += f"; if you want the change, edit {needed}, or remove this file to get "
             remedy += "new requirements"
         return "findings", [f"findings of `{step.command}`{remedy}"]

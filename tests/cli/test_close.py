@@ -46,7 +46,7 @@ from sros_tool.values import as_plain
 from tests.cli.test_json import Seen
 from tests.graph.fake_graph import Beside, graph
 from tests.runtime.test_origins import made_up
-from tests.support.harness import Ended, snapshot, sros
+from tests.support.harness import Ended, policy_text, publish, snapshot, sros
 from tests.support.long_form import some, sometimes
 
 pytest_plugins = ["tests.graph.beside"]
@@ -1345,6 +1345,19 @@ def test_what_is_exported_without_the_enclaves_of_other_machines(
         said = capsys.readouterr()
         assert ("fix this first" in said.out) is bool(problems)
         assert "restarted: /b (2027-01-15T08:00:00Z): sros distr" in said.err
+
+
+def test_a_requirement_that_lost_its_right_is_told_before_a_review_fails(tmp_path: Path) -> None:
+    (tmp_path / "policy.xml").write_text(policy_text({"/a": publish("x")}))
+    said: list[str] = []
+    shell = Shell(close._run, said.append, {}, lambda: datetime.now(UTC), UTC)
+    robot = LocalRobot(tmp_path, 0, shell)
+    (guard,) = (step for step in steps(robot, None) if step.guards)
+    for name, told in (("x", False), ("gone", True)):
+        needed = f'[[only]]\npublish = ["/{name}"]\nenclaves = ["/a"]\n'
+        (tmp_path / "requirements.toml").write_text(needed)
+        preparation._do(robot, guard)
+        assert ("`sros review` fails for a requirement" in said[-1]) is told, said
 
 
 def test_a_robot_whose_files_expire_soon(keystore: Path, tmp_path: Path) -> None:
