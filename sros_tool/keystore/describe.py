@@ -648,8 +648,9 @@ def _describe_keystore(keystore: OpenedKeystore, now: datetime) -> DescribedKeys
         gaps = [str(error)]
     problems += [f"ledger: {gap}" for gap in gaps]
     strangers: list[str] = []
-    with suppress(SrosError):  # of the ledger, or of a file of CAs, as above
-        strangers += _unknown_authorities(keystore, authorities, names, now)
+    for role in authorities:
+        with suppress(SrosError):  # of the ledger, or of its file, as above
+            strangers += _unknown_authorities(keystore, role, names, now)
     return DescribedKeystore(
         path=keystore.root,
         template=settings.name if settings else None,
@@ -665,22 +666,21 @@ def _describe_keystore(keystore: OpenedKeystore, now: datetime) -> DescribedKeys
 
 
 def _unknown_authorities(
-    keystore: OpenedKeystore, roles: Iterable[str], names: Iterable[str], now: datetime
+    keystore: OpenedKeystore, role: str, names: Iterable[str], now: datetime
 ) -> Iterator[str]:
     """Yield, as text, CAs that the ledger does not record, and CAs in the file of an enclave alone.
 
     Raises:
-        SrosError: the ledger or a CA file of the keystore cannot be read.
+        SrosError: the ledger or the CA file of the keystore cannot be read.
     """
-    for role in roles:
-        for authority in unknown_authorities(keystore, role):
-            yield f"{role} CA: {authority_text(authority)} is not in the ledger"
-        known, file = {*map(digest, keystore.authority(role))}, f"{role}_ca.cert.pem"
-        for name in names:
-            data = keystore.enclave(name, now=now).files.get(file, b"")
-            if more := readable_fingerprints(data) - known:
-                text = f"{file} has a CA that the keystore lacks (SHA-256 {min(more)[:8]})"
-                yield f"{role} CA: {name}: {text}"
+    for authority in unknown_authorities(keystore, role):
+        yield f"{role} CA: {authority_text(authority)} is not in the ledger"
+    known, file = {*map(digest, keystore.authority(role))}, f"{role}_ca.cert.pem"
+    for name in names:
+        data = keystore.enclave(name, now=now).files.get(file, b"")
+        if more := readable_fingerprints(data) - known:
+            text = f"{file} has a CA that the keystore lacks (SHA-256 {min(more)[:8]})"
+            yield f"{role} CA: {name}: {text}"
 
 
 def _describe_governance(

@@ -271,6 +271,12 @@ def test_a_ca_that_was_added_is_found_and_not_exported(
     assert not (tmp_path / "robot").exists()
 
 
+def test_an_added_ca_is_shown_although_the_other_ca_is_damaged(bench: Bench) -> None:
+    also_trusted(bench, "public/permissions_ca.cert.pem")
+    bench.path("public/identity_ca.cert.pem").write_bytes(b"damaged")
+    assert "UNKNOWN permissions CA: " in sros("inspect", bench.root).out
+
+
 def test_a_ca_that_was_added_is_noted_by_changes_and_replaced(bench: Bench) -> None:
     assert sros("inspect", bench.root).ok()
     also_trusted(bench, "public/identity_ca.cert.pem")
