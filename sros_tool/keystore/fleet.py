@@ -182,10 +182,11 @@ def unrecorded_notes(
     for robot, (below, _) in found.items():
         if below:
             text = f"{first_few(below, _SHOWN)}: of no robot, because no policy for the fleet had "
-            text += f"this path: it is not in what `--robot {robot}` chooses, nor in a release, "
-            text += "and an agent removes it. To make it an enclave of the robot: `sros "
+            text += "this path with a placeholder: it is not in what "
+            text += f"`--robot {robot}` chooses, nor in a release, and an agent removes it. "
+            text += "To make it an enclave of the robot: `sros "
             text += f"generate_artifacts -k {quote(str(keystore.root))} -p POLICY --fleet FILE "
-            text += f"--robot {robot}`, with a policy that has its path with {{robot}}."
+            text += f"--robot {robot}`, with a policy that writes the path with {{robot}}."
             yield Note("fleet.unrecorded", text)
 
 

@@ -185,7 +185,8 @@ def test_a_keystore_of_version_0_1_is_one_finding_with_one_command(tmp_path: Pat
     ended = sros("check", root, *known)
     assert paragraphs(ended.out) == 1 and "[keystore.ledger-unproven]" in ended.out
     trusted = command_in(ended.out[ended.out.index("If you know") :])
-    assert "accepted without proof" in sros(*trusted, "--dry-run").ok().err
+    said = sros(*trusted, "--dry-run").ok().err
+    assert "accepted without proof: the rights of /a, /b, as the ledger" in said
     assert sros("renew", root, "/a").status == 2
     assert "accepted without proof" in sros(*trusted).ok().err
     sros("check", root, *known).ok()

@@ -105,7 +105,6 @@ from sros_tool.translate import (
 )
 from sros_tool.translate_zenoh.graph import shared_nodes
 from sros_tool.validity import iso
-from sros_tool.wording import counted
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.configuration import ZenohNetwork, check_network
 
@@ -753,8 +752,8 @@ def trust_records(root: Path, **options: Unpack[ChangeOptions]) -> KeystoreUpdat
         change.record()
         change.transaction.commit()
     text = (
-        f"accepted without proof: the rights of {counted(len(names), 'enclave')}, as the ledger "
-        "has them in lines without a chain. If somebody removed one of these lines, older "
+        f"accepted without proof: the rights of {', '.join(names)}, as the ledger has them in "
+        "lines without a chain. If somebody removed one of these lines, older "
         "permissions may be in force again: compare them with your policy (`sros diff_policy`)."
     )
     change.remarks.append(Note("keystore.taken-on-trust", text))
