@@ -558,7 +558,7 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
     from sros_tool.proof.review import AccessChange, DroppedRequirements, Facts, RightsChange
 
     match step.content:
-        case Facts() as facts if len(facts.lines) > 1 and (step.status or step.kind == "keystore"):
+        case Facts() as facts if len(facts.lines) > 1:
             return [f"'{name}' {text}" for text, name in facts.lines]
         case AccessChange(before=before, after=after, growth=growth, dropped=dropped):
             return [*added_lines(before, after, growth), *dropped_lines(after, dropped)]

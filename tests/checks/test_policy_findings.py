@@ -7,9 +7,11 @@ from pathlib import Path
 import pytest
 
 from sros_tool.checks.kind import WARNING, Finding
-from sros_tool.checks.policies import policy_file_findings
+from sros_tool.checks.policies import policy_file_findings, signed_findings
 from sros_tool.files import policies_dir
+from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet, Robot
+from sros_tool.policy.document import read_policy
 from tests.checks.policy_cases import (
     BASICS,
     CASES,
@@ -242,6 +244,10 @@ def test_a_node_in_two_enclaves(tmp_path: Path) -> None:
     text = policy(*(enclave("", f"/{{robot:g{domain}}}/n") for domain in (1, 2)))
     (tmp_path / "policy.xml").write_text(text)
     assert not [*policy_file_findings(tmp_path / "policy.xml", fleet=Fleet.of(robots))]
+    of_fleet = FleetPolicy(
+        read_policy(tmp_path / "policy.xml", placeholders=True), Fleet.of(robots)
+    )
+    assert not signed_findings([of_fleet], [*of_fleet])
 
 
 def test_a_node_with_nearly_the_name_of_its_enclave(tmp_path: Path) -> None:

@@ -93,7 +93,11 @@ def test_an_export_from_before_a_revocation(keystore: Path, tmp_path: Path) -> N
     (early / "enclaves/a/crl.pem").unlink()
     assert strangers(late, early) == [f"{accepts} {late} revokes"]
     assert strangers(late, keystore) == strangers(late, early, vendors=("zenoh",)) == []
-    (early / "enclaves/a/identity_ca.cert.pem").write_text("broken")
+    ca = early / "enclaves/a/identity_ca.cert.pem"
+    listed = (late / "enclaves/a/crl.pem").read_text()
+    ca.write_text(ca.read_text() + listed)  # as in a rotation
+    assert strangers(late, early) == []
+    ca.write_text("broken")
     assert strangers(late, early) == []
 
 

@@ -88,6 +88,9 @@ def test_a_router_without_rights_of_its_own_does_not_differ_from_the_policy(fold
     ended = sros(*compare, cwd=folder).ok()
     left_out = "left out: 1 Zenoh router that the policy lacks, with no more rights than every node"
     assert (ended.out, f"{left_out} needs: /router." in ended.err) == ("", True)
+    (folder / "known.xml").write_text(policy_text({"/a": "", "/b": "", "/router": ""}))
+    known = sros("diff_policy", "known.xml", "ks", cwd=folder)
+    assert "left out" not in known.err and "+ /router ALLOW publish topic /rosout" in known.out
     sros(
         "update_keystore",
         "ks",

@@ -124,6 +124,11 @@ def test_requirements_hold_in_the_domains_of_each_enclave(halls: Path) -> None:
     assert across in broken("p.xml", "--fleet", "f.toml")
 
 
+def test_nodes_of_different_robots_may_have_the_same_name(halls: Path) -> None:
+    words = ("check", "ks", "--policy", "p.xml", "--include", "policy.node-in-two-enclaves")
+    assert sros(*words, cwd=halls).ok().out == sros(*words, "--fleet", "f.toml", cwd=halls).out
+
+
 def test_new_reach_stays_in_a_domain(halls: Path) -> None:
     (halls / "base.xml").write_text(POLICY.replace("/hall/estop", "/hall/stop", 1))
     words = ("base.xml", "p.xml", "--fleet", "f.toml", "--json")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import gzip
+import io
 import json
 import os
 import shutil
 import subprocess
+import tarfile
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -475,9 +477,13 @@ def test_what_is_no_part_of_a_policy_and_what_is_too_large(change: Change) -> No
     )
     said = change.review("--policy", "robot.xml").ok().out
     assert "files: 'large.xml' changes and is too large to be reviewed\n" in said
-    change.commit({"large.xml": None, "hidden.xml.gz": gzip.compress(policy_text(WIDER).encode())})
+    with tarfile.open(fileobj=(tar := io.BytesIO()), mode="w") as archive:
+        archive.addfile(tarfile.TarInfo("robot.xml"))
+    packed = {"p.xml.gz": gzip.compress(policy_text(WIDER).encode()), "p.tar": tar.getvalue()}
+    change.commit({"large.xml": None, **packed})
     said = change.review("--policy", "robot.xml").ok().out
-    assert "'hidden.xml.gz' changes and is an archive, or compressed: nothing looks into" in said
+    for name in packed:
+        assert f"'{name}' changes and is an archive, or compressed: nothing looks into" in said
 
 
 def test_a_keystore_fits_on_a_disk(change: Change) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -100,8 +101,12 @@ def test_permissions_alone_are_neither_verified_nor_a_broken_policy(
     found = value(file)["findings"]
     assert [finding["id"] for finding in found] == ["rights.not-verified", "view.not-checked"]
     assert "a DDS Security document without its enclave" in found[1]["text"]
-    checked = sros("check", file)
-    assert checked.status == 2 and "Name the folder of the enclave" in checked.err
+    plain = shutil.copy(
+        next(robot_keystore.glob("enclaves/**/permissions.xml")), tmp_path / "p.xml"
+    )
+    for lone in (file, plain):
+        checked = sros("check", lone)
+        assert checked.status == 2 and "Name the folder of the enclave" in checked.err
     (tmp_path / "permissions_ca.cert.pem").write_bytes(
         (robot_keystore / "public/permissions_ca.cert.pem").read_bytes()
     )
