@@ -27,7 +27,13 @@ from sros_tool.keystore.confirmation import (
     Seen,
     parse_confirmation,
 )
-from sros_tool.keystore.fleet_status import FleetStatus, State, fleet_metrics, fleet_status
+from sros_tool.keystore.fleet_status import (
+    FleetStatus,
+    State,
+    _KeystoreRecords,
+    fleet_metrics,
+    fleet_status,
+)
 from sros_tool.keystore.layout import ENCLAVES, REFUSED
 from sros_tool.keystore.reader import OpenedKeystore, read_certificate
 from sros_tool.keystore.template import Template
@@ -374,7 +380,7 @@ def test_a_robot_that_was_revoked(field: Field) -> None:
     assert "1 enclave revoked" in field.run("fleet", "status", "ks", "--robot", "r3").out
 
 
-def test_until_when_a_revocation_is_needed(field: Field) -> None:
+def test_until_when_a_revocation_is_needed(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:
     assert field.status()["revoked_until"] is None
     field.run("renew", "ks", "/r3/base", "--revoke-old")
     certificate = read_certificate(field.root / ENCLAVES / "r3/base/cert.pem")
@@ -395,8 +401,13 @@ def test_until_when_a_revocation_is_needed(field: Field) -> None:
     field.run("create_enclave", "ks", "/short")
     certificate = read_certificate(field.root / ENCLAVES / "short/cert.pem")
     field.run("revoke", "ks", "/short")
-    until = validity_of(certificate).not_after
-    assert field.status()["revoked_until"] == iso(until), "robots wait, and trust only the new CA"
+    end = validity_of(certificate).not_after
+    assert field.status()["revoked_until"] == iso(end), "robots wait, and trust only the new CA"
+    with monkeypatch.context() as patched:
+        patched.setattr(_KeystoreRecords, "age_clause", "it was restored")
+        assert fleet_status(OpenedKeystore(field.root)).revoked_until == until
+    field.confirm("r1", restart=["/r1/base"])
+    assert field.status()["revoked_until"] == iso(until), "a process may trust the earlier CA"
     (field.root / "ledger.jsonl").unlink()
     assert field.status()["revoked_until"] is None, "nobody knows"
 
@@ -935,6 +946,25 @@ def test_a_robot_whose_certificates_have_all_expired_cannot_fetch(field: Field) 
         assert (found.state, found.to_do) == ("expired", to_do)
 
 
+def test_a_robot_fetches_with_any_of_its_certificates(field: Field) -> None:
+    """Also with one of an enclave that it should not have; one that nobody issued may be valid."""
+    path, surplus = f"{ENCLAVES}/r1/base/cert.pem", f"{ENCLAVES}/r1/old/cert.pem"
+    last = validity_of(read_certificate(field.root / path)).not_after
+    earlier = field.report("r1")["certificates"][path]
+    field.run("update_keystore", "ks", "--set", "certificates.validity=90d")
+    field.run("renew", "ks", "/r1/base")
+    field.deliver("r1")
+    said = field.report("r1")
+    for other, locked_out_from in ((earlier, last), ([64 * "0"], None)):
+        field.send(
+            "r1",
+            files={**said["files"], surplus: 64 * "1"},
+            certificates={**said["certificates"], surplus: other},
+        )
+        (robot,) = fleet_status(OpenedKeystore(field.root), ["r1"]).robots
+        assert robot.locked_out_from == locked_out_from
+
+
 def samples(text: str, metric: str, *labels: str) -> list[tuple[tuple[str, ...], float]]:
     """Return the values of a metric, with some of their labels."""
     return [
@@ -1262,6 +1292,10 @@ def test_the_module_on_the_robot_confirms_the_same(field: Field) -> None:
         words = ("fleet", "report", "r1", "--robot", "r1", "--restarted")
         said = json.loads(field.run(*words).out)
         assert (said["restart"], said["crl_restart"]) == ([], []), "also those that an agent noted"
+    write_state(robot, AgentState(due=("/r1/base",), boot=boot_id()))
+    now = {"/r1/base": RunningFiles.CURRENT}
+    said = field.report("r1", complete=True, states=now, list_states=now)
+    assert (said["restart"], said.get("crl_restart")) == (["/r1/base"], None), "files may differ"
 
 
 OLD = {**LIBRARY, "product": "Fast DDS", "version": "2.14.5", "path": "/a/libfastrtps.so.2.14.5"}

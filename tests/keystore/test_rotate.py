@@ -517,6 +517,8 @@ def test_a_revoked_certificate_of_a_ca_that_is_gone_is_not_of_a_trusted_one(
     assert (certificate.what, certificate.enclave) == ("certificate", "/b")
     rotate_ca(separate, finish=True, now=NOW)
     assert not [e for e in revoked_issues(OpenedKeystore(separate)) if e.serial]
+    shutil.rmtree(separate / "revoked")
+    assert not [e for e in revoked_issues(OpenedKeystore(separate)) if e.serial]
     revoke(separate, ["/a"], now=NOW)
     assert {e.enclave for e in revoked_issues(OpenedKeystore(separate)) if e.serial} == {"/a"}
 

@@ -164,3 +164,11 @@ def signed_again(changed: Node, key: PrivateKey) -> bytes:
     signature = key.sign(changed.children[0].write(), ec.ECDSA(hashes.SHA256()))
     changed.children[2].content = b"\0" + signature
     return changed.write()
+
+
+def test_a_list_that_expired_before_it_begins_expires_soon_from_its_end() -> None:
+    key = ec.generate_private_key(ec.SECP256R1())
+    ca = issue_ca(key, common_name("CA"), Window(NOW, NOW + DAY))
+    made = sign_crl(ca, key, (), number=1, this_update=NOW, next_update=NOW + DAY)
+    crl = load_crl(made, "list")._replace(next_update=NOW - 90 * DAY)
+    assert crl.expires_soon_from() == crl.next_update
