@@ -49,12 +49,13 @@ from sros_tool.names import (
     ACTION_PARTS,
     action_part,
     check_enclave_name,
+    is_expression,
     nodes_served,
     right_to_use,
 )
 from sros_tool.pki.certificates import IDENTITY_DIGITS
 from sros_tool.policy.model import ALLOW, OTHER_SIDE, Enclave, Policy, policy_in_namespace
-from sros_tool.policy.patterns import covers
+from sros_tool.policy.patterns import Names, covers
 from sros_tool.policy.rights import Right
 from sros_tool.runtime.log_texts import NO_ENCLAVE, RUNS_OPEN, UNKNOWN, LogText
 from sros_tool.runtime.vendor_log import (
@@ -172,16 +173,13 @@ class SearchedKeystore:
         None if that is not known, as in an export or with unreadable permissions, or if an enclave
         has it only by a wildcard.
         """
-        source = self._rights
-        names = {
-            peer.name
-            for peer in (source.rights if source else ())
-            if peer.right == OTHER_SIDE.get(right.right)
-            and peer.qualifier is ALLOW
-            and covers(peer.name, right.name)
-        }
-        is_whole = source is not None and source.sound and source.scope is None
-        return right.name in names or (False if is_whole and not names else None)
+        exact, expressions = self._allowed_names[OTHER_SIDE[right.right]]
+        if right.name in exact:
+            return True
+        with suppress(SrosError):  # too many wildcards to compare
+            if self._is_whole and not expressions.cover(right.name):
+                return False
+        return None
 
     @cached_property
     def zenoh_routers(self) -> frozenset[str]:
@@ -214,6 +212,23 @@ class SearchedKeystore:
         with suppress(SrosError):  # its documents do not tell
             return load_rights(self._keystore)
         return None
+
+    @property
+    def _is_whole(self) -> bool:
+        """Whether these are all enclaves of the keystore, with all of their rights."""
+        return self._rights is not None and self._rights.sound and self._rights.scope is None
+
+    @cached_property
+    def _allowed_names(self) -> Mapping[str, tuple[frozenset[str], Names]]:
+        """Map each right to the names that enclaves have, and to those with wildcards."""
+        names: dict[str, set[str]] = {right: set() for right in OTHER_SIDE}
+        for right in self._rights.rights if self._rights else ():
+            if right.qualifier is ALLOW and right.right in names:
+                names[right.right].add(right.name)
+        return {
+            right: (frozenset(stated), Names(filter(is_expression, stated)))
+            for right, stated in names.items()
+        }
 
     @cached_property
     def _by_node(self) -> Mapping[str, tuple[str, ...]]:
