@@ -90,7 +90,7 @@ def renew(
     """Issue new certificates for ENCLAVE..., and sign their permissions again.
 
     The rights stay the same.  Running processes keep the files they have loaded: restart them
-    before those files expire.
+    before those files expire, or all together if some have expired.
 
     Anyone who has a copy of a replaced certificate and its permissions can use them until they
     expire.  With --revoke-old, processes that load the new crl.pem refuse them: restart the
@@ -159,7 +159,8 @@ def _replaced_lines(result: Changed, *, has_new_keys: bool) -> Iterator[str]:
         deliver = f"publish ({published}) or export again" if published else "export again"
         yield (
             "exports and running processes still have the earlier certificates and "
-            f"permissions: {deliver}, and restart the processes, before these expire"
+            f"permissions: {deliver}, and restart the processes, before these expire, or all "
+            "together if some have expired"
         )
     if has_new_keys and result.outcomes and publish_command(result.root):
         yield (
@@ -574,6 +575,7 @@ def rotate_ca(
 def _print_step(
     step: RotationStep, status: RotationStatus, *, together: bool, same_key: bool
 ) -> None:
+    from sros_tool.keystore.expiry import ONE_BY_ONE
     from sros_tool.keystore.fleet import deliver_first
 
     if not step.changes:
@@ -587,8 +589,7 @@ def _print_step(
     if same_key:
         echo("renewed the identity CA with the same key; certificates that it issued stay valid")
         echo(
-            "Restart the processes at any time; processes before and after the restart "
-            "communicate. Certificates keep their expiry: `sros renew "
+            f"All vendors: {ONE_BY_ONE} Certificates keep their expiry: `sros renew "
             f"{step.root} --all-expiring 30d` renews those that expire soon.",
             err=True,
         )
@@ -597,12 +598,8 @@ def _print_step(
     done = f"{_DONE['reissue']}, and " if together and reissued else ""
     echo(f"{done}{_DONE[step.stage]}: {', '.join(step.files)}")
     if step.stage == "retire":
-        how = (
-            "together"
-            if together
-            else "at any time; processes before and after the restart communicate"
-        )
-        echo(f"Restart all processes {how}. {deliver_first(step.root)}", err=True)
+        how = "Restart all processes together." if together else f"All vendors: {ONE_BY_ONE}"
+        echo(f"{how} {deliver_first(step.root)}", err=True)
     for remark in status.remarks:
         echo(remark, err=True)
 

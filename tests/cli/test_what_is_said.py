@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.keystore.expiry import IF_EXPIRED
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.certificates import validity_of
@@ -102,6 +103,13 @@ def test_a_request_that_is_answered_with_less(root: Path) -> None:
         in line
     )
     sros(*commands(line)[0], cwd=work).ok()
+
+
+def test_processes_whose_files_have_expired_are_restarted_together(root: Path) -> None:
+    renewed = sros("renew", root, "--all").ok()
+    assert "before these expire, or all together if some have expired" in renewed.err
+    for stage in ("--same-key", "--next", "--next", "--next"):
+        assert IF_EXPIRED in sros("rotate_ca", root, stage).ok().err
 
 
 def test_gaining_a_right_leaves_nothing_behind(root: Path) -> None:

@@ -20,11 +20,18 @@ from sros_tool.checks.kind import NOTE
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.files import policies_dir, templates_dir
+from sros_tool.keystore.comparison import Mismatch
 from sros_tool.keystore.describe import history
+from sros_tool.keystore.expiry import IF_EXPIRED
 from sros_tool.keystore.issuing.authority import load_authorities
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import enclave_path, list_enclaves
-from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
+from sros_tool.keystore.lifecycle.create import (
+    create_enclaves,
+    create_keystore,
+    generate_artifacts,
+    restart_note,
+)
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.lifecycle.update import (
@@ -357,6 +364,8 @@ def test_the_stages(root: Path) -> None:
     assert OpenedKeystore(root).governance == governance
     assert OpenedKeystore(root).template.name == "development"
     assert "one by one" in first.remarks[0].text
+    assert IF_EXPIRED in first.remarks[0].text
+    assert IF_EXPIRED in restart_note(Mismatch(names=("topic /scan",))).text
     assert found(root) == set()
     # What is created between the stages follows the new settings already.
     create_enclaves(root, ["/late"], now=LATER)

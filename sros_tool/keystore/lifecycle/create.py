@@ -28,6 +28,7 @@ from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.comparison import Mismatch, compare_governance, mismatch
 from sros_tool.keystore.delivery.published import may_have_later_releases
+from sros_tool.keystore.expiry import IF_EXPIRED, ONE_BY_ONE
 from sros_tool.keystore.fleet import (
     EnclaveDomains,
     enclaves_of_robot,
@@ -699,18 +700,15 @@ def _restart_text(mismatch: Mismatch, *, revoked: bool) -> str:
             "certificates of other processes. Until then, running processes communicate as before."
         )
     if mismatch:
-        which, effect = "all processes", "do not communicate"
+        which, effect, more = "all processes", "do not communicate", ""
         if not mismatch.everything:
-            which = "the processes that use these names"
+            which, more = "the processes that use these names", f" {IF_EXPIRED}"
             effect += f" on {', '.join(mismatch.names)}, but do on everything else"
         return (
             f"Cyclone DDS and Fast DDS: restart {which} together; processes before and after the "
-            f"restart {effect}. Until then, running processes communicate as before."
+            f"restart {effect}. Until then, running processes communicate as before.{more}"
         )
-    return (
-        "All vendors: restart the processes one by one, at any time; processes before and after "
-        "the restart communicate. Until its restart, a process keeps its former files."
-    )
+    return f"All vendors: {ONE_BY_ONE} Until its restart, a process keeps its former files."
 
 
 def exports_note(keystore: OpenedKeystore, names: Sequence[str]) -> Note:

@@ -19,6 +19,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.keystore.expiry import ONE_BY_ONE
 from sros_tool.keystore.fleet import deliver_first
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -275,25 +276,20 @@ def _restart_remarks(keystore: OpenedKeystore, rotation: Rotation) -> list[str]:
     files = [replacement.file for replacement in rotation.replacements]
     if rotation.stage is RotationStage.DISTRIBUTE:
         return [
-            "All vendors: restart the processes one by one, at any time; processes before and "
-            "after the restart communicate. Continue when all have been restarted.",
+            f"All vendors: {ONE_BY_ONE} Continue when all have been restarted.",
             deliver_first(keystore.root),
         ]
     hindrance = _fast_dds_hindrance(keystore, files)
     remarks = [
         f"Fast DDS: {hindrance} Restart all processes together."
         if hindrance
-        else "Fast DDS: restart the processes one by one, at any time; processes before and after "
-        "the restart communicate. Continue when all have been restarted.",
+        else f"Fast DDS: {ONE_BY_ONE} Continue when all have been restarted.",
         "Cyclone DDS: it trusts one CA at a time, so restart all processes together; processes "
         "before and after the restart do not communicate.",
     ]
     with suppress(SrosError):  # `check` finds settings that cannot be read
         if keystore.template.zenoh:
-            remarks.append(
-                "Zenoh: restart the processes one by one, at any time; processes before and after "
-                "the restart communicate. Continue when all have been restarted."
-            )
+            remarks.append(f"Zenoh: {ONE_BY_ONE} Continue when all have been restarted.")
     if any(file != "permissions_ca" for file in files):
         remarks.append(
             "Revocations at this stage are signed by both CAs, if the key of the old CA is "
