@@ -84,7 +84,7 @@ def distribute_key(
     Example:
       $ sros distribute_key keystore /talker talker.tar.gz
       exported enclave /talker to 'talker.tar.gz'
-      $ tar --no-overwrite-dir -xzf talker.tar.gz -C /etc/robot    # on the robot
+      $ tar -xzf talker.tar.gz -C /etc/robot enclaves/talker    # on the robot
       $ sros distribute_key keystore --match '/arm/*' - | \
             ssh robot tar -xz -C robot
       exported enclave /arm/gripper to standard output

@@ -111,6 +111,20 @@ def test_a_host_by_patterns(keystore: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "3").exists()
 
 
+def test_unpacking_one_enclave_leaves_the_folders_of_others(keystore: Path, tmp_path: Path) -> None:
+    sros("distribute_key", keystore, "--all", tmp_path / "robot").ok()
+    before = (tmp_path / "robot/enclaves").stat()
+    sros("distribute_key", keystore, "/a", tmp_path / "talker.tar.gz").ok()
+    (command,) = re.findall(
+        r"\$ (tar .*talker\.tar\.gz.*)  #", sros("distribute_key", "--help").out
+    )
+    command = command.replace("enclaves/talker", "enclaves/a").replace("/etc/robot", "robot")
+    assert shell(command, tmp_path).returncode == 0
+    after = (tmp_path / "robot/enclaves").stat()
+    assert (after.st_ctime_ns, after.st_mtime_ns) == (before.st_ctime_ns, before.st_mtime_ns)
+    assert (tmp_path / "robot/enclaves/a").stat().st_mtime == 0  # it was unpacked
+
+
 def test_through_a_pipe_with_the_modes_of_keys(keystore: Path, tmp_path: Path) -> None:
     (tmp_path / "robot").mkdir()
     ended = shell("sros distribute_key ks --all - | tar -xz -C robot", tmp_path)
