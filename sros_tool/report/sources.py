@@ -685,13 +685,14 @@ def _without_paths(finding: PicturedFinding, places: Mapping[str, str]) -> Pictu
 
 
 def _file_names(path: Path) -> Mapping[str, str]:
-    """Map the paths of a source and its folder, as given, absolute and resolved, to their names.
+    """Map the paths of a source, as given, absolute and resolved, to its file name.
 
-    Longer paths come first, so that they are replaced before paths that they contain.
+    Its folder in quotes is mapped, too: without quotes, the same text may begin a ROS name.  Longer
+    paths come first, so that they are replaced before paths that they contain.
     """
     places = {
-        place: _base_name(shown)
-        for shown in (path.parent, path)
+        f"{quotes}{place}{quotes}": f"{quotes}{_base_name(shown)}{quotes}"
+        for shown, quotes in ((path, ""), (path.parent, "'"))
         for place in (str(shown), str(shown.absolute()), os.path.realpath(shown))
         if "/" in place and place != "/"
     }

@@ -91,6 +91,13 @@ def test_a_folder_of_policies_has_the_findings_of_its_files(tmp_path: Path) -> N
     assert alone and value(policies)["findings"] == alone
 
 
+def test_a_name_that_begins_like_the_folder_of_the_policy_stays(tmp_path: Path) -> None:
+    (policy := tmp_path / "left/arm/p.xml").parent.mkdir(parents=True)
+    policy.write_text(policy_text({"/n": ""}).replace('ns="/"', 'ns="/left/arm"'))
+    shown = sros("view", "left/arm/p.xml", "--format", "json", cwd=tmp_path).ok().out
+    assert "p.xml:1: node /left/arm/n may not publish /rosout" in shown, shown
+
+
 def test_permissions_alone_are_neither_verified_nor_a_broken_policy(
     robot_keystore: Path, tmp_path: Path
 ) -> None:
