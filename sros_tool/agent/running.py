@@ -16,6 +16,7 @@ from sros_tool.agent.settings import AgentSettings
 from sros_tool.checks.kind import WARNING
 from sros_tool.checks.processes import (
     PROCESS_OUTDATED,
+    PROCESS_WITHOUT_FILES,
     may_lack_list,
     newer_files,
     other_folder_findings,
@@ -28,6 +29,7 @@ from sros_tool.keystore.confirmation import (
     RobotLibrary,
     RunningFiles,
     Seen,
+    is_enclave_name,
 )
 from sros_tool.keystore.layout import KEY_FILE
 from sros_tool.runtime.processes import (
@@ -64,8 +66,8 @@ class EnclaveProcesses(NamedTuple):
     """Like `states`, but only for the revocation list and the CAs: ``current`` also if only the
     enclave's own certificate, permissions or governance are newer than a process."""
     elsewhere: tuple[str, ...]
-    """The enclaves of the folder in which a process runs from another folder: a restart of a unit
-    does not help there.
+    """The enclaves of the folder in which a process runs from another folder, or runs although the
+    enclave was removed: a restart of a unit does not help there.
     """
     complete: bool
     """Whether every process of the machine could be looked at."""
@@ -139,6 +141,14 @@ def look_at_processes(
         and finding.kind is not PROCESS_OUTDATED
         and finding.subject != "processes"
     )
+    without_files = {
+        finding.subject for finding in findings if finding.kind is PROCESS_WITHOUT_FILES
+    }
+    removed = [
+        process
+        for process in readers
+        if process.label in without_files and is_enclave_name(_enclave_of(process))
+    ]
     complete = not (running.unseen or running.hidden or running.container) and all(
         process.enclave and not process.enclave.problem
         for process in (*own_processes, *other_processes)
@@ -148,7 +158,7 @@ def look_at_processes(
         states,
         _states(names, readers, is_outdated, readers),
         list_states,
-        tuple(sorted({*map(_enclave_of, elsewhere)})),
+        tuple(sorted({*map(_enclave_of, (*elsewhere, *removed))})),
         complete,
         problems,
         _robot_dds(running),

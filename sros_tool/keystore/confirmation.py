@@ -246,6 +246,14 @@ def is_unusable(problem: str) -> bool:
     return f" {COULD_NOT_START}: " in problem
 
 
+def is_enclave_name(name: str) -> bool:
+    """Return whether ``name`` is that of an enclave, other than /."""
+    try:
+        return check_enclave_name(name) != "/"
+    except InvalidNameError:
+        return False
+
+
 def enclave_of(path: str) -> str:
     """Return the name of the enclave that the file at ``path`` of a keystore belongs to."""
     return path.rpartition("/")[0].removeprefix(ENCLAVES) or "/"
@@ -282,7 +290,7 @@ def make_confirmation(
     names = search_enclaves(root)[0] if unreadable else list_enclaves(root)
     with Folder(root) as folder:
         for name in names:
-            if name != "/" and not _is_enclave_name(name):
+            if name != "/" and not is_enclave_name(name):
                 continue
             try:
                 contents = _confirmed_files(root, folder, name)
@@ -904,14 +912,7 @@ def _entries(value: Mapping[str, Any], key: str, label: str) -> Iterator[tuple[s
 
 def _is_enclave_folder(folder: str) -> bool:
     top, slash, name = folder.partition("/")
-    return top == ENCLAVES and (not slash or _is_enclave_name(f"/{name}"))
-
-
-def _is_enclave_name(name: str) -> bool:
-    try:
-        return check_enclave_name(name) != "/"
-    except InvalidNameError:
-        return False
+    return top == ENCLAVES and (not slash or is_enclave_name(f"/{name}"))
 
 
 def _is_digest(value: object) -> bool:

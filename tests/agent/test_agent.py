@@ -143,7 +143,8 @@ class Robot:
             "ROS_SECURITY_KEYSTORE": str(self.folder),
             "ROS_SECURITY_STRATEGY": "Enforce",
         }
-        enclave = ProcessEnclave(str(self.folder), name, files, is_there=True, here=self.folder)
+        here, is_there = self.folder, place.is_dir()
+        enclave = ProcessEnclave(str(here), name, files, is_there=is_there, here=here)
         started, user = self.started[name], self.user
         return Process(1, ("node",), environment, started, user=user, enclave=enclave)
 
@@ -583,6 +584,18 @@ def test_a_list_that_was_signed_again_is_lacked_by_no_process(
     r1.release = release_of(files_of(root), 5, home.authority)
     r1.round(datetime.now(UTC))
     assert r1.message().crl_restart is None
+
+
+@pytest.mark.parametrize("user", [0, 1])
+def test_a_process_of_an_enclave_that_was_removed_has_no_new_list(r1: Robot, user: int) -> None:
+    """It accepts whom its files let in; another user can only claim to run there."""
+    r1.round()
+    r1.release, r1.restarted, r1.user = None, True, user
+    r1.started = {"/r1/c": moment() + timedelta(seconds=1)}
+    shutil.rmtree(r1.folder / "enclaves/r1/c")
+    done, said = r1.round(), r1.message()
+    assert not done.restart and any("/r1/c in " in problem for problem in done.problems)
+    assert said.restart == (("/r1/c",) if user == 0 else ()) and said.crl_restart is None
 
 
 def test_a_look_at_the_processes_has_its_own_time(r1: Robot) -> None:
