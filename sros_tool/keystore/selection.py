@@ -242,15 +242,23 @@ def missing_enclave_error(
             f"It is the namespace of {counted(len(below), 'enclave')}, such as {below[0]}.",
             f"Name one of them; a verb that takes several also has --match '{name}/*'.",
         )
-    if of_node := _enclaves_of_node(keystore, name, names):
+    uses = _uses(keystore, name, names)
+    if of_node := uses.pop("node"):
         return KeystoreError(
             missing,
             f"{name} is a node of {first_few(of_node, _SHOWN)}.",
             f"Name the enclave: {of_node[0]}.",
         )
-    meant = likely_names(name, existing_enclaves)
-    if meant:
-        return KeystoreError(missing, "", f"Perhaps you mean {' or '.join(meant)}.")
+    kind = next(iter(uses), "")
+    why = (
+        f"{name} is a {kind} in the permissions of {first_few(uses[kind], _SHOWN)}." if kind else ""
+    )
+    if meant := likely_names(name, existing_enclaves):
+        return KeystoreError(missing, why, f"Perhaps you mean {' or '.join(meant)}.")
+    if kind:
+        verb = "publish" if kind == "topic" else "call"
+        who = f"`sros explain {quote(str(root))} --who {verb} {quote(name)}`"
+        return KeystoreError(missing, why, f"Name an enclave. {who} says who may {verb} {name}.")
     try:
         check_enclave_name(name)
     except InvalidNameError as error:
@@ -274,15 +282,28 @@ def missing_enclave_error(
     return KeystoreError(missing, why, f"If it is not a typo, create it with {create}.")
 
 
-def _enclaves_of_node(keystore: OpenedKeystore, node: str, names: Sequence[str]) -> list[str]:
-    """Return the enclaves whose permissions let a node of this full name serve its parameters."""
-    topic = os.fsencode(f">rr{node}/get_parametersReply<")  # a name that is not UTF-8, too
-    enclaves = []
-    for name in names:
+_DDS_TOPICS = {
+    "node": ">rr{}/get_parametersReply<",
+    "topic": ">rt{}<",
+    "service": ">rq{}Request<",
+    "action": ">rq{}/_action/send_goalRequest<",
+}
+"""For each kind of ROS name, the DDS topic in the permissions of enclaves that use the name."""
+
+
+def _uses(keystore: OpenedKeystore, name: str, names: Sequence[str]) -> dict[str, list[str]]:
+    """Map each kind that ``name`` has in permissions to the enclaves that have it; always "node".
+
+    A node is of the enclaves that may serve its parameters.
+    """
+    uses: dict[str, list[str]] = {"node": []}
+    for enclave in names:
         with suppress(SrosError, OSError):
-            if topic in keystore.read(keystore.folder(name) / PERMISSIONS_FILE, "permissions"):
-                enclaves.append(name)
-    return enclaves
+            document = keystore.read(keystore.folder(enclave) / PERMISSIONS_FILE, "permissions")
+            for kind, topic in _DDS_TOPICS.items():
+                if os.fsencode(topic.format(name)) in document:  # a name that is not UTF-8, too
+                    uses.setdefault(kind, []).append(enclave)
+    return uses
 
 
 def revocation_of(keystore: OpenedKeystore, name: str) -> Entry | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from sros_tool.keystore.layout import list_enclaves
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.selection import likely_names, missing_enclave_error
 from sros_tool.pki.certificates import load_certificate
-from tests.support.harness import sros
+from tests.support.harness import policy_text, publish, sros
 
 THERE = ("/mobile_robot/base", "/mobile_robot/teleop", "/mobile_robot/velocity_mux", "/arm/base")
 
@@ -59,6 +60,26 @@ def test_a_namespace_is_not_taken_for_an_enclave_that_is_missing() -> None:
         "enclave /r1 does not exist in keystore 'robot'. It is the namespace of 2 enclaves, such "
         "as /r1/arm. Name one of them; a verb that takes several also has --match '/r1/*'."
     )
+
+
+def test_a_topic_service_or_action_is_not_taken_for_an_enclave(tmp_path: Path) -> None:
+    groups = (
+        '<services request="ALLOW"><service>/add</service></services>'
+        '<actions execute="ALLOW"><action>/dock</action></actions>'
+    )
+    (tmp_path / "p.xml").write_text(policy_text({"/arm": publish("/cmd_vel") + groups}))
+    sros("generate_artifacts", "-k", "ks", "-p", "p.xml", cwd=tmp_path).ok()
+    for name, kind, verb in (
+        ("/cmd_vel", "topic", "publish"),
+        ("/add", "service", "call"),
+        ("/dock", "action", "call"),
+    ):
+        err = sros("explain", "ks", "--reach", name, cwd=tmp_path).err
+        assert f"{name} is a {kind} in the permissions of /arm. Name an enclave. " in err
+        assert "create_enclave" not in err
+        (command,) = re.findall(r"`sros (.*)`", err)
+        assert command == f"explain ks --who {verb} {name}"
+        assert sros(*command.split(), cwd=tmp_path).status < 2
 
 
 def test_an_export_gets_it_from_its_keystore(tmp_path: Path) -> None:
