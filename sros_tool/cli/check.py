@@ -45,7 +45,6 @@ from sros_tool.cli.common import (
     moment_of,
     now,
     output_option,
-    policy_for,
     print_json,
     print_notes,
     progress,
@@ -1002,11 +1001,9 @@ def metrics(
     """
     from sros_tool.checks.formats import keystore_metrics
     from sros_tool.checks.keystores.keystore import keystore_findings
-    from sros_tool.checks.keystores.opened import Circumstances
     from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.prometheus import KeystoreMetrics, render_metrics
 
-    moment = now()
     if output:
         check_metrics_file(output)
         check_output(output, force=True)
@@ -1015,11 +1012,11 @@ def metrics(
     if advisories and not runtime:
         raise UsageError("--advisories is for the DDS of processes: add --runtime")
     known = advisories_of(advisories)
-    wanted = tuple(policy_for(policy, fleet_file) for policy in policies)
+    circumstances = _circumstances(None, None, policies, fleet_file, (root,))
     with progress("examining"):
         keystore = OpenedKeystore(root)
-        circumstances = Circumstances(moment, local_zone(os.environ), policies=wanted)
         findings = keystore_findings(keystore, circumstances)
+        moment = circumstances.now
         gauges = keystore_metrics(keystore, findings, now=moment, each_enclave=not earliest)
         gauges += _process_metrics(moment, known) if runtime else ()
     text = render_metrics(gauges)

@@ -127,6 +127,9 @@ def test_requirements_hold_in_the_domains_of_each_enclave(halls: Path) -> None:
 def test_nodes_of_different_robots_may_have_the_same_name(halls: Path) -> None:
     words = ("check", "ks", "--policy", "p.xml", "--include", "policy.node-in-two-enclaves")
     assert sros(*words, cwd=halls).ok().out == sros(*words, "--fleet", "f.toml", cwd=halls).out
+    for fleet in ((), ("--fleet", "f.toml")):
+        counted = sros("metrics", "ks", "--policy", "p.xml", *fleet, cwd=halls).ok().out
+        assert "sros_findings_of_kind" in counted and "node-in-two-enclaves" not in counted
 
 
 def test_new_reach_stays_in_a_domain(halls: Path) -> None:
