@@ -53,7 +53,6 @@ if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.change import ChangeOptions
     from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.parallel import Tally
-    from sros_tool.policy.model import Policy
 
 # ── arguments ───────────────────────────────────────────────────────────────────────────
 
@@ -272,14 +271,6 @@ def fleet_policies(
     if robots:
         check_choice(policies, fleet, robots)
     return policies
-
-
-def policy_for(file: Path, fleet_file: Path | None) -> Policy:
-    """Return the policy in a file, expanded for the fleet in the --fleet file if there is one."""
-    from sros_tool.fleet.expansion import read_policy_for
-    from sros_tool.fleet.fleet_file import read_fleet
-
-    return read_policy_for(file, read_fleet(fleet_file) if fleet_file else None)
 
 
 def enclave_filter_options(when: str = "Only") -> Callable[[Decorated], Decorated]:
