@@ -189,7 +189,7 @@ def view(
         sources, "Check it out: `git worktree add old REVISION`, and name old/PATH."
     )
     moment = now()
-    written = _format("json" if as_json else form, output, graphviz)
+    written = _format("json" if as_json and not dry_run else form, output, graphviz)
     if written == "markdown" and (len(sources) > 1 or observed or hops):
         raise UsageError(
             "a table takes one source, and neither --observed nor --hops",
@@ -260,7 +260,14 @@ def _on_terminal() -> bool:
 
 def _format(form: str | None, output: Path | None, graphviz: bool) -> str:
     ending = output.suffix.lower() if output else ""
-    chosen = form or _ENDINGS.get(ending, ending.removeprefix("."))
+    of_ending = _ENDINGS.get(ending, ending.removeprefix("."))
+    chosen = form or of_ending
+    if output and of_ending in _FORMATS and chosen != of_ending:
+        raise UsageError(
+            f"'{output}' would be {chosen}, and its name says {of_ending}",
+            "",
+            f"Name it '{output.with_suffix(f'.{chosen}')}', or leave the format out.",
+        )
     if chosen not in _FORMATS and ending:
         raise UsageError(
             f"view writes no {ending} files",

@@ -186,6 +186,16 @@ def test_the_ending_of_the_file_says_the_format(tmp_path: Path) -> None:
         assert (tmp_path / name).read_text().startswith(begins), name
 
 
+def test_a_name_of_another_format_is_refused(tmp_path: Path) -> None:
+    policy = write(tmp_path, "robot.xml", "/x")
+    for form in (("--json",), ("--format", "html")):
+        ended = sros("view", policy, *form, "-o", tmp_path / "a.svg")
+        named = tmp_path / f"a.{form[-1].removeprefix('--')}"
+        assert (ended.status, f"Name it '{named}'" in ended.err) == (2, True)
+        sros("view", policy, *form, "-o", named).ok()
+    sros("view", policy, "--json", "-o", tmp_path / "a.picture").ok()
+
+
 def test_nothing_is_replaced_unasked_and_a_dry_run_writes_nothing(tmp_path: Path) -> None:
     policy, page = write(tmp_path, "robot.xml", "/x"), tmp_path / "page.html"
     assert "would write" in sros("view", policy, "-o", page, "--dry-run").ok().out
