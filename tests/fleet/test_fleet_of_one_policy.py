@@ -188,14 +188,16 @@ def test_a_policy_with_placeholders_needs_a_fleet(made: Path) -> None:
     assert ended.status == 2
     assert "robot.xml:2: '/{robot}/base' has a placeholder" in ended.err
     assert "--fleet FILE" in ended.err
-    for line, said in (
-        ("create_permission ks --robot r7 robot.xml --dry-run", "nothing would change"),
-        ("metrics ks --policy robot.xml --earliest", "sros_findings"),
-    ):
-        assert "has a placeholder" in sros(*line.split(), cwd=made).err
-        done = sros(*line.split(), "--fleet", "fleet.toml", cwd=made).ok()
-        assert said in done.out
-        assert "has a placeholder" not in done.err
+    words, of_fleet = (
+        "create_permission ks --robot r7 robot.xml --dry-run",
+        ("--fleet", "fleet.toml"),
+    )
+    assert "has a placeholder" in sros(*words.split(), cwd=made).err
+    done = sros(*words.split(), *of_fleet, cwd=made).ok()
+    assert "nothing would change" in done.out and "has a placeholder" not in done.err
+    for fleet in ((), of_fleet):  # without the option, it is that of the keystore
+        done = sros("metrics", "ks", "--policy", "robot.xml", "--earliest", *fleet, cwd=made).ok()
+        assert "sros_findings" in done.out and not done.err
 
 
 def test_a_policy_with_placeholders_explains_the_enclaves_of_its_keystore(made: Path) -> None:
