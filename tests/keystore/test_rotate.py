@@ -22,7 +22,12 @@ from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.delivery.release import retired_authorities
 from sros_tool.keystore.issuing import keyring
 from sros_tool.keystore.issuing.keyring import Keyring
-from sros_tool.keystore.known_keys import removed_enclaves, revoked_issues, unlisted_revocations
+from sros_tool.keystore.known_keys import (
+    _since_trusted,
+    removed_enclaves,
+    revoked_issues,
+    unlisted_revocations,
+)
 from sros_tool.keystore.layout import FLEET_ROOT, ROTATION, enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
@@ -535,6 +540,10 @@ def test_the_renewal_of_a_ca_brings_no_removed_enclave_of_an_earlier_ca_back(
     assert removed() == ["/b"], "its certificate is of this key"
     rotate_ca(separate, finish=True, now=days[1])
     assert not removed()
+    keystore = OpenedKeystore(separate)
+    first, *others = (entry for entry in keystore.ledger.entries if entry.what == "ca")
+    without_key = first._replace(key="")
+    assert _since_trusted(keystore, [without_key, *others])[0] is without_key, "it may be this CA"
     renew_identity_ca(separate, now=days[2])
     assert not removed()
 
