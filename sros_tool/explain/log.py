@@ -917,7 +917,8 @@ class _Examiner:
                     f"{quote(enclaves[0])} -- COMMAND`."
                 )
             if nodes:
-                return [f"{beginning}this is the node {node}"], _renaming_advice(nodes, node)
+                advice = _renaming_advice(nodes, node, denial.enclave)
+                return [f"{beginning}this is the node {node}"], advice
         if not nodes and (node or denial.topic in _TOPICS_OF_EVERY_NODE):
             return [f"the permissions lack {_EVERY_NODE}"], (
                 'Add <xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/> to the '
@@ -1084,8 +1085,8 @@ def _served_names(answer: Answer) -> tuple[str, ...]:
     return nodes_served((right.right, right.name) for right in rights)
 
 
-def _renaming_advice(nodes: Sequence[str], wrong: str) -> str:
-    """Return the remedy for a node with the name ``wrong`` in an enclave for other ``nodes``.
+def _renaming_advice(nodes: Sequence[str], wrong: str, enclave: str) -> str:
+    """Return the remedy for a node with the name ``wrong`` in ``enclave``, for other ``nodes``.
 
     A rule without the name of a node renames all nodes of a process.
     """
@@ -1104,7 +1105,7 @@ def _renaming_advice(nodes: Sequence[str], wrong: str) -> str:
         )
     return (
         f"{start}; or, if {wrong} is right, give it a profile with common/node.xml: in the policy "
-        "of ENCLAVE, or in an enclave of its own if it is another program."
+        f"of {enclave}, or in an enclave of its own if it is another program."
     )
 
 

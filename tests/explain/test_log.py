@@ -225,6 +225,16 @@ def test_a_remedy_on_a_robot_is_for_the_keystore_at_home(keystore: Path) -> None
     ) in found
 
 
+def test_a_remedy_that_ends_on_the_robot_is_not_for_the_keystore_alone(keystore: Path) -> None:
+    shutil.rmtree(keystore / "private")
+    (keystore / "ledger.jsonl").unlink()
+    log = keystore.with_name("log")
+    log.write_text("Unable to run the command: a process cannot run in enclave /a. It expired\n")
+    found = sros("explain", keystore, "--log", log).out
+    assert "  Repair what the line names (if a file expired: `sros renew KEYSTORE " in found
+    assert ", and start the process again. KEYSTORE is the keystore that has the CA keys." in found
+
+
 def test_a_clock_is_set_on_the_robot_and_not_at_home(keystore: Path) -> None:
     BREAKAGES["permissions not yet valid"](Enclave(keystore))
     shutil.rmtree(keystore / "private")
@@ -725,6 +735,7 @@ def test_a_node_of_another_name_is_told(keystore: Path, log: str, node: str) -> 
     found = sros("explain", keystore, ENCLAVE, "--log", path).out
     assert f"the permissions are for the node /talker, and this is the node {node}" in found
     assert "`--ros-args -r __node:=talker -r __ns:=/`" in found
+    assert f"in the policy of {ENCLAVE}, or in an enclave of its own" in found
     assert f"here it belongs to node {node}" in sros("explain", "--log", path).out
 
 
