@@ -101,6 +101,28 @@ def test_an_export_from_before_a_revocation(keystore: Path, tmp_path: Path) -> N
     assert strangers(late, early) == []
 
 
+def test_a_keystore_from_before_a_revocation(keystore: Path, tmp_path: Path) -> None:
+    """A restored keystore lacks it, and its next list has the number of another one."""
+    for name in ("/stolen", "/lost"):
+        sros("create_enclave", keystore, name).ok()
+    restored, robot = copy_of(keystore, tmp_path / "restored"), tmp_path / "robot"
+    sros("revoke", keystore, "/stolen").ok()
+    sros("distribute_key", keystore, "/a", robot).ok()
+    nodes, of = f"nodes of {restored} accept 1 certificate that the", f"list of {robot} revokes"
+
+    def accepting() -> list[str]:
+        return [text for text in strangers(restored, robot) if "accept" in text]
+
+    assert accepting() == [f"{nodes} newer revocation {of}"]
+    said = sros("check", restored, robot).out
+    assert "`sros revoke KEYSTORE ENCLAVE`" in said and "distribute_key" not in said
+    sros("revoke", restored, "/lost").ok()
+    assert accepting() == [
+        f"{nodes} revocation {of}",
+        f"nodes of {robot} accept 1 certificate that the revocation list of {restored} revokes",
+    ]
+
+
 def test_protection_and_domains_that_keep_nodes_apart(keystore: Path, tmp_path: Path) -> None:
     robot, other = tmp_path / "robot", tmp_path / "other"
     sros("distribute_key", keystore, "/a", robot).ok()

@@ -8,7 +8,6 @@ from contextlib import suppress
 from datetime import datetime
 from functools import cached_property, lru_cache
 from itertools import chain, combinations, product
-from operator import attrgetter
 from typing import NamedTuple
 
 from cryptography import x509
@@ -60,12 +59,16 @@ PEERS_REVOKED = FindingKind(
 PEERS_ACCEPT = FindingKind(
     "keystore.peers-accept-revoked",
     WARNING,
-    "an earlier revocation list than that of another keystore or export",
-    "A node with the earlier list communicates with everybody whom only the later list revokes, "
-    "such as the thief of a key.",
+    "a revocation list that lacks what that of another keystore or export revokes",
+    "A node with this list communicates with everybody whom only the other list revokes, such as "
+    "the thief of a key.",
     "RFC 5280, 5.2.3; rmw_dds_common (crl.pem).",
     "Export its enclaves again from the keystore, with `sros distribute_key KEYSTORE ENCLAVE "
     "TARGET --force`, bring the files to the robot, and restart the processes.",
+)
+_REVOKE_AGAIN = (
+    "This keystore was perhaps restored from a backup: before its next export, revoke again what "
+    "the other list revokes, with `sros revoke KEYSTORE ENCLAVE`."
 )
 PEERS_PROTECTION = FindingKind(
     "keystore.peers-protection",
@@ -265,7 +268,7 @@ def _names_revoked(data: bytes, keystore: OpenedKeystore, enclaves: Sequence[str
 
 
 def _earlier_lists(targets: Targets) -> Iterator[Finding]:
-    """Yield findings about targets without what the newer list of another target revokes."""
+    """Yield findings about targets without what the newest list of another target revokes."""
     holders: dict[tuple[_Certificates, bytes], dict[str, None]] = defaultdict(dict)
     for shown, (keystore, enclaves) in targets.items():
         for name in enclaves:
@@ -281,25 +284,24 @@ def _earlier_lists(targets: Targets) -> Iterator[Finding]:
         for authority in authorities:
             signer = authority.public_bytes(Encoding.PEM)
             own = _newest_list(own_lists, signer)
-            newest = max(
-                (_newest_list(lists, signer) for _, lists in holders), key=attrgetter("number")
-            )
-            lacking = newest.serials - own.serials
-            if newest.number == own.number or not lacking:
-                continue
-            later = [
-                shown
-                for (_, lists), names in holders.items()
-                for shown in names
-                if _newest_list(lists, signer) == newest
-            ]
-            text = (
-                f"accept {counted(len(lacking), 'certificate')} that the newer revocation list of "
-                f"{names_text(later)} revokes"
-            )
-            found |= {(e, f"nodes of {e} {text}"): None for e in earlier if e not in later}
+            of_list: dict[_List, list[str]] = defaultdict(list)
+            for (_, lists_of_others), names in holders.items():
+                of_list[_newest_list(lists_of_others, signer)] += names
+            newest = max(other.number for other in of_list)
+            # If a keystore was restored from a backup, several lists may have the same number.
+            for other, holding in of_list.items():
+                lacking = other.serials - own.serials
+                if other.number < newest or not lacking:
+                    continue
+                text = (
+                    f"accept {counted(len(lacking), 'certificate')} that the "
+                    f"{'newer ' * (newest > own.number)}revocation list of {names_text(holding)} "
+                    "revokes"
+                )
+                found |= {(e, f"nodes of {e} {text}"): None for e in earlier if e not in holding}
     for shown, text in found:
-        yield PEERS_ACCEPT.found(shown, text, shown)
+        remedy = _REVOKE_AGAIN if targets[shown][0].is_original else ""
+        yield PEERS_ACCEPT.found(shown, text, shown, remedy=remedy)
 
 
 class _List(NamedTuple):
