@@ -138,8 +138,8 @@ def _look() -> float:
     found: Any = None
     while time.monotonic() < deadline and (found is None or len(found[1]) < ENDPOINTS):
         time.sleep(0.1)
-        found = observer.sight()
-    taken = _median(lambda _: observer.sight())
+        found = observer.snapshot()
+    taken = _median(lambda _: observer.snapshot())
     node.destroy_node()
     rclpy.shutdown()
     return taken

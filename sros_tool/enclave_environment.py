@@ -766,7 +766,7 @@ def _unnamed_node_error(policy: Policy, command: Sequence[str]) -> UsageError:
 
     A rule for a node (``-r talker:a:=b``) does not tell that the process has this node.
     """
-    from sros_tool.runtime.environment import rules_of_nodes, started_nodes
+    from sros_tool.runtime.environment import nodes_with_rules, started_nodes
 
     *_, (ns, _) = started_nodes(command)
     remedy = (
@@ -774,7 +774,7 @@ def _unnamed_node_error(policy: Policy, command: Sequence[str]) -> UsageError:
         "enclave of each of its nodes, and this command in an enclave of its own: `sros run "
         "KEYSTORE ENCLAVE -- COMMAND`."
     )
-    for name in rules_of_nodes(command):
+    for name in nodes_with_rules(command):
         enclaves = policy.enclaves_of_node(ns or "/", name)
         if len(enclaves) == 1:
             run = f"`sros run KEYSTORE {quote(enclaves[0].path)} -- COMMAND`"

@@ -403,10 +403,10 @@ def _accesses(
     denied: dict[tuple[str, str], set[str]] = defaultdict(set)
     allowed: dict[tuple[str, str], set[str]] = defaultdict(set)
     for right in rights:
-        into = denied if right.qualifier is DENY else allowed
+        topics_of = denied if right.qualifier is DENY else allowed
         for direction, topics in right.topics._asdict().items():
             if topics:
-                into[right.enclave, direction].update(topics)
+                topics_of[right.enclave, direction].update(topics)
     for (enclave, direction), topics in sorted(allowed.items()):
         outside = sorted(denied[enclave, direction].union(ignored))
         accesses = []

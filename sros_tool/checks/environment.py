@@ -263,9 +263,9 @@ def _spelling_findings(environment: Mapping[str, str]) -> Iterator[Finding]:
         if name in _READ or not name.upper().startswith(("ROS", "RMW")):
             continue
         close = difflib.get_close_matches(name.upper(), _READ, n=1, cutoff=_CLOSE)
-        meant = _OLD.get(name) or (close[0] if close else "")
-        if meant:
-            yield MISSPELT.found(name, f"{name} is set; ROS 2 reads {meant}")
+        known_name = _OLD.get(name) or (close[0] if close else "")
+        if known_name:
+            yield MISSPELT.found(name, f"{name} is set; ROS 2 reads {known_name}")
 
 
 def _enclave_findings(

@@ -261,8 +261,8 @@ NODE_MISSPELT = FindingKind(
     "policy.node-misspelt",
     NOTE,
     "a node whose name differs from the path of its enclave by a letter",
-    "If one of them has a typing error, the node is refused when it starts: in the names of its "
-    "own services, or because it has no enclave.",
+    "If one of the two is misspelled, the node is refused when it starts: it has no enclave, or no "
+    "right to its own services.",
     "sros: compares path= with ns= and node=.",
     "Write the name that the node has when it runs.",
 )
@@ -701,7 +701,9 @@ def _check_parameters_of_others(checked_policy: _CheckedPolicy) -> Iterator[Find
                 and not is_denied(right._replace(name=matched))
             )
             for other in islice(other_nodes, 1):
-                text = f"may serve {name}, also as the node {other} of {enclave_by_node[other]}"
+                text = (
+                    f"may serve {name}, and so pose as the node {other} of {enclave_by_node[other]}"
+                )
                 remedy = _NAME_THEM.format("nodes" if is_of_parameters else "services")
                 yield statement.found(OTHER_NODES_PARAMETERS, text, remedy)
 

@@ -34,7 +34,7 @@ PRIVATE_KEY = FindingKind(
     "review.private-key",
     ERROR,
     "a private key in the commit",
-    "Whoever can read the repository has the key, also after the file is deleted.",
+    "Whoever can read the repository has the key, even after the file is deleted.",
     "The files of the commit.",
     "Replace the key, and keep keys out of repositories.",
 )

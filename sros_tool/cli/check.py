@@ -207,8 +207,8 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
     "--needs-renewal",
     metavar="DURATION|PERCENT|soon",
     help="List only the enclaves that expire within DURATION (30d) or have used PERCENT of their "
-    "validity (66%). `soon`: of which a file expires within 30 days, or within a third of its "
-    "validity, if that is shorter.",
+    "validity (66%). `soon`: a file of the enclave expires within 30 days, or within a third of "
+    "its validity, if that is shorter.",
 )
 @advisories_option
 def check(

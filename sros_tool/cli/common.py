@@ -241,7 +241,7 @@ def fleets_option(function: Decorated) -> Decorated:
         multiple=True,
         metavar="FILE",
         help="Fleet file whose robots replace the placeholders of the policies; give it twice "
-        "for different fleets of the first and the second policy.",
+        "if the first and the second policy are for different fleets.",
     )(function)
 
 

@@ -96,13 +96,13 @@ def distribute_key(
     from sros_tool.keystore.outcomes import changes_below
     from sros_tool.keystore.reader import OpenedKeystore
 
-    root, rest = split_root(arguments)
-    names = rest[:-1]
-    if not rest or not (names or patterns or robots):
+    root, names_and_target = split_root(arguments)
+    names = names_and_target[:-1]
+    if not names_and_target or not (names or patterns or robots):
         raise UsageError("distribute_key takes a keystore, one or more enclaves and a target")
-    target = PATH.convert(rest[-1], None, None)
+    target = PATH.convert(names_and_target[-1], None, None)
     keystore = OpenedKeystore(root)
-    _check_target(keystore, rest[-1])
+    _check_target(keystore, names_and_target[-1])
     chosen = chosen_enclaves(keystore, names, patterns, robots)
     selection = with_keys_here(keystore, chosen, names, keyless=keyless)
     notes: tuple[Note, ...] = ()

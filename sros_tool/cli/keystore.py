@@ -645,9 +645,9 @@ def _open_rights(root: Path, template: Template) -> list[Note]:
     notes = []
     if template.default_permissions == EVERYTHING:
         text = (
-            f"by the template {template.name}, an enclave without a policy may publish, subscribe "
-            "and call everything; restrict it with `sros create_permission` and a policy, or the "
-            f"whole keystore with {change}."
+            f"with the template {template.name}, an enclave without a policy may publish, "
+            "subscribe and call everything; restrict it with `sros create_permission` and a "
+            f"policy, or the whole keystore with {change}."
         )
         notes.append(Note("keystore.open-permissions", text))
     if not template.separate_authorities:

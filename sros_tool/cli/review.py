@@ -153,7 +153,7 @@ def _paths_option(name: str, help_text: str) -> Callable[[Decorated], Decorated]
     show_default=True,
     metavar="DURATION|PERCENT|soon",
     help="Fail if an enclave of a keystore expires within DURATION, has used PERCENT of its "
-    "validity, or expires soon, as by `sros renew --all-expiring soon`.",
+    "validity, or expires soon, as defined for `sros renew --all-expiring`.",
 )
 @click.option(
     "--repository",
@@ -543,7 +543,7 @@ def _text(result: Review) -> list[str]:
 
 
 def _lines_to_read(step: ReviewStep) -> list[str]:
-    """Return what a reviewer has to read: new access and dropped requirements, also if they are
+    """Return what a reviewer has to read: new access and dropped requirements, even if they are
     allowed; rights that nobody answers any more; findings.
     """
     from sros_tool.checks.formats import folded_findings

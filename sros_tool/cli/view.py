@@ -120,7 +120,7 @@ def _focus_completions(
     "--requirements",
     type=PATH,
     metavar="FILE",
-    help="Draw accesses that break the requirements in this TOML file in red.",
+    help="Draw in red the accesses that break the requirements in this TOML file.",
 )
 @click.option(
     "--all",
@@ -129,7 +129,9 @@ def _focus_completions(
     help="Also draw the rights that every node needs, such as /rosout.",
 )
 @click.option("--graphviz", is_flag=True, help="Lay out the SVG with Graphviz.")
-@robot_option("Read this robot of a large keystore in full, even if it equals other robots.")
+@robot_option(
+    "Read this robot of a large keystore in full, even if it is the same as other robots."
+)
 @force_option
 @dry_run_option
 def view(

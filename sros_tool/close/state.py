@@ -93,9 +93,10 @@ class RunningRobot:
         return [process for process in self.in_domain if not process.asks_for_security]
 
     def runs_open(self, process: ClosedProcess, since: datetime | None = None) -> bool:
-        """Return whether a process like an observed one runs without security, perhaps ``since``.
+        """Return whether a process like the observed one runs without security.
 
-        That of a unit has to be of this unit: any user can start one with the same command.
+        With ``since``, it has to run since then.  If the observed process belongs to a unit, the
+        other one has to belong to this unit: any user can start one with the same command.
         """
         return any(
             process.fits(other)
@@ -119,10 +120,10 @@ class RunningRobot:
 
     @cached_property
     def not_current(self) -> Mapping[str, tuple[Process, str]]:
-        """Map enclaves to a process that is not closed, with why, before "the processes of X".
+        """Map each enclave with a process that is not closed to this process, and the reason.
 
-        A process of a user who cannot read the files only claims to run in an enclave: it counts
-        if no other one does.
+        The reason is text before "the processes of X".  A process of a user who cannot read the
+        files only claims to run in an enclave: it counts if the enclave has no other process.
         """
         by_enclave: dict[str, list[SecuredProcess]] = {}
         for secured in self.secured:
@@ -160,8 +161,8 @@ class RunningRobot:
             f"others can read {KEY_FILE} (its mode is {mode:04o}): if anybody did, `sros renew "
             f"KEYSTORE {enclave.name} --new-key --revoke-old`, otherwise chmod 600; "
         )
-        lead = readable if mode & 0o077 else ""
-        return f"{lead}{newer} changed, or got another mode, after the start of"
+        warning = readable if mode & 0o077 else ""
+        return f"{warning}{newer} changed, or got another mode, after the start of"
 
     def with_later_processes(self, observed: ObservedProcesses) -> ObservedProcesses:
         """Return observed processes with those that were started later, in other enclaves.

@@ -148,7 +148,7 @@ def _recorded_processes(robot: LocalRobot) -> Iterator[_StartedProcesses]:
 
 
 def _remember(robot: LocalRobot, document: str, observed: ObservedProcesses) -> None:
-    """Write the observation and the processes, also those of earlier watches that do not run now.
+    """Write the observation, and the processes, including earlier ones that do not run now.
 
     Raises:
         UsageError: an option names an enclave that the robot does not have.
@@ -179,7 +179,7 @@ def _observed_processes(
     ended_participants: Collection[str],
     started: _StartedProcesses,
 ) -> ObservedProcesses:
-    """Return the processes of the observed nodes, also those that ended while sros watched."""
+    """Return the processes of the observed nodes, including those that ended while sros watched."""
     processes, domain = running.in_domain, running.robot.domain
     pids = [
         process.own_pid or process.pid for process in processes if "libddsc" in process.libraries
@@ -236,8 +236,8 @@ def _lacking_text(robot: LocalRobot, nodes: Sequence[ObservedNode]) -> str:
     files = shlex.join((str(robot.policy), str(robot.observed_policy)))
     add = f"sros merge_policy {files} --in-place"
     restart = (
-        f"{first_few(meanings, MOST_NAMES)}; if the node lacks it, restart it so, and watch again: "
-        f"{robot.close_command} --for 1m; otherwise, " * bool(meanings)
+        f"{first_few(meanings, MOST_NAMES)}; if the node lacks it, restart the node with it, and "
+        f"watch again: {robot.close_command} --for 1m; otherwise, " * bool(meanings)
     )
     return (
         f"'{robot.policy}' stays as it is, and lacks {counted(len(rights), 'right')} seen now "

@@ -333,7 +333,7 @@ def taken_for_action(question: Question, action: Question) -> tuple[Note, ...]:
 def note_on_action(
     question: Question, kind: str | None, decide: Callable[[Question], tuple[bool, Sequence[str]]]
 ) -> Iterator[Note]:
-    """Yield a note if what an enclave is denied is a part of an action, or the name of one it may.
+    """Yield a note if the denied name is a part of an action, or names an action that is allowed.
 
     ``kind`` is the kind of the name if the user gave it; ``decide`` returns whether the enclave may
     do it, or else the parts that it may do.

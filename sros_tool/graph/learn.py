@@ -524,9 +524,9 @@ _TEXTS = {
     "silent": "left out, because these nodes were announced but had no endpoint: {}",
     "stray": "left out, because the writers or readers of these topics belong to no ROS node: {}",
     "unknown-enclave": "left out, because the graph does not show in which enclaves these nodes "
-    "run: ROS_SECURITY_ENCLAVE_OVERRIDE sets it, and the observer's keystore has no certificate "
-    "for it; observe with the keystore that has their enclaves (--keystore), or "
-    "start them with `--ros-args --enclave /its/name`: {}",
+    "run: ROS_SECURITY_ENCLAVE_OVERRIDE names the enclave, and the observer's keystore has no "
+    "certificate of the enclave; observe with the keystore that has their enclaves (--keystore), "
+    "or start them with `--ros-args --enclave /its/name`: {}",
     "tool": "left out, because these nodes are tools that observe the robot: {}",
 }
 

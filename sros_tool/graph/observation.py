@@ -217,7 +217,7 @@ def main() -> int:
 class GraphObserver(Protocol):
     """Interface of an observer of the ROS graph."""
 
-    def sight(self) -> tuple[list[Any], list[Any]] | None:
+    def snapshot(self) -> tuple[list[Any], list[Any]] | None:
         """Return nodes and endpoints of the same moment, or None."""
 
 
@@ -229,7 +229,7 @@ def report_graph(observer: GraphObserver, report: Any, period: float, *, ordered
     """
     before: object = None
     while True:
-        now = observer.sight()
+        now = observer.snapshot()
         changes = now is None or now != before
         if now is not None and changes:
             listed, endpoints = before = now
@@ -249,7 +249,7 @@ class _Observer:
         self._itself: tuple[str, str, str] | None = None
         self._participant = ""
 
-    def sight(self) -> tuple[list[Any], list[Any]] | None:
+    def snapshot(self) -> tuple[list[Any], list[Any]] | None:
         """Return nodes and endpoints of the same moment; None if nodes changed in every attempt."""
         for _ in range(_ATTEMPTS):
             listed = self._listed()

@@ -5,7 +5,7 @@ decide how long the graph is observed.  Times are in seconds; clock and source a
 
 rclpy lists nodes with their enclaves, but without their processes; it lists endpoints with the
 names of their nodes and with their participants (processes), but without enclaves.  `resolve`
-combines the two lists, also if nodes of the same name run in several enclaves.
+combines the two lists, even if nodes of the same name run in several enclaves.
 
 The graph shows the enclave of ``--ros-args --enclave``, but "/" for a process whose enclave comes
 from ROS_SECURITY_ENCLAVE_OVERRIDE.  The identifier of a secured participant, however, begins with

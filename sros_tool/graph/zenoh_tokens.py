@@ -67,7 +67,7 @@ class _TokenObserver:
         alive = sample.kind == zenoh.SampleKind.PUT
         (self._tokens.add if alive else self._tokens.discard)(str(sample.key_expr))
 
-    def sight(self) -> tuple[list[Any], list[Any]]:
+    def snapshot(self) -> tuple[list[Any], list[Any]]:
         """Return nodes and endpoints, as the observer on DDS does."""
         nodes, endpoints = set(), set()
         for token in tuple(self._tokens):

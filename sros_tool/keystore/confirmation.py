@@ -425,7 +425,7 @@ class LastMessage(NamedTuple):
 class Received:
     """A confirmation, and when the keystore received it, by the clock of the keystore's machine.
 
-    ``message`` is the last message of the robot's agent, also if a later confirmation came without
+    ``message`` is the last message of the robot's agent, even if a later confirmation came without
     a message; None if the agent never sent a message.
     """
 

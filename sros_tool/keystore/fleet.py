@@ -338,8 +338,8 @@ def refuse_stale_domains(
             continue
         if before.of(name) != (domains := after.of(name)):
             raise KeystoreError(
-                f"by the fleet file, enclave {name} belongs to domain {domains}, but it would "
-                f"keep its permissions for domain {before.of(name)}",
+                f"according to the fleet file, enclave {name} belongs to domain {domains}, but it "
+                f"would keep its permissions for domain {before.of(name)}",
                 "No policy of this command states its rights, so it gets no new permissions.",
                 "Name the policies of all enclaves whose robots change their domain.",
             )

@@ -344,7 +344,7 @@ class RobotStatus:
         return replace(self.without_list(), state=state)
 
     def expired(self, now: datetime) -> RobotStatus:
-        """Return the status at ``now``, when files of the robot may have expired."""
+        """Return the status at ``now``: `State.EXPIRED` or worse if a file has expired by then."""
         if not self.enclaves or all(end > now for end in self.expiry.values()):
             return self
         status = self

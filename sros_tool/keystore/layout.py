@@ -592,7 +592,7 @@ def _wrong_path_remedy(root: Path) -> str:
 
 
 def keystore_around(folder: Path) -> Path | None:
-    """Return the keystore whose folder ``folder`` is in, whether it exists or not, or None."""
+    """Return the keystore that contains ``folder``, which need not exist; None if none does."""
     with suppress(KeystoreError):
         return next(filter(is_keystore, Path(os.path.realpath(folder)).parents), None)
     return None

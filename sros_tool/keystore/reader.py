@@ -136,7 +136,7 @@ class FilesReadOnce:
 
     @property
     def full(self) -> bool:
-        """Whether the cache keeps no more files."""
+        """Whether the cache takes no further files."""
         return self._size > _MOST_KEPT
 
     def _read(self, path: Path, label: str, max_bytes: int) -> bytes:

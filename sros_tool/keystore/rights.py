@@ -795,10 +795,10 @@ def _unanswered_rights(
     right to publish it is gone or denied.  A right to use a wildcard counts if enclaves offer no
     name any more that it matches.
     """
-    taken = [right for right in difference.only_first if right.qualifier is not DENY]
-    taken += (right for right in difference.only_second if right.qualifier is DENY)
+    reduced = [right for right in difference.only_first if right.qualifier is not DENY]
+    reduced += (right for right in difference.only_second if right.qualifier is DENY)
     names_of: dict[str, set[str]] = defaultdict(set)
-    for right in taken:
+    for right in reduced:
         names_of[right.right].add(right.name)
     touched = {word: Names(sorted(names)) for word, names in names_of.items()}
     asked = [

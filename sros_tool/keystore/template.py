@@ -67,7 +67,7 @@ class Template:
     ``unique_subject``, the subject of every certificate has a unique part.  ``short_lived`` are
     enclaves whose certificates and permissions expire earlier than the others.  ``zenoh`` is the
     network for which enclaves get Zenoh configurations, or None.  ``distributions`` are the
-    ROS 2 distributions for which the keystore has to hold; () if it does not say.
+    ROS 2 distributions that the keystore has to fit; () if the template states none.
     """
 
     name: str

@@ -95,15 +95,15 @@ def remapped_policies(
         uses = {use for _, of_policy in remapped for use in of_policy if use.rule == rule}
         if not uses:
             raise UsageError(
-                f"--remap {rule}: no policy to merge has this name, or node",
+                f"--remap {rule}: no policy to merge has this name, or such a node",
                 "",
                 "Write the names as the nodes of the policy use them.",
             )
         nodes = sorted({use.node for use in uses})
         if rule.old == _NODE and len(nodes) > 1:
             text = (
-                f"--remap {rule} gives one name to the nodes {enumerated(nodes)}. Take the one "
-                f"that is meant with --node, or write its name, as in {nodes[0]}:{rule}."
+                f"--remap {rule} gives one name to the nodes {enumerated(nodes)}. Choose the node "
+                f"with --node, or write its name, as in {nodes[0]}:{rule}."
             )
             notes.append(Note("merge.remapped-nodes", text))
         if any(use.kind == "actions" for use in uses):
@@ -113,7 +113,7 @@ def remapped_policies(
             )
             text = (
                 f"--remap {rule} renames an action. Nodes do so since Kilted, and on Jazzy since "
-                f"rcl_action 9.2.8: start earlier ones with `--ros-args {' '.join(parts)}`."
+                f"rcl_action 9.2.8: start earlier versions with `--ros-args {' '.join(parts)}`."
             )
             notes.append(Note("merge.remapped-action", text))
     return [policy for policy, _ in remapped], notes

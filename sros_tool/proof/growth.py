@@ -75,9 +75,9 @@ from sros_tool.proof.protection import (
 from sros_tool.proof.sources import ALL_DOMAINS, AT, AccessSource
 from sros_tool.proof.worlds import (
     ROS_TOPICS,
+    any_allows,
     domains_of,
     enforced_access,
-    is_enforced,
     valid_topics,
 )
 from sros_tool.proof.zenoh_settings import unknown_settings
@@ -589,7 +589,7 @@ def _access_on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
 
         def decide(verb: AccessVerb, topic: str) -> bool:
             writes = verb is AccessVerb.PUBLISH
-            return is_enforced(side.enforcers, enclave, domain, topic, writes=writes)
+            return any_allows(side.enforcers, enclave, domain, topic, writes=writes)
 
         writes, reads = (names & ROS_TOPICS for names in (enforced.writes, enforced.reads))
         topics = {AccessVerb.PUBLISH: writes, AccessVerb.SUBSCRIBE: reads}
@@ -1255,7 +1255,10 @@ def _enclaves_near(robots: _EnclavesByRobot, robot: str) -> dict[str, Profile]:
 
 
 def undenied_name(denied: Right, stated: Rules) -> str | None:
-    """Return a name of the denial ``denied``, not of an action, that ``stated`` has no rule for."""
+    """Return a name that ``denied`` matches, and that no rule of ``stated`` matches.
+
+    ``denied`` is not for an action.
+    """
     if stated.cover(denied):
         return None
     allowed = stated.overlapping(denied._replace(qualifier=ALLOW))
@@ -1427,7 +1430,7 @@ def _left_out_texts(base: AccessSource, head: AccessSource) -> Iterator[str]:
     if any(
         file.document.mode is Mode.CLIENT for _, side in sides for file in side.zenoh_files.values()
     ):
-        yield "what clients of Zenoh let their router do"
+        yield "what Zenoh clients let their router do"
     for name, side in sides:
         other = head if side is base else base
         if side.trusts is not None and other.trusts is None:

@@ -636,8 +636,8 @@ class _Review:
         with suppress(SrosError):  # `left_out` says that these were not looked for
             walked = self._changed_files(self.head, None)
             earlier = {path: entry for path, entry in walked if path.endswith(KEY_FILE)}
-        both = {**earlier, **entries}
-        files = {path: entry.id for path, entry in both.items() if entry.mode in FILES}
+        key_files = {**earlier, **entries}
+        files = {path: entry.id for path, entry in key_files.items() if entry.mode in FILES}
         keys = {
             digits
             for digits, content in self._contents(files.values())

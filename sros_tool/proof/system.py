@@ -62,10 +62,10 @@ from sros_tool.proof.worlds import (
     Crossing,
     TopicAccess,
     World,
+    any_allows,
     dds_access,
     domains_of,
     enforced_access,
-    is_enforced,
     names_of_expression,
     ros_access,
     topics_of,
@@ -552,7 +552,7 @@ def _zenoh_world(
     """Return the Zenoh world of a domain, with the enclaves ``names``."""
 
     def confirm(enclave: str, writes: bool, topic: str) -> bool:
-        return is_enforced(enforcers, enclave, domain, topic, writes=writes)
+        return any_allows(enforcers, enclave, domain, topic, writes=writes)
 
     no_topics = TopicAccess(NameSet(), NameSet())
     return World(

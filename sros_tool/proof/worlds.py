@@ -572,10 +572,10 @@ def enforced_access(enforcers: Iterable[Enforcement], enclave: str, domain: int)
     )
 
 
-def is_enforced(
+def any_allows(
     enforcers: Iterable[Enforcement], enclave: str, domain: int, topic: str, *, writes: bool
 ) -> bool:
-    """Return whether an enforcer lets an enclave write or read a topic, by its method `decide`."""
+    """Return whether any of the enforcers lets an enclave write or read a topic."""
     messages = zenoh_message(topic, domain, writes=writes)
     remote = Remote(enclave)
     return bool(messages) and any(

@@ -717,7 +717,7 @@ class _Demanded:
         self._names = {level: Names(topics) for level, topics in topics_of.items()}
 
     def protection(self, kind: str, name: str) -> Protection | None:
-        """Return the weakest protection demanded for the topics of a name, or None if none is."""
+        """Return the weakest protection demanded for the topics of a name; None without any."""
         levels = [self._level(topic) for topic in _topics(kind, name)] if self._names else []
         least = min(levels, key=_ORDER.index, default=WireLevel.UNKNOWN)
         return None if least is WireLevel.UNKNOWN else Protection(least)

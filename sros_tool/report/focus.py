@@ -88,8 +88,8 @@ def focused_picture(
         UsageError: nothing in the sources has such a name.
     """
     system = _System(picture, sources)
-    meant_names = dict.fromkeys(meant for word in words for meant in system.names_meant(word))
-    focuses = tuple(system.focus(kind, name) for kind, name in meant_names)
+    focused_names = dict.fromkeys(meant for word in words for meant in system.names_meant(word))
+    focuses = tuple(system.focus(kind, name) for kind, name in focused_names)
     if routers > 1:
         left_out = f"; what passes between the {routers} Zenoh routers is not considered"
         focuses = tuple(replace(focus, sentence=f"{focus.sentence}{left_out}") for focus in focuses)

@@ -196,7 +196,7 @@ def scenes_of(
         picture: the picture.
         with_places: whether cards get a y and groups get frames; formats that place cards
             themselves need neither.
-        drawn_as: the real names behind drawn names, which are counted instead.
+        drawn_as: for drawn names, the real names behind them; only real names are counted.
     """
     groups = {enclave.path: enclave.group for enclave in picture.enclaves}
     titles = sorted(set(groups.values()))

@@ -265,7 +265,7 @@ def started_nodes(command: Sequence[str]) -> Iterator[tuple[str, str]]:
         yield next((ns for of, ns in namespaces.items() if of in ("", name)), ""), name
 
 
-def rules_of_nodes(command: Sequence[str]) -> list[str]:
+def nodes_with_rules(command: Sequence[str]) -> list[str]:
     """Return the node names that remapping rules of a command are for (``-r talker:a:=b``)."""
     return [node for node in dict.fromkeys(node for node, _, _ in _rules(command)) if node]
 

@@ -448,7 +448,8 @@ _FAST_PARTICIPANT_TEXTS = (
     _log_text(
         "peer-malformed", _FAST,
         r"Error validating remote permissions for \S+ \(Malformed permissions file",
-        "a PEER was refused: Fast DDS does not accept its permissions, although signed correctly",
+        "a PEER was refused: Fast DDS does not accept its permissions, although these are signed "
+        "correctly",
         "Sign the peer's permissions again: `sros create_permission KEYSTORE PEER POLICY`.",
     ),
     _log_text(

@@ -209,7 +209,7 @@ def chosen_vendor(
 
 
 def shipped_vendor(rmw: str, environment: Mapping[str, str]) -> Vendor | None:
-    """Return the vendor of an RMW as `vendor_of`, in the release that $ROS_DISTRO ships."""
+    """Return the `vendor_of` an RMW, in the release that $ROS_DISTRO ships."""
     vendor, distribution = vendor_of(rmw), sourced_distribution(environment.get(ROS_DISTRO))
     shipped = (
         distribution.shipped_product(vendor.traits.product) if vendor and distribution else None

@@ -664,7 +664,7 @@ class Enforcement:
         )
 
     def rules_for(self, common_name: str) -> int:
-        """Return the number of rules of subjects that have a name."""
+        """Return the number of rules of the subjects with this common name."""
         return sum(
             len(self.rules_of(subject.id))
             for subject in self.subjects

@@ -1,4 +1,4 @@
-"""Read Zenoh configurations, also those that sros did not write: JSON5, or YAML in JSON syntax.
+"""Read Zenoh configurations, whoever wrote them: JSON5, or YAML in JSON syntax.
 
 Zenoh chooses the language by the file name's ending, and reads no file with another ending.
 

@@ -203,8 +203,8 @@ def test_enclave_names(tmp_path: Path) -> None:
 def test_a_wildcard_for_nodes_that_matches_a_node_of_another_enclave(tmp_path: Path) -> None:
     own = enclave("").replace('node="n"', 'node="bas?"')
     other = enclave("", "/b").replace('node="n"', 'node="base"')
-    posing = {each.text for each in findings(tmp_path, policy(own, other)) if "also" in each.text}
-    assert "may serve /bas?/set_parameters, also as the node /base of /b" in str(posing)
+    posing = {each.text for each in findings(tmp_path, policy(own, other)) if "pose" in each.text}
+    assert "may serve /bas?/set_parameters, and so pose as the node /base of /b" in str(posing)
     assert len(posing) == len(PARAMETERS)
     assert "policy.other-nodes-parameters" not in ids(tmp_path, policy(own, enclave("", "/b")))
 

@@ -281,8 +281,8 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     assert f"lacks 1 right seen now (/listener subscribe /chatter); {remapped}" in again.out
     assert "-r /chatter:=/old/chatter, or the policy, --remap /old/chatter:=" in again.out
     assert (
-        "; if the node lacks it, restart it so, and watch again: sros close robot --for 1m;"
-        in again.out
+        "; if the node lacks it, restart the node with it, and watch again: "
+        "sros close robot --for 1m;" in again.out
     )
     assert " otherwise, if a process should not have them, stop it, and run `sros c" in again.out
     add = "sros merge_policy robot/policy.xml robot/seen.xml --in-place"
@@ -984,7 +984,7 @@ def test_a_node_that_was_restarted_without_its_namespace(robot: Robot) -> None:
     robot.nodes = (TALKER, LISTENER)
     said = robot.close("--for", "1s", status=1).out
     hint = "perhaps /listener is /left/listener, started without its namespace (-r __ns:=/left)"
-    assert f"; {hint}; if the node lacks it, restart it so, and watch again" in said
+    assert f"; {hint}; if the node lacks it, restart the node with it, and watch again" in said
     robot.nodes = (TALKER, left, ros_node("listener", "010f0000071200000000"))
     assert "without its namespace" not in robot.close("--for", "1s", status=1).out
 

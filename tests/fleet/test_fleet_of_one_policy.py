@@ -357,7 +357,7 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
         "generate_artifacts", "-k", "ks", "-p", "one.xml", "--fleet", "fleet.toml", cwd=folder
     )
     assert ended.status == 2
-    assert "by the fleet file, enclave /r1/lift belongs to domain 0" in ended.err
+    assert "according to the fleet file, enclave /r1/lift belongs to domain 0" in ended.err
     assert "Name the policies of all enclaves" in ended.err
 
     # Another domain of the keystore leaves the one of a robot as it is.

@@ -81,7 +81,7 @@ def test_a_graph_that_changed_is_read_again_at_once(monkeypatch: pytest.MonkeyPa
     waits: list[float] = []
 
     class Script:
-        def sight(self) -> Any:
+        def snapshot(self) -> Any:
             return looks.pop(0)
 
     def select(*words: Any) -> tuple[bool]:

@@ -112,7 +112,7 @@ NOT_IN_POLICY = FindingKind(
     "enclave.not-in-policy",
     NOTE,
     "an enclave that no policy names",
-    "Its permissions stay valid, also if its node was renamed or removed from the policy.",
+    "Its permissions stay valid, even if its node was renamed or removed from the policy.",
     "sros: --policy.",
     "Name the policy of this enclave, too; or, if nobody needs the enclave, revoke it: `sros "
     "revoke KEYSTORE ENCLAVE`.",

@@ -194,15 +194,15 @@ def check_vendors(
 
     ``known_findings`` are the other findings about the enclave and its CAs.
     """
-    for domain, made in evaluation.by_domain.items():
-        if findings := list(_refusal_findings(evaluation, made, known_findings)):
+    for domain, participants in evaluation.by_domain.items():
+        if findings := list(_refusal_findings(evaluation, participants, known_findings)):
             yield from findings
             return
         # Vendors decide alike on usual names in a document as sros writes it, and each topic costs.
         if evaluation.portable and not any(_is_about_rules(finding) for finding in known_findings):
             continue
         ids = {finding.id for finding in known_findings}
-        if findings := list(_different_rights_findings(evaluation, made, domain, ids)):
+        if findings := list(_different_rights_findings(evaluation, participants, domain, ids)):
             yield from findings
             return
 
@@ -459,8 +459,8 @@ def with_start_finding(
     if evaluation.portable and _states_all(grant):
         return [*known_findings]
     has_denials = any(not rule.allow for rule in grant.rules)
-    for domain, made in evaluation.by_domain.items():
-        running = [participant for participant in made.values() if not participant.causes()]
+    for domain, participants in evaluation.by_domain.items():
+        running = [p for p in participants.values() if not p.causes()]
         # Vendors decide alike on a document as sros writes it.
         asked = running[:1] if evaluation.portable and not has_denials else running
         denials = [
@@ -470,7 +470,7 @@ def with_start_finding(
             continue
         longest_denial = max(filter(None, denials), key=lambda denial: len(denial.text))
         where = f"on domain {domain}, " if len(evaluation.by_domain) > 1 else ""
-        if len(running) < len(made):
+        if len(running) < len(participants):
             titles = evaluation.titles([participant.vendor for participant in running])
             where += f"on {' and '.join(titles)} "
         finding = NO_NODE.found(

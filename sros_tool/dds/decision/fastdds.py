@@ -357,14 +357,14 @@ def _read_domains(element: XmlElement) -> DomainSet:
 
 
 def _read_range(element: XmlElement) -> DomainRange:
-    ends = element.elements
-    if ends and ends[0].name == "max":
-        return DomainRange(None, _read_number(ends[0]))
-    if not ends or ends[0].name != "min":
+    limits = element.elements
+    if limits and limits[0].name == "max":
+        return DomainRange(None, _read_number(limits[0]))
+    if not limits or limits[0].name != "min":
         raise UnreadableError("<id_range> begins with neither <min> nor <max>")
-    first = _read_number(ends[0])
-    bounded = len(ends) > 1 and ends[1].name == "max"
-    return DomainRange(first, _read_number(ends[1]) if bounded else None)
+    first = _read_number(limits[0])
+    bounded = len(limits) > 1 and limits[1].name == "max"
+    return DomainRange(first, _read_number(limits[1]) if bounded else None)
 
 
 # ── governance ─────────────────────────────────────────────────────────────────────────────

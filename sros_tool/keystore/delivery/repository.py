@@ -81,7 +81,7 @@ def load_signer(data: bytes, label: str) -> CryptoSigner:
 
 
 def replaced_key(role: str) -> str:
-    """Return the remedy for the key of a role that is lost, as a sentence."""
+    """Return the remedy for a lost key of this role, as a sentence."""
     return f"Restore it from a backup, or make another with --rotate-key {role}."
 
 

@@ -129,7 +129,7 @@ def sign_request(
         data: the request (PEM).
         only_enclaves: the name of the enclave that the request has to be for; empty for any.  A
             robot can write any name into its request.
-        refuse_revoked: refuse a revoked enclave also if ``only_enclaves`` names it.
+        refuse_revoked: refuse a revoked enclave even if ``only_enclaves`` names it.
         renew: the enclave has to exist; it gets a new certificate.
         answer: the path for the answer, which is written after the keystore has changed.
         force: replace ``answer`` if it exists.
@@ -345,7 +345,7 @@ class _Signer:
     def _record_paths(self) -> None:
         """Add the policy's paths with placeholders to the fleet of the keystore.
 
-        The robots of that fleet stay the same, also if the policy was expanded for another fleet.
+        The robots of that fleet stay the same, even if the policy was expanded for another fleet.
         """
         change, root, stated = self._change, self._root, self._stated_rights
         fleet = change.fleet

@@ -198,9 +198,9 @@ def stated_expressions(policy: Enclave) -> ExpressionSets:
         for group in profile.groups:
             names = [expand(name, ns, node) for name in group.names]
             for right, qualifier in group.rights:
-                into = expressions.allowed if qualifier is ALLOW else expressions.denied
+                by_verb = expressions.allowed if qualifier is ALLOW else expressions.denied
                 for verb, before, behind in _ENDPOINTS[right]:
-                    into[verb].update([f"{before}{name}{behind}" for name in names])
+                    by_verb[verb].update([f"{before}{name}{behind}" for name in names])
     return expressions
 
 
@@ -217,12 +217,12 @@ def signed_expressions(permissions: Permissions, domains: DomainSet) -> Expressi
         if (allowing and not rule.allow) or rule.domains != domains or rule.relay:
             return None
         allowing = rule.allow
-        into = expressions.allowed if allowing else expressions.denied
+        by_verb = expressions.allowed if allowing else expressions.denied
         for verb, all_criteria in ((_OUT, rule.publish), (_IN, rule.subscribe)):
             for criteria in all_criteria:
                 if criteria.partitions or criteria.data_tags:
                     return None
-                into[verb].update(criteria.topics)
+                by_verb[verb].update(criteria.topics)
     return expressions
 
 

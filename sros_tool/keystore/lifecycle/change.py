@@ -281,7 +281,7 @@ class KeystoreChange:
         self.notes += self.edit_notes()
 
     def check_domain(self, domain: int | None) -> None:
-        """Raise `KeystoreError` if the governance is not for ``domain``; None is accepted."""
+        """Raise `KeystoreError` if a ``domain`` is given, and the governance is not for it."""
         check_domain(self.domains, domain, self.root)
 
     def write_fleet(self, fleet: Fleet, patterns: Collection[str]) -> Fleet:

@@ -131,12 +131,13 @@ def restore_revocations(
 ) -> Changed:
     """Revoke again all certificates on revocation lists that the keystore signed and lost.
 
-    The next list has a higher number than these.  Enclaves that they revoke are moved to
-    ``revoked``, as they were before, also if they were renewed since; enclaves of which only an
-    earlier certificate was replaced stay.  Their key is revoked, too, unless a certificate that the
-    ledger lacked has the same key.  Certificates that the ledger lacks are recorded, so that they
-    can be revoked, and are revoked at once if their enclaves were.  The ledger records that the
-    keystore was restored, with a number that it did not give before: the seconds since 1970.
+    The next list has a higher number than the lost lists.  Enclaves that were revoked are moved to
+    ``revoked`` again, even if they were renewed since; enclaves of which only an earlier
+    certificate was replaced stay.  The key of a replaced certificate is revoked, too, unless a
+    certificate that the ledger lacked has the same key.  Certificates that the ledger lacks are
+    recorded, so that they can be revoked; those of a revoked enclave are revoked at once.  The
+    ledger records that the keystore was restored, with a number that the ledger never had: the
+    seconds since 1970.
 
     Raises:
         KeystoreError: as `revoke`.

@@ -703,10 +703,10 @@ class _Rotator:
             if name != "/"
         ]
         for path in (GOVERNANCE_P7S, *copies):
-            real = self._root / path
-            if not real.is_file() or real.is_symlink():
+            file = self._root / path
+            if not file.is_file() or file.is_symlink():
                 continue
-            signed = self._keystore.files.signed(self._keystore.read(real, "governance document"))
+            signed = self._keystore.files.signed(self._keystore.read(file, "governance document"))
             signed.verify(permissions.old[0])
             parse_governance(signed.document)  # raises if it is malformed
             message = permissions.new.sign(signed.document, "the governance document")

@@ -97,7 +97,7 @@ class Place:
 
     Whoever comes after a process that was killed ends a change that was decided, and drops another.
     ``due`` is the record of the enclaves whose processes still have earlier files, ``delivered`` of
-    the enclaves that were installed last, also if somebody removed them since, and ``trusting`` of
+    the enclaves that were installed last, even if somebody removed them since, and ``trusting`` of
     digests (`trust_digest`) of enclaves of ``due`` whose processes have these files.
     """
 
