@@ -908,7 +908,7 @@ NOT_ON_ZENOH = FindingKind(
 ENCLAVE_NAMES = FindingKind(
     "portable.enclave-names",
     WARNING,
-    "an enclave whose path has only components of another enclave's path",
+    "an enclave whose path consists only of components of another enclave's path",
     "Cyclone DDS checks only that every part of a certificate's subject occurs in the grant's "
     "subject. So /robot can join with the (public) permissions of /robot/admin.",
     "Cyclone DDS 0.10.2 and 11.0.1 (access_control.c); reproduced: readers received data of such "

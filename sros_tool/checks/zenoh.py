@@ -49,7 +49,7 @@ UNKNOWN_SETTING = FindingKind(
     ERROR,
     "a setting that Zenoh does not have",
     "Zenoh refuses the whole file, so that no session opens and no router starts. The name is "
-    "misspelled, or of another version.",
+    "misspelled, or belongs to another version of Zenoh.",
     "Zenoh 1.10.2 (commons/zenoh-config), tested.",
     "Correct the name, or remove the setting.",
 )

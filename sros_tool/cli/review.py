@@ -93,7 +93,7 @@ def _paths_option(name: str, help_text: str) -> Callable[[Decorated], Decorated]
         type=_Lines(),
         multiple=True,
         metavar="PATH",
-        help=f"{help_text}  Can be repeated, or have several lines.",
+        help=f"{help_text}  Can be repeated, or name several on separate lines.",
     )
 
 

@@ -858,7 +858,7 @@ _ROUTERS_KEY = Note(
     "explain.zenoh-router",
     "anyone with the router's key may send and receive everything that passes through the router, "
     "whatever its permissions say, because forwarding needs this. In peer mode, every session also "
-    "trusts a second process with that key, next to the router. Give the key to no other process.",
+    "trusts a second process with that key, besides the router. Give the key to no other process.",
 )
 
 

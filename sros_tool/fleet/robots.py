@@ -416,14 +416,14 @@ def _patterns(paths: tuple[str, ...]) -> Mapping[str, list[_Pattern]]:
 
 
 def _expression(parts: Parts) -> re.Pattern[str]:
-    text, captured = "", set()
+    text, named_parts = "", set()
     for part in parts:
         if isinstance(part, str):
             text += re.escape(part)
-        elif part.value in captured:
+        elif part.value in named_parts:
             text += f"(?P={part.value})"
         else:
-            captured.add(part.value)
+            named_parts.add(part.value)
             text += f"(?P<{part.value}>{_VALUES[part.value]})"
     return re.compile(text, re.ASCII)
 

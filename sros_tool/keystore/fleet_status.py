@@ -514,10 +514,10 @@ class FleetStatus:
 
     @property
     def complete(self) -> bool:
-        """Whether every robot that has enclaves confirmed the current files in time, says that no
-        restart is due and that its agent has no problem, robots can still fetch what was published,
-        and nothing else casts doubt on it; if not, the exit status is 1. Robots of which all
-        enclaves were revoked do not count.
+        """Whether every robot that has enclaves confirmed the current files in time, and reports no
+        restart that is due and no problem of its agent, robots can still fetch what was published,
+        and nothing else casts doubt on their files; if not, the exit status is 1. Robots of which
+        all enclaves were revoked do not count.
         """
         if (
             self.overdue

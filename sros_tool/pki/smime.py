@@ -519,7 +519,7 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
         raise ValueError("unknown digest")
     signatures = tuple(_signature(child) for child in der.children(signers.content))
     if not signatures or any(signature.digest not in listed for signature in signatures):
-        raise ValueError("no signature, or another digest than announced")
+        raise ValueError("no signature, or a digest other than the announced one")
     return SignedDocument(
         content=content,
         document=_document(content),

@@ -1164,7 +1164,7 @@ def _write_profile(
 
 _MOST_LEVELS = 100
 _MOST_FILES = 10_000
-_LOOKED_AT = 256 * 1024
+_MOST_SEARCHED = 256 * 1024
 """Size in bytes of the largest file without the ending ``.xml`` that is searched for a policy."""
 
 
@@ -1222,7 +1222,7 @@ def is_policy(name: str, content: bytes, shown: str) -> bool:
     """
     if name.lower().endswith(".xml"):
         return parse(content, shown, instructions=True).tag == "policy"
-    begin = content[:_LOOKED_AT].replace(b"\0", b"")  # of UTF-16, too
+    begin = content[:_MOST_SEARCHED].replace(b"\0", b"")  # of UTF-16, too
     if begin.lstrip(b"\xef\xbb\xbf\xff\xfe \t\r\n").startswith(b"<") and b"<policy" in begin:
         raise DocumentError(
             f"{shown} looks like a policy, but its name does not end with .xml",
@@ -1271,6 +1271,6 @@ def _content(path: Path) -> bytes:
         return read_bytes(path, "policy file")
     try:
         with path.open("rb") as file:
-            return file.read(_LOOKED_AT)
+            return file.read(_MOST_SEARCHED)
     except OSError as error:
         raise DocumentError(f"'{path}' cannot be read", str(error.strerror)) from error

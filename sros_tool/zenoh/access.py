@@ -653,7 +653,7 @@ class Enforcement:
         return next(stated.key_expressions for stated in self.rules if stated.id == rule)
 
     def allowed_keys(self, common_name: str, flow: Flow, message: Message) -> tuple[str, ...]:
-        """Return the key expressions that rules of subjects with a name allow."""
+        """Return the key expressions that the rules of subjects with this common name allow."""
         return tuple(
             key
             for subject in self.subjects
