@@ -544,6 +544,7 @@ class _Editor:
         enclave_elements = {
             element.get("path"): element for block in blocks for element in block.named("enclave")
         }
+        new = []
         for path, enclave_entries in groupby(entries.items(), key=lambda item: item[0].enclave):
             places = dict(enclave_entries)
             if path in enclave_elements:
@@ -559,7 +560,9 @@ class _Editor:
                     "Merge into the file that contains this part.",
                 )
             profiles = _New("profiles", children=[_profile(*profile) for profile in places.items()])
-            self._append(blocks[0], _New(f'enclave path="{path}"', children=[profiles]))
+            new.append(_New(f'enclave path="{path}"', children=[profiles]))
+        if new:
+            self._append(blocks[0], new)
         return self._text.document()
 
     def _add_to_enclave(
@@ -578,10 +581,9 @@ class _Editor:
             else:
                 new.append(_profile(place, entries))
         if new and blocks:
-            for element in new:
-                self._append(blocks[0], element)
+            self._append(blocks[0], new)
         elif new:
-            self._append(enclave, _New("profiles", children=new))
+            self._append(enclave, [_New("profiles", children=new)])
 
     def _add_to_profiles(self, profiles: list[PlacedElement], entries: Sequence[AddedName]) -> None:
         groups: dict[tuple[str, GroupRights], PlacedElement] = {}
@@ -589,10 +591,9 @@ class _Editor:
             for child in profile.children:
                 if child.tag in RIGHTS:
                     groups.setdefault((child.tag, _rights_of(child)), child)
-        for new in _groups(
-            [entry for entry in entries if (entry.kind, entry.rights) not in groups]
-        ):
-            self._append(profiles[0], new)
+        new = [entry for entry in entries if (entry.kind, entry.rights) not in groups]
+        if new:
+            self._append(profiles[0], _groups(new))
         for (kind, rights), names in groupby(entries, key=lambda entry: (entry.kind, entry.rights)):
             if group := groups.get((kind, rights)):
                 self._add_names(group, kind, list(names))
@@ -605,7 +606,7 @@ class _Editor:
             new = _item(entry)
             place = bisect_left(present, entry.name) if is_sorted else len(present)
             if not is_sorted:
-                self._append(group, new)
+                self._append(group, [new])
             elif place:
                 self._put_after(group.children[place - 1], new)
             else:
@@ -613,11 +614,12 @@ class _Editor:
 
     # ── writing elements ───────────────────────────────────────────────────────────────────
 
-    def _append(self, parent: PlacedElement, new: _New) -> None:
-        """Insert an element after the last child of ``parent``, but before its metadata."""
+    def _append(self, parent: PlacedElement, new: Sequence[_New]) -> None:
+        """Insert elements after the last child of ``parent``, but before its metadata."""
         last = next((child for child in reversed(parent.children) if child.tag != "metadata"), None)
         if last:
-            self._put_after(last, new)
+            for element in new:
+                self._put_after(last, element)
         else:
             self._put_into_empty(parent, new)
 
@@ -633,10 +635,10 @@ class _Editor:
         else:
             text.put(parent.inner, self._rendered(new, text.indent_of(first)))
 
-    def _put_into_empty(self, parent: PlacedElement, new: _New) -> None:
+    def _put_into_empty(self, parent: PlacedElement, new: Iterable[_New]) -> None:
         text, outer = self._text, self._text.indent_of(parent)
         indent = None if outer is None else outer + text.unit
-        rendered = self._rendered(new, indent)
+        rendered = "".join(self._rendered(element, indent) for element in new)
         if parent.close == parent.inner == parent.end:  # <profile .../>
             ending = "" if outer is None else text.newline + outer
             tag = text.text[parent.start : parent.end].rstrip("/>").rstrip()

@@ -146,12 +146,16 @@ def test_new_groups_profiles_and_enclaves(file: Path) -> None:
 
 
 def test_an_empty_profile_is_opened(file: Path) -> None:
-    merged = merge_into(file, asking(topics("q"), ns="/ns", node="m")).document.decode()
+    asked = asking(topics("q") + topics("r", rights='subscribe="ALLOW"'), ns="/ns", node="m")
+    merged = merge_into(file, asked).document.decode()
     assert merged == POLICY.replace(
         "<profile ns='/ns/' node=\"m\"/>",
         "<profile ns='/ns/' node=\"m\">\n"
         '          <topics publish="ALLOW">\n'
         "            <topic>q</topic>\n"
+        "          </topics>\n"
+        '          <topics subscribe="ALLOW">\n'
+        "            <topic>r</topic>\n"
         "          </topics>\n"
         "        </profile>",
     )

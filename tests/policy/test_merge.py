@@ -132,7 +132,9 @@ def test_what_is_no_remapping(rule: str) -> None:
 
 def test_a_policy_without_enclaves_gets_the_rights_of_others_alone(tmp_path: Path) -> None:
     (path := tmp_path / "empty.xml").write_text('<policy version="0.2.0"><enclaves/></policy>')
-    result = merge_into(path, moved := policy_in_namespace(one(TOPICS), "/left"))
+    profiles = one(TOPICS).enclaves[0].profiles
+    both = Policy((Enclave("/a", profiles), Enclave("/b", profiles)))
+    result = merge_into(path, moved := policy_in_namespace(both, "/left"))
     assert policy_rights(read_policy(path, result.document)) == policy_rights(moved)
 
 
