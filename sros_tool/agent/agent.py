@@ -59,6 +59,7 @@ from sros_tool.keystore.confirmation import (
     lacks_key,
     make_confirmation,
     render_confirmation,
+    shortened_dds,
     shortened_problems,
 )
 from sros_tool.keystore.delivery.archive import listed_digests
@@ -672,7 +673,6 @@ class _Round:
             self._folder,
             self._settings.robot,
             now=now,
-            dds=processes.dds,
             unreadable=self._unreadable,
         )
         restart, crl_restart = (
@@ -681,6 +681,7 @@ class _Round:
         )
         confirmation = replace(
             confirmation,
+            dds=shortened_dds(processes.dds),
             restart=restart,
             boot=_boot_digest(self._settings.robot, self._machine.boot()),
             crl_restart=None if crl_restart == restart else crl_restart,

@@ -144,6 +144,7 @@ def _report(folder: Path, robot: str, restarted: bool) -> None:
         RunningFiles,
         make_confirmation,
         render_confirmation,
+        shortened_dds,
         shortened_problems,
     )
     from sros_tool.keystore.layout import list_enclaves
@@ -152,11 +153,14 @@ def _report(folder: Path, robot: str, restarted: bool) -> None:
     with progress("reading"):
         moment = now()
         names = list_enclaves(folder)
-        processes = _processes_here(folder, names, moment)
-        confirmation = make_confirmation(folder, robot, now=moment, dds=processes.dds)
+        confirmation = make_confirmation(folder, robot, now=moment)
+        # After the files are read, so that no file that is brought meanwhile counts as loaded.
+        processes = _processes_here(folder, names, now())
         running = (f"{problem}." for problem in processes.problems)
         problems = (*running, *installed_sentences(folder, names, moment))
-    confirmation = replace(confirmation, problems=shortened_problems(problems))
+    confirmation = replace(
+        confirmation, dds=shortened_dds(processes.dds), problems=shortened_problems(problems)
+    )
     agent, states = read_state(folder), processes.loaded_from_any_folder()
     noted = agent.due if agent.boot == boot_id() and not restarted else ()
     restart = {*noted, *enclaves_to_restart((), states, complete=True)}

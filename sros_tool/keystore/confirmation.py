@@ -267,13 +267,11 @@ def make_confirmation(
     robot: str,
     *,
     now: datetime,
-    dds: RobotDds | None = None,
     unreadable: Callable[[str, Exception], None] | None = None,
 ) -> Confirmation:
     """Return a confirmation of all enclaves in ``root``, a keystore or a robot's installed folder.
 
     Folders that are not named like an enclave are left out: no process can run in them.
-    Libraries in ``dds`` beyond the first 100 are counted as unseen processes.
 
     ``unreadable`` gets the name of each enclave of which a file cannot be read, and the error; the
     confirmation leaves the enclave out.  Without it, the error is raised.
@@ -303,9 +301,13 @@ def make_confirmation(
                 files[path] = hashlib.sha256(data).hexdigest()
                 if path.rpartition("/")[2] in _CERTIFICATE_FILES:
                     certificates[path] = certificate_digests(data)
-    if dds and (more := len(dds.libraries) - _MOST_LIBRARIES) > 0:
-        dds = RobotDds(dds.libraries[:_MOST_LIBRARIES], min(dds.unseen + more, _MOST_UNSEEN))
-    return Confirmation(robot, now, files, certificates, dds)
+    return Confirmation(robot, now, files, certificates)
+
+
+def shortened_dds(dds: RobotDds) -> RobotDds:
+    """Return a DDS in the form of a confirmation: further libraries count as unseen processes."""
+    more = max(len(dds.libraries) - _MOST_LIBRARIES, 0)
+    return RobotDds(dds.libraries[:_MOST_LIBRARIES], min(dds.unseen + more, _MOST_UNSEEN))
 
 
 def shortened_problems(problems: Iterable[str]) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import json
 import re
@@ -610,6 +611,21 @@ def test_a_report_says_which_restarts_are_due_if_all_processes_were_seen(field: 
         field.confirm("r1", *words)
         robot = field.status()["robots"]["r1"]
         assert (robot["state"], robot["crl_in_force"]) == (state, in_force)
+
+
+def test_files_that_are_replaced_during_a_report_are_not_reported_as_loaded(
+    field: Field, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = field.folder / "r1" / ENCLAVES / "r1/base/permissions.p7s"
+    before, look = hashlib.sha256(file.read_bytes()).hexdigest(), fleet_verbs._processes_here
+
+    def replace_and_look(*words: Any) -> EnclaveProcesses:
+        file.write_bytes(b"new")
+        return look(*words)
+
+    monkeypatch.setattr(fleet_verbs, "_processes_here", replace_and_look)
+    said = json.loads(field.run("fleet", "report", "r1", "--robot", "r1").out)
+    assert said["files"][f"{ENCLAVES}/r1/base/permissions.p7s"] == before
 
 
 def test_other_permissions_leave_the_list_in_force(field: Field) -> None:
