@@ -159,15 +159,16 @@ class _RemainingProcesses:
         """Yield how to restart open the processes that run in enclaves, except those of units."""
         closed = [process for process in self._started_by_hand if process.enclave in self._secured]
         counts = Counter(process.enclave for process in closed)
-        commands = []
+        steps = []
         for process in closed:
             secured = self._secured[process.enclave]
             is_alone = counts[process.enclave] == 1 and not process.launch
+            which = "it"
             if is_alone and not process.container and self._running.may_use_files(secured):
                 process = secured_process(secured, process.enclave)
-            commands.append(process.open_command(self._robot.domain))
-        for command in dict.fromkeys(commands):
-            yield f"restart it open: {command}"
+                which = f"process {secured.pid}"
+            steps.append(f"restart {which} open: {process.open_command(self._robot.domain)}")
+        yield from dict.fromkeys(steps)
 
     def secured_units(self) -> Iterator[str]:
         """Yield the processes of units that run in enclaves though their units were restarted."""
@@ -203,7 +204,7 @@ class _RemainingProcesses:
         known = {process.enclave for process in self._observed.processes}
         for enclave in sorted(self._secured.keys() - known):
             guest = self._secured[enclave]
-            remedy = f"restart it open: {process_text(guest)}"
+            remedy = f"restart process {guest.pid} open: {process_text(guest)}"
             if not self._running.may_use_files(guest):
                 remedy = f"it is {guest.label} of user {guest.user}, who cannot read its files"
             yield f"{enclave} runs in an enclave, too; {remedy}"

@@ -480,7 +480,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     (robot.folder / "link").symlink_to("robot")
     robot.spelled = "link/export"
     undone = robot.close("--undo", status=1)
-    assert undone.out == "restart it open: cd /opt && /opt/run talker\n"
+    assert undone.out == "restart process 4711 open: cd /opt && /opt/run talker\n"
     assert "/listener does not run; start it open: cd /opt && /opt/run listener\n" in undone.err
     policy = robot.folder / "robot/policy.xml"
     kept = policy.read_text()
@@ -583,7 +583,7 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     assert "the robot runs closed: process 4711 (run), process 4712 (run), process 7" in watching
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert f"\n# /late\ncd /opt && sros run {export} /late -- /opt/late --ros-args\n" in commands
-    undone = "restart it open: cd /opt && /opt/late --ros-args\n"
+    undone = "restart process 7 open: cd /opt && /opt/late --ros-args\n"
     assert undone in robot.close("--undo", status=1).out
     robot.by_hand, robot.more = set(), (replace(late, environment={}, enclave=None),)
     assert "the robot is open" in robot.close("--undo").err
