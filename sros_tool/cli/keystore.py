@@ -740,10 +740,10 @@ def update_keystore(
     settings need --allow-looser. The enclaves keep their keys and their rights.
 
     By default, everything changes at once. With --next, the change has two stages: first the
-    certificates and permissions, after which you can restart processes one by one; then, with the
-    same command, the governance. If the governance changes the protection of messages, processes
-    with the old and with the new governance do not communicate (Cyclone DDS 0.10.2, Fast DDS
-    2.14.5): restart them together.
+    certificates and permissions, after which you can restart processes one by one (together, if
+    files that they loaded have expired); then, with the same command, the governance. If the
+    governance changes the protection of messages, processes with the old and with the new
+    governance do not communicate (Cyclone DDS 0.10.2, Fast DDS 2.14.5): restart them together.
 
     The exit status of a dry run is 1 if --allow-looser is needed and missing.
 
