@@ -98,7 +98,7 @@ def map_slices(
 
     There is at most one slice for each core; this process handles the first slice, forked workers
     the others.  A short list becomes one slice without a worker, as does any list in a program
-    with several threads: a fork could leave the locks of other threads held for ever.  Results and
+    with several threads: a fork could leave the locks of other threads held forever.  Results and
     errors of workers are pickled.
 
     Raises:

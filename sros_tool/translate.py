@@ -273,7 +273,7 @@ class RosRight(NamedTuple):
 def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
     """Return the ROS rights of a rule, with the topics of services and actions combined again.
 
-    Other topics (half a service, a topic without ROS prefix) keep their DDS names, with ``kind``
+    Other topics (half a service, a topic without a ROS prefix) keep their DDS names, with ``kind``
     "dds".  Partitions and relay criteria are ignored.
     """
     qualifier = ALLOW if rule.allow else DENY

@@ -283,7 +283,7 @@ class Systemd:
         """
         listing = self._run(
             "list-units", "--plain", "--no-legend", "--state=active", "sros@*.service",
-            within=_ASK_SECONDS,
+            seconds=_ASK_SECONDS,
         )  # fmt: skip
         return frozenset(line.split()[0] for line in listing.splitlines() if line.split())
 
@@ -293,9 +293,9 @@ class Systemd:
         Raises:
             UnavailableError: it does not restart; the error says why.
         """
-        self._run("restart", unit, within=_RESTART_SECONDS)
+        self._run("restart", unit, seconds=_RESTART_SECONDS)
 
-    def _run(self, *words: str, within: float) -> str:
+    def _run(self, *words: str, seconds: float) -> str:
         failure = f"`{' '.join((*self._command, *words[:1], *words[-1:]))}` failed"
         try:
             done = subprocess.run(
@@ -303,11 +303,11 @@ class Systemd:
                 capture_output=True,
                 text=True,
                 errors="replace",
-                timeout=within,
+                timeout=seconds,
                 stdin=subprocess.DEVNULL,
             )
         except subprocess.TimeoutExpired as error:
-            raise UnavailableError(failure, f"It did not end within {within:.0f} s.") from error
+            raise UnavailableError(failure, f"It did not end within {seconds:.0f} s.") from error
         except OSError as error:
             raise UnavailableError(failure, f"{error.strerror or error}.") from error
         if done.returncode:

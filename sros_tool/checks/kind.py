@@ -267,7 +267,7 @@ class FindingFilter:
     lowest severity that is shown.  A prominent note is shown where warnings are.
 
     A weakness that the keystore's template chose, such as the single CA of template sros2, is
-    accepted: it counts as a note, and is summarised in one line if notes are not shown.  With
+    accepted: it counts as a note, and is summarized in one line if notes are not shown.  With
     ``strict`` it counts like any other finding.  A keystore made by ros2/sros2 has no template, so
     no finding is accepted.
     """

@@ -583,7 +583,7 @@ RELATIVE_GLOBAL = FindingKind(
     "policy.relative-global-name",
     ERROR,
     "a global ROS 2 topic that is written as a relative name",
-    "/rosout, /parameter_events and /clock are absolute also for nodes in a namespace, so the "
+    "/rosout, /parameter_events and /clock are absolute even for nodes in a namespace, so the "
     "rule allows a topic that no node uses. Sample policies of ros2/sros2 have this mistake.",
     "rcl 9 (logging_rosout.h: /rosout); rclcpp 28 (/parameter_events, /clock).",
     "Put a / before the name.",

@@ -247,7 +247,7 @@ def _possible_endpoints(
 
 
 def ros_use(endpoint: Endpoint) -> tuple[str, str]:
-    """Return the right that an endpoint needs, and its ROS name, or its DDS topic without one."""
+    """Return the right that an endpoint needs, and its ROS name or, if it has none, DDS topic."""
     right, name = right_to_use(endpoint.topic, writes=endpoint.direction == PUBLISH)
     return right or endpoint.direction, name
 

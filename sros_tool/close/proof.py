@@ -139,7 +139,7 @@ def _errors_text(robot: LocalRobot) -> str:
     findings = json.loads(output)["findings"]
     errors = [finding for finding in findings if finding["severity"] == "error"]
     if not errors:  # the files changed since `check` found some
-        return "sros check found an error: ask again"
+        return "sros check found an error, and then none: run the proof again"
     first = "{file}: {text}. {remedy}".format_map(errors[0]).rstrip(".")
     return f"sros check finds {counted(len(errors), 'error')}, the first in {first}"
 

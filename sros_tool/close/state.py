@@ -187,8 +187,8 @@ class RunningRobot:
                 domains.setdefault(process.domain, []).append(process.label)
         close = "sros close ANOTHER_FOLDER" if robot.observed else robot.close_command
         return "; ".join(
-            f"in domain {domain}, not {robot.domain}, runs {first_few(labels, MOST_NAMES)}: "
-            f"to close it, {close} --domain {domain}"
+            f"in domain {domain}, not {robot.domain}: {first_few(labels, MOST_NAMES)}; "
+            f"to close that, {close} --domain {domain}"
             for domain, labels in sorted(domains.items())
         )
 

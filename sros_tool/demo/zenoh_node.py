@@ -318,7 +318,7 @@ def _open(config: zenoh.Config, patience: float, stop: threading.Event) -> zenoh
         zenoh.ZError: the session does not open for another reason.
     """
     mode = json.loads(config.get_json("mode"))
-    # The files of sros let a session wait for its router for ever: here this function waits.
+    # The files of sros let a session wait for its router forever: here this function waits.
     config.insert_json5("connect/timeout_ms", "0")
     session = None
     latest = time.monotonic() + patience

@@ -442,7 +442,7 @@ _DIVIDED = (
     "judged the enclave with the fewest denials"
 )
 _UNCLEAR = (
-    "several enclaves are for these nodes, and the graph does not show in which of them they run; "
+    "several enclaves have these nodes, and the graph does not show in which of them they run; "
     "sros judged all of them; start each process with `--ros-args --enclave /its/name` to "
     "distinguish them"
 )

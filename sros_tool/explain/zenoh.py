@@ -939,7 +939,7 @@ class ZenohOfKeystore:
         return f"Zenoh ({self._reason_text})"
 
     def outcomes(self, question: Question) -> tuple[ZenohAnswer, ...]:
-        """Return an answer for each enclave, which does not list who is at the other end."""
+        """Return an answer for each enclave; the answers do not list who is at the other end."""
         # Imported here, because a question about one enclave needs neither.
         from sros_tool.explain.who import decide_each, first_allowing_domain
 

@@ -321,7 +321,7 @@ class RobotStatus:
         """Whether nothing is to be done: the robot's files are current and its agent reports no
         problem, or it has no enclaves.
 
-        All enclaves of a revoked robot are gone: the others need the revocation list.
+        A revoked robot has no enclaves any more: only the other robots need the revocation list.
         """
         if self.state is State.REVOKED:
             return not self.enclaves
@@ -335,7 +335,7 @@ class RobotStatus:
         return self.received
 
     def is_locked_out(self, now: datetime) -> bool:
-        """Return whether a web server with the current CA and list refuses it at ``now``."""
+        """Return whether a web server with the current CA and list refuses the robot at ``now``."""
         return self.locked_out_from is not None and self.locked_out_from <= now
 
     def offline(self) -> RobotStatus:
@@ -669,7 +669,7 @@ class _ComparedRobot(NamedTuple):
     def restart(self) -> tuple[str, ...] | None:
         """Return the enclaves whose processes have earlier files; None if it was not reported.
 
-        Processes may still run in an enclave that the keystore gives to the robot no more.
+        Processes may still run in an enclave that the keystore no longer gives to the robot.
         """
         running = self.running()
         due = self.confirmed.restart if self.confirmed else None
@@ -964,8 +964,8 @@ class _KeystoreRecords:
         """Return the enclaves whose certificate is for a key that the robot does not have.
 
         These are the enclaves of which the robot has no file, the enclaves with an earlier key, and
-        the enclaves of which its agent says so.  A key that the keystore lacks was made on the
-        robot, and a release is enough.
+        the enclaves whose key, as its agent reports, is missing.  A key that the keystore lacks was
+        made on the robot, and a release is enough.
         """
         confirmed = compared_robot.confirmed
         if confirmed is None:
@@ -1334,7 +1334,7 @@ class _Stages:
         return self._new["identity_ca"]
 
     def is_of_replaced_ca(self, compared_robot: _ComparedRobot) -> bool:
-        """Return whether all certificates of a robot are of identity CAs that are trusted no more.
+        """Return whether all certificates of a robot are of untrusted, replaced identity CAs.
 
         Files of the stage ``distribute`` are those of the old CA, which trust the new one, too.
         """

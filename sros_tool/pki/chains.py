@@ -282,7 +282,7 @@ def _network_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
         ]
         for certificate, networks in zip(chain, values, strict=True):
             if len(networks) > 1 or not set(networks) <= set(_INHERITED):
-                yield f"{subject_text(certificate.subject)} has {title}, not known to sros"
+                yield f"{subject_text(certificate.subject)} has {title}, which sros does not know"
         if values[0] and values[-1]:
             yield f"{subject_text(chain[-1].subject)} has {title} of another CA, and is trusted"
 
@@ -484,7 +484,7 @@ def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
             extension.oid == ExtensionOID.POLICY_MAPPINGS for extension in certificate.extensions
         )
         if maps and policies is not None:
-            yield f"{name} has policyMappings, not known to sros"
+            yield f"{name} has policyMappings, which sros does not know"
         asked = _ALWAYS_ASKED if policies is None else _OF_POLICIES
         if any(
             extension.oid in asked and is_unread(extension) for extension in certificate.extensions

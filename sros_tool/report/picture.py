@@ -334,7 +334,7 @@ class Influence:
 class Focus:
     """The answer to a question about one name or enclave.
 
-    The answer holds for all names that rights allow, also for names that the picture does not have.
+    The answer holds for all names that rights allow, even for names that the picture does not have.
     """
 
     kind: Annotated[str, Words((*_KINDS, "enclave"))]

@@ -160,8 +160,8 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
         text = f"enclaves are for different ROS domains ({several}), and a name is drawn once for "
         text += "all of them. Information goes only between enclaves with a common domain"
         if any(_rights_differ_by_domain(source) for source in read):
-            text += "; a click on a page takes each right of an enclave for a right in all domains "
-            text += "of the enclave (--focus takes each right only in its own)"
+            text += "; on a page, a click treats each right as if it held in all domains of its "
+            text += "enclave (--focus treats each right only in its own domains)"
         text += "."
         finding = PicturedFinding("view.domains", "note", text)
         picture = replace(picture, findings=(*picture.findings, finding))

@@ -881,9 +881,11 @@ def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
     assert "would not be heard any more (accept: --partial)" in robot.close("--apply", status=1).out
     assert robot.restarts == []
     robot.more = (replace(robot.more[0], pid=6, environment={"ROS_DOMAIN_ID": "1"}),)
-    ended, in_1 = robot.close("--for", "1s"), "in domain 1, not 0, runs process 6 (other): to cl"
+    ended, in_1 = robot.close("--for", "1s"), "in domain 1, not 0: process 6 (other); to cl"
     assert "process 6" not in ended.out and in_1 in ended.err
-    assert f"; {in_1}ose it, sros close ANOTHER_FOLDER --d" in robot.close("--proof", status=1).out
+    assert (
+        f"; {in_1}ose that, sros close ANOTHER_FOLDER --d" in robot.close("--proof", status=1).out
+    )
     robot.close("--apply")
 
 
@@ -1184,7 +1186,7 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
     assert "process 4711 (run) speaks DDS, but this shell is set up for Zenoh. Run `unset " in said
     robot.more, robot.nodes = (Process(5, ("a",), {"ROS_DOMAIN_ID": "7"}, datetime.now(UTC)),), ()
     ended = robot.close(status=2)
-    there = "in domain 7, not 0, runs process 5 (a): to close it, sros close robot --domain 7"
+    there = "in domain 7, not 0: process 5 (a); to close that, sros close robot --domain 7"
     assert f"to close: no node was observed in domain 0. {there}. Otherwise start the" in ended.err
     robot.more = ()
     assert not (robot.folder / "robot").exists()

@@ -142,7 +142,7 @@ def choose_grant(
 ) -> int | Refusal:
     """Return the index of the grant that decides for ``subject``, or why no grant does."""
     if not subject and traits.crashes_on_empty_subject:
-        text = f"{traits.title} ends with an error at a certificate with an empty subject."
+        text = f"{traits.title} fails with an error on a certificate with an empty subject."
         return Refusal("empty-subject", text, Outcome.CRASHES)
     now = moment.timestamp()
     outdated: Refusal | None = None

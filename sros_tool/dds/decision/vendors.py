@@ -198,9 +198,9 @@ class VendorTraits:
     Access control in the other direction of the topic prevents this (tested).
     """
     ignores_unauthenticated: bool = False
-    """Participants without identity are refused even if governance allows them (2.9)."""
+    """Participants without an identity are refused even if governance allows them (2.9)."""
     controls_unauthenticated: bool = True
-    """Access control applies to participants without identity.
+    """Access control applies to participants without an identity.
 
     If it does not, all topics with enable_discovery_protection are hidden from them, whatever
     discovery_protection_kind is (Cyclone DDS 0.10.2).

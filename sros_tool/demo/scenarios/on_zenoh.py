@@ -602,14 +602,14 @@ def _trespass_rows() -> tuple[Row, ...]:
         ("past the router", _past_the_router),
         ("through the router", _through_the_router),
     ):
-        for party, does, denied, done in _ENTRIES:
-            attack = f"another enclave {does} {way}"
+        for party, act, denied, done in _ENTRIES:
+            attack = f"another enclave {act} {way}"
             rows += tries(attack, *rows_of(party, attack, denied, done))
-    for party, does, _, done in _ENTRIES[:2]:
+    for party, act, _, done in _ENTRIES[:2]:
         rows += tries(
-            f"another enclave {does} past the router",
+            f"another enclave {act} past the router",
             _trespass_row(
-                f"an enclave that was given the topic {does}",
+                f"an enclave that was given the topic {act}",
                 party,
                 done,
                 "the rules allow it",

@@ -196,7 +196,7 @@ def later_revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
 
     Raises:
         KeystoreError: the folder has more archives than the fleet can need: whoever has the web
-            server could else keep the keystore busy for ever.
+            server could else keep the keystore busy forever.
     """
     serials: set[int] = set()
     read_lists: set[bytes] = set()
