@@ -159,7 +159,7 @@ def test_its_own_template_is_accepted(same: str, root: Path) -> None:
 
 def test_what_a_new_keystore_leaves_open_is_said(tmp_path: Path) -> None:
     ended = sros("generate_artifacts", "-k", tmp_path / "ks", "-e", "/a").ok()
-    assert "still open: by the template development, an enclave without a policy" in ended.err
+    assert "still open: with the template development, an enclave without a policy" in ended.err
     (_, command) = commands(ended.err)
     sros(*command).ok()
     words = ("generate_artifacts", "-k", tmp_path / "other", "-e", "/a")
