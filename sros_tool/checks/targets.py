@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from shlex import quote
@@ -23,6 +24,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.xml import read_bytes
 
+_COMMENT = re.compile(rb"<!--.*?(?:-->|\Z)", re.DOTALL)
 _ENCLAVE_FILES = (*REQUIRED_FILES, KEY_URI_FILE, "permissions.xml", "crl.pem", "request.pem")
 
 
@@ -106,7 +108,7 @@ def _policies_at(path: Path) -> list[Path]:
     from sros_tool.policy.document import files_of_policies
 
     if not path.is_dir():
-        begin = read_bytes(path, "file")[:1000].lower()
+        begin = _COMMENT.sub(b"", read_bytes(path, "file")[:1000]).lower()
         if b"multipart/signed" in begin or b"<dds" in begin:
             raise DocumentError(
                 f"'{path}' is a DDS Security document without its enclave",

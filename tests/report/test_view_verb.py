@@ -114,6 +114,9 @@ def test_permissions_alone_are_neither_verified_nor_a_broken_policy(
     for lone in (file, plain):
         checked = sros("check", lone)
         assert checked.status == 2 and "Name the folder of the enclave" in checked.err
+    policy = write(tmp_path, "robot.xml", "/x")
+    policy.write_text(policy.read_text().replace("<enclaves>", "<!-- see <dds> --><enclaves>", 1))
+    assert "[policy." in sros("check", policy).out
     (tmp_path / "permissions_ca.cert.pem").write_bytes(
         (robot_keystore / "public/permissions_ca.cert.pem").read_bytes()
     )
