@@ -17,7 +17,8 @@ Names and enclaves can have the placeholders of policies, which a fleet fills in
 ``{namespaces}`` stand for one name for each robot.
 
 Whoever changes a policy can also change its requirements.  A requirement counts as kept if
-requirements of the new file together demand at least as much, whatever their names and order.
+requirements of the new file together demand at least as much, whatever their names and order: in
+the namespace ``/``, and also in every other one, for a file that is read for no namespace.
 """
 
 from __future__ import annotations
@@ -60,6 +61,8 @@ EXCEPT = "!"
 _WORDS = ("name", "why")
 """Keys with words, which are in every table."""
 _LEVELS = {"sign": Level.SIGN, "encrypt": Level.ENCRYPT}
+_ELSEWHERE = "/[\ue000]"
+"""Any namespace but ``/``: of the names that a file can have, only ``*`` covers the letter."""
 
 
 class RobotNames(NamedTuple):
@@ -80,7 +83,8 @@ class Requirement:
     """Base class of requirements: place of its table in the file, its name and reason (or "").
 
     ``robot`` is the robot whose values its placeholders have, or "".  ``as_written`` says whether
-    its names are those in the file, and not of a robot or namespace.
+    its names are those in the file, and not of a robot or namespace.  ``elsewhere`` is the
+    requirement in any other namespace; None if the file was read for a namespace.
     """
 
     KIND: ClassVar[str]
@@ -91,6 +95,7 @@ class Requirement:
     robot: str = ""
     of_robots: tuple[RobotNames, ...] = field(default=(), compare=False, repr=False)
     as_written: bool = field(default=True, compare=False, repr=False)
+    elsewhere: Requirement | None = field(default=None, compare=False, repr=False)
 
     def __str__(self) -> str:
         """Return the requirement's own name, or the sentence with its demand."""
@@ -333,6 +338,9 @@ def parse_requirements(
     pairs_left = _MOST_PAIRS
     for table in filled:
         requirement = _READERS[table.kind](table)
+        if table.namespace == "/":
+            moved = _READERS[table.kind](replace(table, namespace=_ELSEWHERE))
+            requirement = replace(requirement, elsewhere=moved)
         requirements.append(requirement)
         if len(requirements) > _MOST_FILLED:
             raise DocumentError(
@@ -827,16 +835,18 @@ class DroppedRequirement:
     """A requirement of the earlier file that the new file drops or weakens.
 
     ``requirement`` has its place in the earlier file; ``kept`` are requirements of the new file
-    about some of the same names or enclaves.
+    about some of the same names or enclaves.  ``only_elsewhere``: the new file demands it, but not
+    in every other namespace.
     """
 
     requirement: Requirement
     kept: tuple[Requirement, ...] = ()
+    only_elsewhere: bool = False
 
     @property
     def change(self) -> str:
         """``dropped`` if the new file demands nothing similar, else ``weakened``."""
-        return "weakened" if self.kept else "dropped"
+        return "weakened" if self.kept or self.only_elsewhere else "dropped"
 
     @property
     def demand(self) -> str:
@@ -870,6 +880,11 @@ class DroppedRequirement:
 
     def text(self) -> str:
         """Return a clause with the part of the requirement that the new file still demands."""
+        if self.only_elsewhere:
+            return (
+                "the new file demands less in another namespace (`sros check --namespace`): a name "
+                "moves with the namespace in only one of the files"
+            )
         if not self.kept:
             return "the new file has no such requirement"
         return f"the new file demands less: {'; '.join(self.now)}"
@@ -882,26 +897,39 @@ def dropped_requirements(
 
     All other requirements of ``before`` hold wherever all requirements of ``after`` hold.
     """
+    after = tuple(after)
     new_parts = [
         (part, new_requirement) for new_requirement in after for part in _parts(new_requirement)
     ]
-    new_demands = {_only_demand(part) for part, _ in new_parts}  # a fast test for equal parts
+    is_demanded = _demanded_by(after)
+    is_demanded_elsewhere = _demanded_by(filter(None, (new.elsewhere for new in after)))
     dropped = []
     for requirement in before:
-        parts = tuple(_parts(requirement))
-        if all(
-            _only_demand(part) in new_demands
-            or any(_implies(new_part, part) for new_part, _ in new_parts)
-            for part in parts
-        ):
+        here, elsewhere = is_demanded(requirement), requirement.elsewhere
+        if here and (elsewhere is None or is_demanded_elsewhere(elsewhere)):
             continue
+        parts = tuple(_parts(requirement))
         remaining = (
             new_requirement
             for new_part, new_requirement in new_parts
             if any(_is_alike(new_part, part) for part in parts)
         )
-        dropped.append(DroppedRequirement(requirement, tuple(dict.fromkeys(remaining))))
+        dropped.append(DroppedRequirement(requirement, tuple(dict.fromkeys(remaining)), here))
     return tuple(dropped)
+
+
+def _demanded_by(requirements: Iterable[Requirement]) -> Callable[[Requirement], bool]:
+    """Return a function that returns whether ``requirements`` fully demand a requirement."""
+    parts = [part for requirement in requirements for part in _parts(requirement)]
+    demands = {_only_demand(part) for part in parts}  # a fast test for equal parts
+
+    def is_demanded(requirement: Requirement) -> bool:
+        return all(
+            _only_demand(old) in demands or any(_implies(part, old) for part in parts)
+            for old in _parts(requirement)
+        )
+
+    return is_demanded
 
 
 def dropped_findings(

@@ -69,6 +69,11 @@ WEAKENED = {
     "less that nobody may both": (NOT_BOTH.replace("/a", "/*"), NOT_BOTH),
     "somebody is not kept apart": (APART, APART.replace('"/web/*"', '"/web/*", "!/web/x"')),
 }
+ELSEWHERE = {
+    "a name moves": ('"/a"', '"a"'),
+    "a name stays": ('"a"', '"/a"'),
+    "a name stays, and some namespaces are named": ('"a"', '"/a", "/[!l]*/a", "/?/a"'),
+}
 DROPPED = {
     "another kind": (ONLY, MUST),
     "other names": (ONLY, ONLY.replace("/a", "/c").replace("/b", "/d")),
@@ -90,6 +95,16 @@ def test_what_is_demanded_in_part_is_weakened(case: str) -> None:
     before, after = map(read, WEAKENED[case])
     (found,) = dropped_requirements(before, after)
     assert (found.change, found.kept) == ("weakened", after)
+
+
+@pytest.mark.parametrize("case", ELSEWHERE)
+def test_what_no_longer_moves_with_the_namespace_is_weakened(case: str) -> None:
+    before, after, wider = (
+        read(ONLY.replace('"/a"', names)) for names in (*ELSEWHERE[case], '"*/a", "/a"')
+    )
+    (found,) = dropped_requirements(before, after)
+    assert (found.change, found.only_elsewhere) == ("weakened", True)
+    assert dropped_requirements(before, before) == dropped_requirements(before, wider) == ()
 
 
 @pytest.mark.parametrize("case", DROPPED)
