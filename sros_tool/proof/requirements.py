@@ -1083,8 +1083,9 @@ def _enclaves_within(narrow: Sequence[str], wide: Sequence[str]) -> bool:
     )
     narrow_names = [name for name in narrow if not name.startswith(EXCEPT)]
     wide_names = [name for name in wide if not name.startswith(EXCEPT)]
+    names = [name.replace(_ELSEWHERE, "/*", 1) for name in narrow_names]
     still_excepted = (
-        enclave for enclave in wide_excepted if any(overlap(enclave, name) for name in narrow_names)
+        enclave for enclave in wide_excepted if any(overlap(enclave, name) for name in names)
     )
     return _patterns_within(narrow_names, wide_names) and _patterns_within(
         still_excepted, narrow_excepted

@@ -107,6 +107,13 @@ def test_what_no_longer_moves_with_the_namespace_is_weakened(case: str) -> None:
     assert dropped_requirements(before, before) == dropped_requirements(before, wider) == ()
 
 
+def test_an_exception_of_some_namespaces_is_weakened() -> None:
+    before, after = read(NOTHING_BUT), read(NOTHING_BUT.replace('"/y"', '"/y", "!*/left/*"'))
+    (found,) = dropped_requirements(before, after)
+    assert found.only_elsewhere
+    assert dropped_requirements(after, after) == ()
+
+
 @pytest.mark.parametrize("case", DROPPED)
 def test_what_is_not_demanded_is_dropped(case: str) -> None:
     before, after = map(read, DROPPED[case])
