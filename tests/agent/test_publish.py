@@ -78,6 +78,13 @@ def numbers(publisher: Home) -> dict[str, int]:
 # ── who gets what ──────────────────────────────────────────────────────────────────────────
 
 
+def forget_publishing(root: Path) -> None:
+    """Remove what a keystore has since it published first, except from its ledger."""
+    for path in (*root.glob("fleet_root.json"), *root.glob("private/fleet_*")):
+        path.unlink()
+    (root / "published.json").unlink()
+
+
 def test_only_what_changes_is_published_again(publisher: Home) -> None:
     before, old = archives(publisher), numbers(publisher)
     assert not publisher.publish().names("published")
@@ -830,6 +837,36 @@ def test_a_publishing_folder_that_was_lost(publisher: Home) -> None:
     assert not publisher.publish(new_folder=True).names("published")
 
 
+@pytest.mark.parametrize("backup_published", [False, True])
+def test_a_folder_without_metadata_has_releases_that_the_keystore_does_not_know(
+    publisher: Home, backup_published: bool
+) -> None:
+    """Publishing there would bring back a robot that was revoked after the backup."""
+    backup = copy_of(publisher.root, publisher.folder / "backup")
+    if not backup_published:
+        forget_publishing(backup)
+    publisher.run("revoke", "ks", "--robot", "r5")
+    publisher.publish()
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    if backup_published:
+        shutil.rmtree(publisher.pub / "metadata")
+    before = snapshot(publisher.root)
+    for new_folder in (False, True):
+        with pytest.raises(KeystoreError, match="the keystore's CA sealed: r1, r2, up") as refused:
+            publisher.publish(new_folder=new_folder)
+        remedy = refused.value.remedy
+        words = ("fleet collect", "sros revoke", "/metadata'", "--restored --new-folder")
+        assert [remedy.index(word) for word in words] == sorted(map(remedy.index, words))
+        assert ("agent init --force" in remedy) is not backup_published
+        shutil.rmtree(publisher.pub / "metadata", ignore_errors=True)
+    assert snapshot(publisher.root) == before
+    done = publisher.publish(restored=True, new_folder=True)
+    assert done.notes[0].id == "fleet.revocations-restored" and "/r5/base" in done.notes[0].text
+    publisher.robot().gets()
+    publisher.robot("r5").refuses(FetchProblem.NOT_FOR_ROBOT)
+
+
 def test_keystore_and_folder_that_were_lost(publisher: Home) -> None:
     """What home gave after the backup, and nobody there knows, is never given twice."""
     backup = copy_of(publisher.root, publisher.folder / "backup")
@@ -878,10 +915,7 @@ def test_links_and_pipes_in_a_publishing_folder_lead_nowhere(publisher: Home, at
 
 
 def test_the_folder_of_another_keystore(publisher: Home) -> None:
-    for name in ("fleet_root.json", "published.json"):
-        (publisher.root / name).unlink()
-    for path in (publisher.root / "private").glob("fleet_*"):
-        path.unlink()
+    forget_publishing(publisher.root)
     before = snapshot(publisher.folder)
     with pytest.raises(KeystoreError, match="did not write"):
         publisher.publish()

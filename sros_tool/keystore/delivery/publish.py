@@ -579,7 +579,12 @@ class _Run:
         self.list.folder = os.path.abspath(folder)  # noqa: PTH100 - keeps a link as it is named
         self._now = now
         self._dry_run = dry_run
-        self._present = read_present(folder, self.roots)
+        try:
+            self._present = read_present(folder, self.roots)
+        except KeystoreError as error:
+            if unknown := self._unknown_releases():
+                raise self._unknown_error(unknown) from error
+            raise
         self._there = self._present.releases()
         self._composed: Composed | None = None
         self._made: list[_ReleaseOutcome] = []
@@ -618,17 +623,20 @@ class _Run:
                 releases revoke cannot be read.
         """
         is_lost = self._published_before and not self._present.timestamp
+        unknown = [] if self._present.timestamp else self._unknown_releases()
+        if unknown and not restored:
+            raise self._unknown_error(unknown)
         if is_lost and not new_folder:
             raise self._nothing_published_error()
         is_later = self._has_later_releases(restored)
-        if restored and not (is_later or new_folder or self._shows_restore()):
+        if restored and not (is_later or unknown or new_folder or self._shows_restore()):
             raise self._not_restored_error()
         if restored and not is_later:
             self._check_removed()
         if restored:
             forgotten = Forgotten(self.keystore, self._now)
-            if is_later:
-                last = self._last_read()
+            if is_later or unknown:
+                last = self._last_read() if is_later else unknown[-1]
                 self._check_authorities(last)
                 for path, content in last.files.items():
                     if path.endswith(f"/{CRL_FILE}"):
@@ -837,8 +845,49 @@ class _Run:
                 )
         self._notes += revocation.notes
 
+    def _unknown_releases(self) -> list[Release]:
+        """Return the sealed releases, by number, that the keystore does not know, or whose list."""
+        entries = self.keystore.ledger_with("what", "release").entries
+        known = {entry.number for entry in entries if entry.what == "release"}
+        forgotten = Forgotten(self.keystore, self._now)
+        unknown = [
+            release
+            for release in self._sealed_releases()
+            if release.number not in known
+            or any(
+                forgotten.add(content)
+                for path, content in release.files.items()
+                if path.endswith(f"/{CRL_FILE}")
+            )
+        ]
+        return sorted(unknown, key=lambda release: release.number)
+
+    def _unknown_error(self, unknown: Sequence[Release]) -> KeystoreError:
+        where = quote(str(self.keystore.root))
+        robots = sorted({release.robot for release in unknown})
+        end = "and publish again"
+        if not self._published_before:
+            end = "publish again, and give agents the new root metadata (`sros agent init --force`)"
+        return self._restored_error(
+            f"has releases that the keystore's CA sealed: {first_few(robots, 3)}, up to the number "
+            f"{unknown[-1].number}",
+            f"first run `sros fleet collect {where} INBOX`, because messages of robots show what "
+            f"was revoked; revoke again what else was revoked (`sros revoke {where} --robot "
+            f"NAME`); empty '{self._folder / _METADATA}', and add --restored --new-folder, which "
+            f"also revokes again what these releases revoke. Then renew all certificates, {end}: "
+            "docs/howto/keystore_is_lost.md",
+        )
+
     def _sealed_certificates(self) -> Iterator[x509.Certificate]:
-        """Yield the certificates in all archives that a permissions CA of the keystore sealed."""
+        """Yield the certificates in all releases that a permissions CA of the keystore sealed."""
+        for release in self._sealed_releases():
+            for file, content in release.files.items():
+                if file.endswith(f"/{CERTIFICATE_FILE}"):
+                    with suppress(SrosError):
+                        yield from load_certificates(content, file)[:1]
+
+    def _sealed_releases(self) -> Iterator[Release]:
+        """Yield the releases in all archives that a permissions CA of the keystore sealed."""
         authorities = self.keystore.authority(PERMISSIONS)
         for path in self._paths():
             if not path.startswith(f"{_ARCHIVES}/"):
@@ -846,11 +895,8 @@ class _Run:
             with suppress(SrosError):
                 data = read_bytes(self._folder / path, "archive", max_bytes=OF_ONE_ROBOT.packed)
                 release = read_release(data)
-                if seal_problem(release, authorities):
-                    continue
-                for file, content in release.files.items():
-                    if file.endswith(f"/{CERTIFICATE_FILE}"):
-                        yield from load_certificates(content, file)[:1]
+                if not seal_problem(release, authorities):
+                    yield release
 
     # ── which robots ───────────────────────────────────────────────────────────────────────
 

@@ -267,8 +267,9 @@ def _foreign_folder_error(folder: Path, why: str) -> KeystoreError:
     return KeystoreError(
         f"'{folder}' has metadata that this keystore did not write",
         f"{why[:1].upper()}{why[1:].removesuffix('.')}.",
-        "Name another folder. If this keystore published to it before, and it is damaged, remove "
-        f"'{folder / _METADATA}', and publish again with --new-folder.",
+        "Name another folder. If the keystore was restored from a backup, first follow "
+        "docs/howto/keystore_is_lost.md. If this keystore published to it before, and it is "
+        f"damaged, remove '{folder / _METADATA}', and publish again with --new-folder.",
     )
 
 
