@@ -543,7 +543,7 @@ def fleet_status(
         keystore: A keystore with a fleet, or its path.
         robots: The names of some robots; all by default.
         max_age: Robots whose last confirmation is older are ``overdue`` and ``offline``; without
-            it, robots that fetch are both after a day without a message.
+            ``max_age``, this applies to robots that fetch after a day without a message.
         now: The time from which ages count; the current time by default.
 
     Returns:

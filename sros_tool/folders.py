@@ -139,7 +139,7 @@ class Folder:
             return open(os.open(name, _OLD_FILE, dir_fd=parent), "rb")
 
     def read_inside(self, path: str) -> bytes:
-        """Return the content of a file, as `read`, also through links that stay in the folder.
+        """Return the content of a file, as `read` does, also through links that stay in the folder.
 
         Raises:
             KeystoreError: a link leads out of the folder.

@@ -228,7 +228,7 @@ def check_namespace(ns: str) -> str:
 
 
 def check_plain_namespace(ns: str) -> str:
-    """Return a normalized namespace as `check_namespace`; refuse one with a wildcard, too."""
+    """Return a normalized namespace as `check_namespace` does; refuse wildcards, too."""
     if is_expression(ns):
         raise InvalidNameError(f"the namespace {ns!r} has a wildcard", "", "Write it as /left.")
     return check_namespace(ns)

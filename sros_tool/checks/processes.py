@@ -513,7 +513,7 @@ PROCESS_OTHER_FOLDER = FindingKind(
     WARNING,
     "a process that runs in an enclave from another folder",
     "The process loaded a copy of the enclave's files. What is delivered here, such as a "
-    "revocation list, does not reach it, also not by a restart.",
+    "revocation list, does not reach it, not even by a restart.",
     "rcl 9 (rcl/src/rcl/security.c): ROS_SECURITY_KEYSTORE names the folder.",
     "Stop the process, start it from the folder that gets new files (`sros run KEYSTORE ENCLAVE -- "
     "COMMAND...`), and remove the copy.",

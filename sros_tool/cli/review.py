@@ -211,8 +211,8 @@ def review(
     r"""Review a change of policies, requirements and keystores, as in a pull request.
 
     Checks the policies and keystores of the commit HEAD, decides whether the requirements of HEAD
-    hold, and those that HEAD drops, and compares all access with the commit BASE. PATHs are
-    relative to the top of the repository.
+    and the requirements that HEAD drops hold, and compares all access with the commit BASE. PATHs
+    are relative to the top of the repository.
 
     Both commits are read from git itself: nothing is checked out, and files of the work tree are
     read only to report that they differ. No link in a commit is followed, and no program of the
@@ -613,7 +613,7 @@ def _verdict(result: Review) -> str:
         if count
     ]
     if allowed := sum(step.allowed for step in result.steps):
-        words.append(f"{counted(allowed, 'step')} found what is allowed")
+        words.append(f"{counted(allowed, 'step')} found something that is allowed")
     left_out = f"; but {'; '.join(result.left_out)}" if result.left_out else ""
     compared = f" compared with {result.base}" if result.base else ""
     return f"{result.head}{compared}: {' and '.join(words) or 'nothing found'}{left_out}"

@@ -1158,7 +1158,7 @@ def _notes(answer: ZenohAnswer, stated: Answer, outdated: Sequence[str] | None) 
 def _note_on_unsigned(files: Sequence[str]) -> Iterator[Note]:
     if files:
         text = (
-            f"the permissions CA has not signed {', '.join(files)}: anyone who can write to it can "
-            "give rights, because Zenoh verifies no signature."
+            f"the permissions CA has not signed {', '.join(files)}: anyone who can write to an "
+            "unsigned file can give rights, because Zenoh verifies no signature."
         )
         yield Note("explain.zenoh-unsigned", text)

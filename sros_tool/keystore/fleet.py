@@ -91,7 +91,7 @@ def enclaves_of_several_distributions(keystore: OpenedKeystore) -> dict[tuple[st
 
 
 def checked_fleet(keystore: OpenedKeystore) -> Fleet | None:
-    """Return the fleet as `load_fleet`, after checking that nobody edited its file.
+    """Return the fleet as `load_fleet` does, after checking that nobody edited its file.
 
     Verbs that issue or send files by the fleet use this.
 

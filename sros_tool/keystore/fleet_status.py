@@ -530,7 +530,7 @@ class FleetStatus:
         return all(robot.settled for robot in self.robots)
 
     def with_overdue(self, now: datetime, max_age: timedelta | None = None) -> FleetStatus:
-        """Return a copy with what is to be done, in which robots silent for long are offline.
+        """Return a copy with what is to be done, in which long-silent robots are offline.
 
         These are the robots whose last confirmation is older than ``max_age``; without
         ``max_age``, the robots that fetch and sent nothing for more than a day.  Messages of robots

@@ -368,7 +368,7 @@ class LedgerFile:
         return self._reading_with(_EVERY, terms).ledger
 
     def next_number(self) -> int:
-        """Return the number for a new answer, as `Ledger.next_number`."""
+        """Return the number for a new answer, as `Ledger.next_number` does."""
         if index := self._opened().ledger_index:
             state = index.state
             return max(state.lines, state.number) + 1

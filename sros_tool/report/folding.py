@@ -74,7 +74,7 @@ class Folding(NamedTuple):
         """Return a picture with equal units drawn as one.
 
         Args:
-            picture: any picture, also with a focus or of two sources.
+            picture: any picture, even one with a focus or of two sources.
             robots: the robots of a fleet, by their enclaves.
         """
         return _Draft(picture, robots or {}).folding()

@@ -146,8 +146,8 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
     hosts = places | _hosts(drawing.hosts)
     if observed:
         observation = union(list(map(PictureSource.titled, observed, titles[len(read) :])))
-        homes = enclaves_of_nodes(observation.nodes, read[0].nodes)
-        read.append(observation.moved_to_homes(homes))
+        enclave_of = enclaves_of_nodes(observation.nodes, read[0].nodes)
+        read.append(observation.moved_to_homes(enclave_of))
     picture = _compared_picture(read, hosts, use=bool(drawing.observed))
     governed = [source.governance for source in read if source.governance]
     if len(governed) == 2 and governed[0] != governed[1]:

@@ -221,7 +221,7 @@ def test_dropping_a_requirement_is_a_consent_of_its_own(change: Change) -> None:
         "[requirement.violated]",
     )
     assert failed.status == 1 and all(line in failed.out for line in lines), failed
-    assert "1 step failed and 1 step found what is allowed" in failed.out
+    assert "1 step failed and 1 step found something that is allowed" in failed.out
     assert "\n  + /b publish topic /x  (robot.xml:6)" in failed.out
     allowed = change.review(*words, "--dropped-requirements", "allow", "--json").ok()
     steps = {step["step"]: step for step in json.loads(allowed.out)["steps"]}

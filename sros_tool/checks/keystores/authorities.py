@@ -227,7 +227,7 @@ CA_KEY_PLAIN = FindingKind(
 CA_KEY_FEW_ROUNDS = FindingKind(
     "keystore.ca-key-few-rounds",
     NOTE,
-    "a CA key whose passphrase can be guessed fast",
+    "a CA key whose passphrase can be guessed quickly",
     "Whoever copies the key can try millions of passphrases in a minute. OpenSSL makes 2048 rounds "
     "of PBKDF2 by default; 600,000 are recommended, or scrypt.",
     "OWASP Password Storage Cheat Sheet (2025); OpenSSL 3.0 (openssl-pkcs8).",

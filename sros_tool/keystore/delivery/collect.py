@@ -525,7 +525,7 @@ class _Verifier:
     def _arrival(self, file: _File, last: Received | None) -> datetime:
         """Return when the file of a message was written, but not before the last message.
 
-        Messages may lie in the inbox for long before somebody takes them in.
+        Messages may lie in the inbox for a long time before somebody takes them in.
         """
         earliest = last.time if last else file.written
         return min(max(file.written, earliest), self._now).replace(microsecond=0)

@@ -1097,7 +1097,7 @@ class _Run:
         self._changes = changes_below(self.keystore.root, change.transaction.changes)
 
     def write(self, keys: _Keys) -> None:
-        """Write the metadata, the timestamp last; then remove files that were unused for long.
+        """Write the metadata, the timestamp last; then remove files long unused.
 
         A new root is written first if the current metadata already fits it; otherwise after the
         new metadata, which the keys of both roots have signed.  So robots find complete metadata
