@@ -111,7 +111,7 @@ def test_what_nodes_remap_otherwise_is_noted() -> None:
         (
             ["plan:=/arm/plan"],
             ["merge.remapped-action"],
-            f"earlier ones with `--ros-args {rules}`.",
+            f"earlier versions with `--ros-args {rules}`.",
         ),
         (["__node:=x"], ["merge.remapped-nodes"], "name to the nodes hand and n. Take the one"),
         (["n:__node:=x"], [], ""),
