@@ -113,7 +113,7 @@ def test_what_nodes_remap_otherwise_is_noted() -> None:
             ["merge.remapped-action"],
             f"earlier versions with `--ros-args {rules}`.",
         ),
-        (["__node:=x"], ["merge.remapped-nodes"], "name to the nodes hand and n. Take the one"),
+        (["__node:=x"], ["merge.remapped-nodes"], "name to the nodes hand and n. Choose the node"),
         (["n:__node:=x"], [], ""),
         (["__ns:=/left"], [], ""),
     ):
