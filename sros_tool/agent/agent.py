@@ -183,6 +183,8 @@ class _Round:
         self._settings = settings
         self._machine = machine
         self._problems: list[str] = []
+        self._brought: list[str] = []
+        """Enclaves that the installed release does not have, and that are newer."""
         self._state = read_state(folder)
         self._is_in_step = False
         """Whether the installed files, with their revocation list, are those of the last
@@ -364,9 +366,11 @@ class _Round:
     def _changed_files(self) -> tuple[str, ...] | None:
         """Return the paths of files that are missing, or differ from the installed release.
 
-        None if no release is installed with all its enclaves, or its seal cannot be read.
+        The release removes enclaves that it does not have: their certificates are included, too.
+        An enclave that somebody brought after the release is only reported.  None if no release is
+        installed with all its enclaves, or its seal cannot be read.
         """
-        state, changed_paths = self._state, []
+        state, changed_paths, released = self._state, [], set()
         if not state.accepted or state.release != state.accepted:
             return None
         try:
@@ -374,8 +378,23 @@ class _Round:
             with Folder(self._folder) as opened:
                 for line in text.splitlines():
                     digest, mark, path = line.decode(errors="replace").partition("  ")
+                    released.add(path)
                     if mark and _sha256(opened, path) != digest:
                         changed_paths.append(path)
+            for name in self._enclaves():
+                path = f"{enclave_folder(name)}/{CERTIFICATE_FILE}"
+                if path in released:
+                    continue
+                begin = validity_of(read_certificate(self._folder / path)).not_before
+                if state.latest and begin <= state.latest:
+                    changed_paths.append(path)
+                else:
+                    self._brought.append(name)
+                    self._problems.append(
+                        f"{name} is newer than release {state.release}, which does not have it. "
+                        "Publish it (`sros fleet publish KEYSTORE PUB`), or remove it here: the "
+                        "next release without it removes it, with its key."
+                    )
         except (SrosError, OSError):
             return None
         return tuple(changed_paths)
@@ -434,6 +453,7 @@ class _Round:
                 installed=state.accepted,
                 pinned=frozenset(settings.authorities),
                 new_keys=keys,
+                keep=self._brought if release.number == state.accepted else (),
                 before=before,
             )
         except SrosError as error:

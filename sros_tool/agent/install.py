@@ -14,7 +14,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -109,6 +109,7 @@ def install_release(
     installed: int = 0,
     pinned: frozenset[str] = frozenset(),
     new_keys: Mapping[str, PrivateKey] | None = None,
+    keep: Collection[str] = (),
     before: Callable[[Sequence[str]], None] = lambda _names: None,
 ) -> Installation:
     """Install a release in the security folder ``folder``.
@@ -121,6 +122,7 @@ def install_release(
         installed: the highest number of a release that was accepted before.
         pinned: SHA-256 of permissions CAs that count as trusted, too.
         new_keys: keys that wait for their certificate, by enclave.
+        keep: enclaves that stay although the release does not have them.
         before: is called before the change with the enclaves whose processes have to be restarted
             for it.
 
@@ -147,7 +149,7 @@ def install_release(
                 changes[name] = _list_alone(opened, name, files, now)
         removed = []
         for name in present:
-            if name in enclaves or _waits_for_answer(opened, name):
+            if name in enclaves or name in keep or _waits_for_answer(opened, name):
                 continue
             try:
                 changes[name] = _removal(opened, name)

@@ -244,6 +244,22 @@ def test_a_server_that_refuses_one_certificate_of_the_robot(
     assert problem == "The source refuses this robot." and sorted(r1.tried) == sorted(NAMES)
 
 
+def test_enclaves_that_the_release_does_not_have(home: Home, r1: Robot) -> None:
+    """Those of another robot go in the next round; what was brought since the release stays."""
+    r1.round()
+    shutil.copytree(r1.folder / "enclaves/r1/a", r1.folder / "enclaves/r2/x")
+    since = r1.folder / "enclaves/r1/since/cert.pem"
+    since.parent.mkdir()
+    since.write_bytes(home.renewed.files["enclaves/r1/a/cert.pem"])
+    for removed in (("/r2/x",), ()):
+        done = r1.round()
+        assert done.removed == removed and not (r1.folder / "enclaves/r2/x").exists()
+        problem = done.problems[0]
+        assert problem.startswith("/r1/since is newer than release 1") and since.exists()
+    r1.release = home.revoked
+    assert r1.round().removed == ("/r1/since",) and not r1.round().problems
+
+
 def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None:
     r1.round()
     (r1.folder / ".agent/release.p7s").write_bytes(b"damaged")
