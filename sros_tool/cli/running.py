@@ -11,6 +11,7 @@ import stat
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from datetime import timedelta
 from io import UnsupportedOperation
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -586,6 +587,8 @@ def units(
         raise UsageError("COMMAND is for nodes, and no enclave is named")
     if passphrase:
         notes = [*notes, *passphrase_file_notes(Path(passphrase))]
+    if Job.RENEW in jobs:
+        notes = [*notes, *_late_renewal_notes(root)]
     for job in jobs:
         files |= job_units(
             Job(job),
@@ -612,6 +615,26 @@ def units(
     if not changes:
         echo(f"the units in '{folder}' are already up to date", err=True)
     print_notes(list(dict.fromkeys(notes)))
+
+
+def _late_renewal_notes(root: Path) -> Iterator[Note]:
+    """Yield a note if files expire so fast that the daily job may renew them too late."""
+    from sros_tool.validity import duration_text, elapsed, soon_limit
+
+    template = OpenedKeystore(root).template
+    for what, validity in (
+        ("certificates", template.certificate_validity),
+        ("permissions", template.permissions_validity),
+    ):
+        # A day, the delay of the timer, and the delivery.
+        if isinstance(validity, timedelta) and soon_limit(validity) < timedelta(days=2):
+            text = (
+                f"{what} are valid for {duration_text(validity)}, and count as expiring soon only "
+                f"in the last {elapsed(soon_limit(validity))}: the daily job renew may come "
+                "too late. Choose a validity of 6 days or more, or run the job more often "
+                "(`systemctl edit sros-renew.timer`: [Timer], OnCalendar=hourly)"
+            )
+            yield Note("units.renewal-late", text)
 
 
 def _inbox(root: Path) -> tuple[str, ...]:

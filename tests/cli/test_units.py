@@ -95,6 +95,18 @@ def test_jobs_are_of_this_keystore_and_its_owner(made: Path, tmp_path: Path) -> 
     assert f"fleet status {made} --max-age 900s --prometheus -o {FLEET_FILE}\n" in fleet
 
 
+@pytest.mark.parametrize(("validity", "limit"), [("2d", "16 h"), ("5d", "1 d"), ("6d", "")])
+def test_a_validity_that_is_too_short_for_the_daily_job(
+    tmp_path: Path, validity: str, limit: str
+) -> None:
+    sros("create_keystore", tmp_path / "ks", "--permissions-validity", validity).ok()
+    said = sros("units", tmp_path / "ks", "--job", "renew", tmp_path / "units").ok().err
+    late = (
+        f"permissions are valid for {validity}, and count as expiring soon only in the last {limit}"
+    )
+    assert said.count("may come too late") == bool(limit) == (late in said)
+
+
 def test_messages_are_collected_and_releases_published(made: Path, tmp_path: Path) -> None:
     folders = ("--inbox", tmp_path / "in", "--publish", tmp_path / "pub")
     sros(
