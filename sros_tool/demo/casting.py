@@ -40,6 +40,7 @@ from sros_tool.demo.scenarios.model import (
     Row,
     RowStatus,
     Scenario,
+    is_of_nodes,
 )
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.faults import Fault
@@ -430,7 +431,7 @@ def _service_cast(rights: Mapping[str, Grant]) -> dict[str, str]:
     for server, client in permutations(rights, 2):
         for topic in _application_topics(rights[server]):
             service, begin = service_of(topic)
-            if begin != "rr" or ACTION_SEPARATOR in service or "parameter" in topic:
+            if begin != "rr":
                 continue
             if not allows(rights[client], "publish", dds_names("request", service).publish[0]):
                 continue
@@ -531,7 +532,6 @@ def _copy_filter(root: Path, folders: set[str]) -> Callable[[str, list[str]], se
     return left_out_names
 
 
-_TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events", "rt/clock", "ros_discovery_info")
 _WILD = set("*?[")
 
 
@@ -600,11 +600,11 @@ def _is_wild(expression: str) -> bool:
 def _application_topics(grant: Grant) -> Iterator[str]:
     """Yield the DDS topics of the application that a grant allows to publish by exact name.
 
-    Topics of every node, hidden topics and topics of actions are left out.
+    Topics and services of nodes, hidden topics and topics of actions are left out.
     """
     for topic in _topics_to_publish(grant):
-        private = topic.startswith("rt/_") or ACTION_SEPARATOR in topic
-        if topic not in _TOPICS_OF_EVERY_NODE and not private:
+        name = service_of(topic)[0] or topic.removeprefix("rt")
+        if not (is_of_nodes(name) or topic.startswith("rt/_") or ACTION_SEPARATOR in topic):
             yield topic
 
 

@@ -97,10 +97,7 @@ class KeystoreCopy:
             KeystoreError: no enclave plays the part.
         """
         if part not in self.cast:
-            raise UncastError(
-                f"the keystore has no enclave for the part {part}",
-                "No enclave has the permissions that this part of the attack needs.",
-            )
+            raise UncastError(part)
         return self.cast[part]
 
     def folder(self, part: str) -> Path:
@@ -184,7 +181,23 @@ class KeystoreCopy:
 
 
 class UncastError(KeystoreError):
-    """The keystore has no enclave that the forgery needs."""
+    """The keystore has no enclave for a part of the row."""
+
+    def __init__(self, part: str) -> None:
+        needed = _NEEDED.get(part, f"an enclave for the {part}")
+        super().__init__("no enclave of the keystore fits this row", f"The row needs {needed}.")
+
+
+_SERVICE_OF_TWO = "an enclave that offers a service of its own, and another that may call it"
+_NEEDED = {
+    "guest": "a third enclave, besides those of the talker and the listener",
+    "admin": "two more enclaves: one that may not publish the topic, and one below it that may, as"
+    " /arm and /arm/tool",
+    "server": _SERVICE_OF_TWO,
+    "client": _SERVICE_OF_TWO,
+    "newcomer": "an enclave that the demo made without a policy",
+}
+"""What a keystore needs to have, by the part that none of its enclaves fits."""
 
 
 Forge = Callable[[KeystoreCopy], None]

@@ -164,7 +164,7 @@ class KeystoreSet:
                 and not part.startswith("/")
                 and part not in self._cast(identity)
             ):
-                return f"the keystore has no enclave that can be the {part}"
+                return str(UncastError(part))
             if isinstance(error := self._missing(party), UncastError):
                 return str(error)
         if self.user is not None and (enclave := self.user.permitted_enclave(row)):

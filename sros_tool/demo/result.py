@@ -824,7 +824,7 @@ def _left_out_clauses(result: DemoResult) -> Iterator[str]:
         if scenario.keystore is None:
             continue
         used = {member.enclave for member in scenario.cast}
-        yield f"{len(used)} of {scenario.keystore.enclaves} enclaves in a part"
+        yield f"{len(used)} of {scenario.keystore.enclaves} enclaves took part"
         if scenario.keystore.elsewhere:
             yield f"{scenario.keystore.elsewhere} with their key elsewhere"
         if scenario.not_tried:

@@ -141,5 +141,5 @@ def test_names_are_distinct() -> None:
 
 def test_a_part_that_nobody_plays_is_named() -> None:
     copy = KeystoreCopy(Path("ks"), Path("other"), {}, "/t", 0, datetime(2026, 1, 1, tzinfo=UTC))
-    with pytest.raises(KeystoreError, match="no enclave for the part"):
+    with pytest.raises(KeystoreError, match="The row needs two more enclaves"):
         forger.borrowed_permissions(copy)

@@ -14,7 +14,7 @@ from sros_tool.demo.forger import KeystoreCopy
 from sros_tool.demo.program import DemoOptions, run_demo
 from sros_tool.demo.result import KeystoreSummary, demo_table, summary_page
 from sros_tool.demo.scenarios.attacks import ATTACKS
-from sros_tool.demo.scenarios.model import RowStatus
+from sros_tool.demo.scenarios.model import RowStatus, check_topic
 from sros_tool.errors import KeystoreError, UsageError
 from sros_tool.keystore.layout import CRL_FILE, REQUIRED_FILES
 from tests.demo.test_demo_result import CLOSED, OPEN, TWIN, result
@@ -130,6 +130,23 @@ def test_a_part_is_given_to_whom_it_fits_best(tmp_path: Path) -> None:
     assert [user.cast[part] for part in parts] == ["/b", "/d", "/e"]
 
 
+def test_services_that_the_nodes_of_the_demo_have_are_not_attacked(tmp_path: Path) -> None:
+    """On rclpy they have another type there; the services of lifecycle nodes are attacked."""
+    services = "".join(
+        f"<service>/eye/{name}</service>"
+        for name in ("get_type_description", "set_parameters", "x")
+    )
+    robot = {
+        "/a": f'{publish("/image")}<services reply="ALLOW">{services}</services>',
+        "/b": f'{HEARS}<services request="ALLOW">{services}</services>',
+    }
+    user = opened(make_keystore(tmp_path, robot))
+    assert (user.service, user.cast["server"], user.cast["client"]) == ("/eye/x", "/a", "/b")
+    assert check_topic("eye/change_state") == "/eye/change_state"
+    with pytest.raises(UsageError, match="the demo cannot use /eye/set_parameters"):
+        check_topic("eye/set_parameters")
+
+
 def test_whoever_lacks_the_revocation_list_is_the_listener_or_said_to_be_untried(
     place: Place,
 ) -> None:
@@ -204,7 +221,7 @@ def test_a_keystore_is_not_proved_by_what_was_not_tried(row: object, proved: boo
     assert shown.exit_status == (0 if proved else 2)
     assert shown.as_expected is proved
     last = demo_table(shown).splitlines()[-1]
-    assert "3 left out with --only, 0 of 7 enclaves in a part, 2 with their key elsewhere" in last
+    assert "3 left out with --only, 0 of 7 enclaves took part, 2 with their key elsewhere" in last
     assert ("because something was not tried" in last) is not proved
     verdict = "as expected" if proved else "as expected where it was tried"
     assert f"**{verdict}, " in summary_page(shown, NOW)

@@ -15,6 +15,7 @@ from typing import Final
 from sros_tool.demo.forger import Forge, Undefended
 from sros_tool.errors import UsageError
 from sros_tool.files import policies_dir
+from sros_tool.names import node_of_service
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave, Group, Policy, Profile
 
@@ -463,7 +464,7 @@ ACTION: Final = "/fibonacci"
 
 _ROS_TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*\Z")
 _MAX_TOPIC_LENGTH = 200
-_TOPICS_OF_EVERY_NODE = ("/rosout", "/parameter_events", "/clock", DENIED_TOPIC)
+_TOPICS_OF_NODES = ("/rosout", "/parameter_events", "/clock", DENIED_TOPIC)
 
 
 def check_topic(topic: str) -> str:
@@ -480,13 +481,18 @@ def check_topic(topic: str) -> str:
             "Use a name such as /chatter or /robot/camera.",
         )
     absolute = topic if topic.startswith("/") else f"/{topic}"
-    if absolute in _TOPICS_OF_EVERY_NODE:
+    if is_of_nodes(absolute):
         raise UsageError(
             f"the demo cannot use {absolute}",
-            "Every ROS 2 node, or the demo itself, uses this topic.",
+            "Every ROS 2 node, or the demo itself, uses this topic or service.",
             "Use a name such as /chatter.",
         )
     return absolute
+
+
+def is_of_nodes(name: str) -> bool:
+    """Return whether the demo's own nodes have a topic or service, which no role can then use."""
+    return name in _TOPICS_OF_NODES or bool(node_of_service(name))
 
 
 def _shipped_policy(file: str) -> Policy:
