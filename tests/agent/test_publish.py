@@ -867,6 +867,20 @@ def test_a_folder_without_metadata_has_releases_that_the_keystore_does_not_know(
     publisher.robot("r5").refuses(FetchProblem.NOT_FOR_ROBOT)
 
 
+def test_releases_of_a_later_ca_in_a_folder_without_metadata(publisher: Home) -> None:
+    backup = copy_of(publisher.root, publisher.folder / "backup")
+    forget_publishing(backup)
+    publisher.run("rotate_ca", "ks", "--finish", "--allow-unconfirmed")
+    shutil.rmtree(publisher.pub)
+    publisher.publish(new_folder=True)
+    shutil.rmtree(publisher.pub / "metadata")
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    for restored in (False, True):
+        with pytest.raises(KeystoreError, match=r"no CA of .* sealed: r1, r2, r5\."):
+            publisher.publish(restored=restored, new_folder=True)
+
+
 def test_keystore_and_folder_that_were_lost(publisher: Home) -> None:
     """What home gave after the backup, and nobody there knows, is never given twice."""
     backup = copy_of(publisher.root, publisher.folder / "backup")

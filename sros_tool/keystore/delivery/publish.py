@@ -626,6 +626,8 @@ class _Run:
         unknown = [] if self._present.timestamp else self._unknown_releases()
         if unknown and not restored:
             raise self._unknown_error(unknown)
+        if not self._present.timestamp:
+            self._check_seals()
         if is_lost and not new_folder:
             raise self._nothing_published_error()
         is_later = self._has_later_releases(restored)
@@ -847,8 +849,7 @@ class _Run:
 
     def _unknown_releases(self) -> list[Release]:
         """Return the sealed releases, by number, that the keystore does not know, or whose list."""
-        entries = self.keystore.ledger_with("what", "release").entries
-        known = {entry.number for entry in entries if entry.what == "release"}
+        known = self._known_numbers()
         forgotten = Forgotten(self.keystore, self._now)
         unknown = [
             release
@@ -861,6 +862,29 @@ class _Run:
             )
         ]
         return sorted(unknown, key=lambda release: release.number)
+
+    def _known_numbers(self) -> set[int]:
+        entries = self.keystore.ledger_with("what", "release").entries
+        return {entry.number for entry in entries if entry.what == "release"}
+
+    def _check_seals(self) -> None:
+        """Refuse a folder without metadata that has later releases of a CA that is unknown here."""
+        known, authorities = self._known_numbers(), self.keystore.authority(PERMISSIONS)
+        foreign = {
+            release.robot
+            for release in self._releases()
+            if release.number not in known and seal_problem(release, authorities)
+        }
+        if foreign:
+            raise KeystoreError(
+                f"'{self._folder}' has releases that no CA of the keystore '{self.keystore.root}' "
+                f"sealed: {first_few(sorted(foreign), 3)}",
+                "Another keystore published them, or this keystore was restored from a backup from "
+                "before its permissions CA was replaced: publishing would undo later changes, such "
+                "as a revocation.",
+                "If the keystore was restored, first follow docs/howto/keystore_is_lost.md. Name "
+                "an empty folder.",
+            )
 
     def _unknown_error(self, unknown: Sequence[Release]) -> KeystoreError:
         where = quote(str(self.keystore.root))
@@ -889,14 +913,15 @@ class _Run:
     def _sealed_releases(self) -> Iterator[Release]:
         """Yield the releases in all archives that a permissions CA of the keystore sealed."""
         authorities = self.keystore.authority(PERMISSIONS)
+        yield from (each for each in self._releases() if not seal_problem(each, authorities))
+
+    def _releases(self) -> Iterator[Release]:
+        """Yield the releases in all archives, whoever sealed them."""
         for path in self._paths():
-            if not path.startswith(f"{_ARCHIVES}/"):
-                continue
-            with suppress(SrosError):
-                data = read_bytes(self._folder / path, "archive", max_bytes=OF_ONE_ROBOT.packed)
-                release = read_release(data)
-                if not seal_problem(release, authorities):
-                    yield release
+            if path.startswith(f"{_ARCHIVES}/"):
+                with suppress(SrosError):
+                    data = read_bytes(self._folder / path, "archive", max_bytes=OF_ONE_ROBOT.packed)
+                    yield read_release(data)
 
     # ── which robots ───────────────────────────────────────────────────────────────────────
 
