@@ -395,7 +395,7 @@ def _opened_zenoh(
 def _refuse_outdated(keystore: OpenedKeystore, name: str, now: datetime) -> None:
     """Raise `KeystoreError` if the enclave's Zenoh file lacks current rights of other enclaves.
 
-    A router, and a session in mode peer, enforces the rights of other enclaves: an outdated file,
+    A router, and a session in peer mode, enforces the rights of other enclaves: an outdated file,
     though validly signed, would enforce outdated rights.  An export cannot be checked for this.
     """
     from sros_tool.keystore.layout import PERMISSIONS, SETTINGS

@@ -182,7 +182,7 @@ def vulnerability_metrics(
 ) -> tuple[Metric, Metric]:
     """Return how many vulnerabilities each DDS has, and how many releases are unknown.
 
-    Versions are no labels, of which there would be as many as processes, or robots, think of.
+    The version is not a label: hostile processes or robots could make up any number of versions.
     """
     most: dict[str, int] = {}
     unknown: Counter[str] = Counter()

@@ -66,7 +66,7 @@ SESSION_WITHOUT_RULES = FindingKind(
     "zenoh.session-without-rules",
     ERROR,
     "a session without access control",
-    "Anyone who impersonates the router, or in mode peer connects to the session directly, can "
+    "Anyone who impersonates the router, or in peer mode connects to the session directly, can "
     "read everything that the session publishes and send it anything. The rules of the real router "
     "do not apply.",
     _TESTED,

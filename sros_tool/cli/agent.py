@@ -238,8 +238,8 @@ def _unit(text: str) -> Unit:
 )  # fmt: skip
 @click.option(
     "--restarted", is_flag=True,
-    help="With --once: all processes were restarted since the last round, also those that the "
-    "agent cannot see. It does not count for files that this round installs.",
+    help="With --once: all processes were restarted since the last round, even those that the "
+    "agent cannot see. This does not count for files that this round installs.",
 )  # fmt: skip
 @json_option
 def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool) -> int:

@@ -372,7 +372,7 @@ def portability_problems(
     if signed_bytes >= MAX_SIGNED_BYTES:
         yield "portable.document-size", f"the signed permissions have {signed_bytes} bytes"
     for grant in permissions.grants:
-        long = [
+        too_long = [
             topic
             for rule in grant.rules
             for criteria in (*rule.publish, *rule.subscribe)
@@ -380,8 +380,9 @@ def portability_problems(
             if len(topic.encode()) > _LONGEST_TOPIC
             and not any(character in topic for character in "*?[")
         ]
-        if long:
-            yield "portable.long-name", f"{long[0][:60]}... has {len(long[0].encode())} bytes"
+        if too_long:
+            name, size = too_long[0][:60], len(too_long[0].encode())
+            yield "portable.long-name", f"{name}... has {size} bytes"
         allowed = [r for r in grant.rules if r.allow]
         denied = [r for r in grant.rules if not r.allow]
         for direction, other in (("publish", "subscribe"), ("subscribe", "publish")):

@@ -173,7 +173,7 @@ def publish_command(root: Path) -> str:
 def unrecorded_notes(
     keystore: OpenedKeystore, fleet: Fleet | None, names: Collection[str]
 ) -> Iterator[Note]:
-    """Yield a note for each robot below whose folder enclaves are that the fleet does not record.
+    """Yield a note for each robot whose folder has enclaves that the fleet does not record.
 
     Neither ``--robot`` nor a release includes these enclaves.
     """

@@ -92,7 +92,7 @@ class MappedLibrary(NamedTuple):
 
     @property
     def packaged(self) -> bool:
-        """Whether a Debian or Ubuntu package has it, which can have fixes of later releases."""
+        """Whether it is from a Debian or Ubuntu package, which can have fixes of later releases."""
         return self.path.startswith(("/usr/lib/", "/lib/"))
 
 

@@ -490,7 +490,7 @@ class _Rotator:
         return stage
 
     def _refuse_deletion(self, stage: RotationStage) -> None:
-        """Raise `UsageError` if sros shall delete an old key that it does not delete."""
+        """Raise `UsageError` if sros is asked to delete an old key that it does not delete."""
         if self._delete and stage is RotationStage.DISTRIBUTE:
             raise UsageError(
                 "the stage distribute deletes no key",
