@@ -351,9 +351,9 @@ def _unknown_process_problems(robot: LocalRobot, state: CloseState) -> Iterator[
     routers = [process for process in RunningRobot(robot).open_processes if process.is_router]
     if routers and not any(process.is_router for process in observed.processes):
         yield (
-            f"{routers[0].label} is a Zenoh router that did not run when sros watched, or is not "
-            f"of the robot. Watch again while it runs, or stop it: {close} --for 1m. Otherwise "
-            "closed nodes do not reach each other through this router (accept: --partial)"
+            f"{routers[0].label} is a Zenoh router that did not run when sros watched, or does not "
+            f"belong to the robot. Watch again while it runs, or stop it: {close} --for 1m. "
+            "Otherwise closed nodes do not reach each other through this router (accept: --partial)"
         )
     pids = {process.enclave: process.pid for process in observed.processes}
     if twice := sorted(pids.keys() & {*observed.elsewhere}):
