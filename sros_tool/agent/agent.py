@@ -360,7 +360,7 @@ class _Round:
             repaired = (
                 path for path in changed_files or () if enclave_of(path) in installation.changed
             )
-            self._note_repaired(release.number, tuple(repaired))
+            self._note_repaired(release.number, tuple(repaired), installation.removed)
         return installation, True
 
     def _changed_files(self) -> tuple[str, ...] | None:
@@ -399,16 +399,23 @@ class _Round:
             return None
         return tuple(changed_paths)
 
-    def _note_repaired(self, release: int, paths: Sequence[str]) -> None:
-        """Remember that files were replaced: every message of the next day says so."""
+    def _note_repaired(self, release: int, paths: Sequence[str], removed: Sequence[str]) -> None:
+        """Remember what was replaced or removed: every message of the next day says so."""
+        now, texts = self._machine.now, []
         if paths:
-            now = self._machine.now
-            text = (
+            texts.append(
                 f"At {iso(now)}, {counted(len(paths), 'file')} that release {release} has "
                 f"{'was' if len(paths) == 1 else 'were'} changed or missing here, and replaced: "
                 f"{first_few(paths, 3)}. Find out who or what changes files on this robot."
             )
-            self._state = replace(self._state, repaired=text, repaired_at=now)
+        if removed:
+            texts.append(
+                f"At {iso(now)}, enclaves that release {release} does not have were here, and were "
+                f"removed: {first_few(removed, 3)}. If they are of another robot, somebody may "
+                "have copied their keys: `sros renew KEYSTORE ENCLAVE --new-key --revoke-old`."
+            )
+        if texts:
+            self._state = replace(self._state, repaired=" ".join(texts), repaired_at=now)
 
     def _note_closed_keys(self, exposed: Mapping[str, datetime], now: datetime) -> None:
         """Report the keys that others could read until the agent closed them, for a day."""

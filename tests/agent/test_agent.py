@@ -257,7 +257,9 @@ def test_enclaves_that_the_release_does_not_have(home: Home, r1: Robot) -> None:
         problem = done.problems[0]
         assert problem.startswith("/r1/since is newer than release 1") and since.exists()
     r1.release = home.revoked
-    assert r1.round().removed == ("/r1/since",) and not r1.round().problems
+    assert r1.round().removed == ("/r1/since",)
+    (problem,) = r1.round().problems
+    assert "removed: /r2/x. If they are of another robot" in problem, "for a day"
 
 
 def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None:
