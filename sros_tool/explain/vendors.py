@@ -429,7 +429,7 @@ def _runs_on_zenoh(keystore: OpenedKeystore, name: str) -> bool:
 
 
 class OpenedParts(NamedTuple):
-    """Whether processes without an identity have a right, or else which of its parts they have."""
+    """Whether processes without an identity have a right, or else which of its `acting_parts`."""
 
     whole: bool = False
     parts: tuple[str, ...] = ()
