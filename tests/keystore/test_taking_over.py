@@ -16,6 +16,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.pki.certificates import validity_of
 from tests.support.harness import copy_of, policy_text, publish, sros
 from tests.support.long_form import some
 from tests.support.made_by_ros2 import RELEASES, make
@@ -113,8 +114,9 @@ def _ca_without_identifier(root: Path) -> None:
     path = root / "public/identity_ca.cert.pem"
     real = x509.load_pem_x509_certificate(path.read_bytes())
     builder = x509.CertificateBuilder(real.issuer, real.subject, real.public_key())
-    builder = builder.serial_number(real.serial_number).not_valid_before(real.not_valid_before_utc)
-    builder = builder.not_valid_after(real.not_valid_after_utc)
+    validity = validity_of(real)
+    builder = builder.serial_number(real.serial_number)
+    builder = builder.not_valid_before(validity.not_before).not_valid_after(validity.not_after)
     builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=1), critical=True)
     forged = builder.sign(ec.generate_private_key(ec.SECP256R1()), hashes.SHA256())
     path.write_bytes(forged.public_bytes(serialization.Encoding.PEM))
