@@ -31,6 +31,8 @@ from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
+from sros_tool.keystore.lifecycle.rotate import rotate_ca
+from sros_tool.keystore.lifecycle.rotation import RotationStage
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
@@ -76,6 +78,25 @@ def test_an_older_list_does_not_replace_a_newer_one(fleet: Path, tmp_path: Path)
     ):
         distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True)
     (robot / "enclaves/base/crl.pem").unlink()
+    assert distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True).changes
+
+
+def test_a_replaced_ca_does_not_replace_the_one_after_it(fleet: Path, tmp_path: Path) -> None:
+    """Even with --force: the robot would trust everybody again who was revoked since the backup."""
+    backup, robot = copy_of(fleet, tmp_path / "backup"), tmp_path / "robot"
+    distribute(OpenedKeystore(fleet), ["/base"], robot, now=NOW)
+    for _ in RotationStage.DISTRIBUTE, RotationStage.REISSUE, RotationStage.RETIRE:
+        rotate_ca(fleet, allow_unconfirmed=True, now=NOW)
+    distribute(OpenedKeystore(fleet), ["/base"], robot, now=NOW, force=True)
+    before = snapshot(robot)
+    for role in ("identity", "permissions"):
+        with pytest.raises(KeystoreError, match=f"has a later {role} CA than the keystore's"):
+            distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True)
+        assert snapshot(robot) == before
+        (robot / f"enclaves/base/{role}_ca.cert.pem").unlink()
+        before = snapshot(robot)
+    assert distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True).changes
+    (robot / "enclaves/base/identity_ca.cert.pem").write_text("damaged")
     assert distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True).changes
 
 

@@ -14,6 +14,8 @@ from pathlib import Path
 from shlex import quote
 from typing import Annotated, NamedTuple
 
+from cryptography import x509
+
 from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.faults import Fault
 from sros_tool.files import staged_file
@@ -57,7 +59,14 @@ from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.keystore.transaction import Change, Transaction
 from sros_tool.keystore.zenoh_files import open_zenoh
 from sros_tool.names import check_enclave_name
-from sros_tool.pki.certificates import fingerprints, load_certificates, validity_of
+from sros_tool.pki.certificates import (
+    authority_key,
+    authority_text,
+    digest,
+    fingerprints,
+    load_certificates,
+    validity_of,
+)
 from sros_tool.pki.crl import list_number, newest_list
 from sros_tool.pki.keys import holds_private_key
 from sros_tool.pki.token import read_token_file
@@ -481,6 +490,7 @@ def _write_folder(
         )
     check_same_authority(target, files)
     _check_robot(keystore, target, files)
+    _check_later_authorities(keystore, target, files)
     _check_lists(target, files)
     stale = _stale_paths(target, files)
     different = {
@@ -520,6 +530,43 @@ def _check_robot(keystore: OpenedKeystore, target: Path, files: Mapping[str, byt
                 f"'{settings}' names {owner}. Nothing was changed.",
                 f"Choose the folder of {robot.name}.",
             )
+
+
+def _check_later_authorities(
+    keystore: OpenedKeystore, target: Path, files: Mapping[str, bytes]
+) -> None:
+    """Raise `KeystoreError` if an enclave in ``target`` trusts a CA that replaced the keystore's.
+
+    That is a CA with another key, at least as late as the CAs in ``files``, that the ledger does
+    not have: the keystore is from before a rotation.
+    """
+    for path, data in files.items():
+        role = _ROLES.get(path.rpartition("/")[2])
+        place = target / path
+        if role is None or not place.is_file() or read_bytes(place, "CA file") == data:
+            continue
+        sent, present = load_certificates(data, path), list[x509.Certificate]()
+        with suppress(SrosError):  # a damaged file trusts nobody
+            present += load_certificates(read_bytes(place, "CA file"), str(place))
+        recorded = {e.sha256 for e in keystore.ledger_with("what", "ca").entries if e.what == "ca"}
+        newest = max(validity_of(authority).not_before for authority in sent)
+        for authority in present:
+            if (
+                authority_key(authority) not in map(authority_key, sent)
+                and digest(authority) not in recorded
+                and validity_of(authority).not_before >= newest
+            ):
+                raise KeystoreError(
+                    f"'{place}' has a later {role} CA than the keystore's",
+                    f"It trusts {authority_text(authority)}, which the keystore does not know: the "
+                    "robot would trust the earlier CA again, and what was revoked since. Nothing "
+                    "was changed.",
+                    "The keystore may come from a backup: docs/howto/keystore_is_lost.md says how "
+                    f"to go on. If the keystore's CA is right, remove '{place}' first.",
+                )
+
+
+_ROLES = {IDENTITY_CA_FILE: IDENTITY, PERMISSIONS_CA_FILE: PERMISSIONS}
 
 
 def _check_lists(target: Path, files: Mapping[str, bytes]) -> None:
