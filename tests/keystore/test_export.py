@@ -87,6 +87,7 @@ def test_a_replaced_ca_does_not_replace_the_one_after_it(fleet: Path, tmp_path: 
     distribute(OpenedKeystore(fleet), ["/base"], robot, now=NOW)
     for _ in RotationStage.DISTRIBUTE, RotationStage.REISSUE, RotationStage.RETIRE:
         rotate_ca(fleet, allow_unconfirmed=True, now=NOW)
+    refresh_crl(fleet, now=NOW)
     distribute(OpenedKeystore(fleet), ["/base"], robot, now=NOW, force=True)
     before = snapshot(robot)
     for role in ("identity", "permissions"):
@@ -96,6 +97,8 @@ def test_a_replaced_ca_does_not_replace_the_one_after_it(fleet: Path, tmp_path: 
         (robot / f"enclaves/base/{role}_ca.cert.pem").unlink()
         before = snapshot(robot)
     assert distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True).changes
+    assert not (robot / "enclaves/base/crl.pem").exists(), "no list of a CA that is not trusted"
+    assert all(enclave.loadable for enclave in verify_arrival(robot, now=NOW).enclaves)
     (robot / "enclaves/base/identity_ca.cert.pem").write_text("damaged")
     assert distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True).changes
 

@@ -540,15 +540,15 @@ def _check_later_authorities(
     That is a CA with another key, at least as late as the CAs in ``files``, that the ledger does
     not have: the keystore is from before a rotation.
     """
+    recorded = {e.sha256 for e in keystore.ledger_with("what", "ca").entries if e.what == "ca"}
     for path, data in files.items():
-        role = _ROLES.get(path.rpartition("/")[2])
+        role = _ROLES_OF_FILES.get(path.rpartition("/")[2])
         place = target / path
         if role is None or not place.is_file() or read_bytes(place, "CA file") == data:
             continue
         sent, present = load_certificates(data, path), list[x509.Certificate]()
         with suppress(SrosError):  # a damaged file trusts nobody
             present += load_certificates(read_bytes(place, "CA file"), str(place))
-        recorded = {e.sha256 for e in keystore.ledger_with("what", "ca").entries if e.what == "ca"}
         newest = max(validity_of(authority).not_before for authority in sent)
         for authority in present:
             if (
@@ -564,9 +564,6 @@ def _check_later_authorities(
                     "The keystore may come from a backup: docs/howto/keystore_is_lost.md says how "
                     f"to go on. If the keystore's CA is right, remove '{place}' first.",
                 )
-
-
-_ROLES = {IDENTITY_CA_FILE: IDENTITY, PERMISSIONS_CA_FILE: PERMISSIONS}
 
 
 def _check_lists(target: Path, files: Mapping[str, bytes]) -> None:
@@ -595,9 +592,11 @@ def _check_lists(target: Path, files: Mapping[str, bytes]) -> None:
 
 
 def _stale_paths(target: Path, files: dict[str, bytes]) -> list[str]:
-    """Return the paths in ``target`` of Zenoh files and keys that the enclaves no longer have.
+    """Return the paths in ``target`` of files that the enclaves no longer have.
 
-    An enclave that is exported without a key keeps the key in ``target``: no other copy exists.
+    These are Zenoh files, keys, and revocation lists of other CAs, with which nothing starts
+    (`_check_lists` refuses to lose a list of the enclave's own CA).  An enclave that is exported
+    without a key keeps the key in ``target``: no other copy exists.
     """
     folders = {path.rpartition("/")[0] for path in files}
     keyed = {folder for folder in folders for file in KEY_FILES if f"{folder}/{file}" in files}
@@ -605,7 +604,8 @@ def _stale_paths(target: Path, files: dict[str, bytes]) -> list[str]:
         path
         for folder in folders
         for path in (
-            f"{folder}/{file}" for file in (*ZENOH_FILES, *(KEY_FILES if folder in keyed else ()))
+            f"{folder}/{file}"
+            for file in (CRL_FILE, *ZENOH_FILES, *(KEY_FILES if folder in keyed else ()))
         )
         if path not in files and os.path.lexists(target / path)
     )
