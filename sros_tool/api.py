@@ -837,14 +837,14 @@ def check_requirements(
 
     Args:
         path: A keystore, a policy file or a folder of policies; or several policies of one robot or
-            fleet, which count as one.
+            fleet, which count as one policy.
         requirements: The TOML file of the requirements, or several.
         fleet: The file with the robots that the placeholders of a policy and its requirements stand
             for; a keystore has its own.
         template: The keystore template, by name or file, whose protection a policy gets. Without
             it, the default template is assumed where the policy states no protection, and a finding
             reports this.
-        vendor: The only DDS vendor to decide for, or "zenoh"; every tested one and Zenoh by
+        vendor: The only DDS vendor to decide for, or "zenoh"; every tested vendor and Zenoh by
             default.
         distribution: The ROS 2 distribution, such as "lyrical", whose DDS decides; without
             ``vendor``, all that it ships.

@@ -665,7 +665,8 @@ def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
 def _check_parameters_of_others(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about parameter services of nodes that the enclave does not have.
 
-    A wildcard is such a finding if it matches one of a node that only other enclaves have.
+    A wildcard is such a finding if it matches such a service of a node that only other enclaves
+    have.
     """
     nodes: dict[str, set[str]] = defaultdict(set)
     enclave_by_node: dict[str, str] = {}
@@ -771,7 +772,7 @@ def _different_common_part_cause(folder: str, lacking: Sequence[_Lacking]) -> Ca
     """Return the common cause of findings: the included common part is not the one of sros."""
     new, old = quote(folder), quote(f"{folder}.old")
     return Cause(
-        f"the included '{folder}/node.xml' lacks rights that the one of this sros has",
+        f"the included '{folder}/node.xml' lacks rights that the file of this sros has",
         _denied_at_start(lacking),
         f"'{folder}/node.xml' is included and differs from the file of this sros. Replace it: "
         f"`mv {new} {old} && sros policies --copy {new}`. Files and changes of your own are then "
@@ -1213,7 +1214,7 @@ SHARED_NAMESPACE = FindingKind(
     WARNING,
     "robots with the same namespace, or with one namespace inside the other",
     "Both robots publish and subscribe to the same names; and a wildcard in the outer namespace "
-    "also matches the names in the inner one.",
+    "also matches the names in the inner namespace.",
     "rcl (puts the node's namespace before relative names); sros (placeholder {namespace}).",
     "Give each robot a namespace of its own in the fleet file, or a ROS domain of its own.",
 )
@@ -1221,7 +1222,7 @@ SHARED_NAMESPACE = FindingKind(
 UNKNOWN_GROUP = FindingKind(
     "policy.unknown-group",
     WARNING,
-    "robots in no group, or in one that no policy names",
+    "robots in no group, or in a group that no policy names",
     "Their processes get no enclaves, and no keys.",
     "sros (placeholder {robot:GROUP}).",
     "Correct the groups of the robots in the fleet file, or name all policies of the fleet.",
@@ -1677,8 +1678,8 @@ def signed_findings(
         ]
         parts.append(replace(policy, enclaves=tuple(chosen)))
     of_fleet = any(isinstance(policy, FleetPolicy) for policy in policies)
-    found = findings_in(parts, distribution, of_fleet=of_fleet)
-    shown = [finding for finding in found if finding.severity >= WARNING]
+    findings = findings_in(parts, distribution, of_fleet=of_fleet)
+    shown = [finding for finding in findings if finding.severity >= WARNING]
     shown.sort(key=lambda finding: -finding.severity.weight)
     return list(group_by_cause(list(dict.fromkeys(shown))))
 

@@ -95,7 +95,7 @@ class RunningRobot:
     def runs_open(self, process: ClosedProcess, since: datetime | None = None) -> bool:
         """Return whether a process like the observed one runs without security.
 
-        With ``since``, it has to run since then.  If the observed process belongs to a unit, the
+        With ``since``, it must have run since then.  If the observed process belongs to a unit, the
         other one has to belong to this unit: any user can start one with the same command.
         """
         return any(

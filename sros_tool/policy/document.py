@@ -1171,7 +1171,7 @@ _MOST_SEARCHED = 256 * 1024
 def join_policies(policies: Sequence[Policy]) -> Policy:
     """Return one policy with the enclaves of several policies of a robot or a fleet.
 
-    A policy may include the enclaves of another one; ``policies`` has at least one policy.
+    A policy may include the enclaves of another policy; ``policies`` has at least one policy.
 
     Raises:
         PolicyError: two policies state the same enclave at different places.
@@ -1183,7 +1183,7 @@ def join_policies(policies: Sequence[Policy]) -> Policy:
         if earlier.source != enclave.source or earlier != enclave:
             raise PolicyError(
                 f"{enclave.source}: enclave {enclave.path} is in another policy, too",
-                f"The other one is at {earlier.source}.",
+                f"The other enclave is at {earlier.source}.",
                 "Name only policies of one robot, and state each enclave in one of them.",
             )
     fallbacks = tuple(fallback for policy in policies for fallback in policy.fallbacks)
