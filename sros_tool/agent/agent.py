@@ -183,8 +183,6 @@ class _Round:
         self._settings = settings
         self._machine = machine
         self._problems: list[str] = []
-        self._brought: list[str] = []
-        """Enclaves that the installed release does not have, and that are newer."""
         self._state = read_state(folder)
         self._is_in_step = False
         """Whether the installed files, with their revocation list, are those of the last
@@ -215,6 +213,7 @@ class _Round:
         exposed = recent | dict.fromkeys(readable_keys, now)
         self._state = replace(self._state, exposed=exposed)
         installation, fetched = self._fetch_and_install(certain)
+        self._note_newer_enclaves()
         repaired = self._state.repaired_at
         if repaired and abs(now - repaired) < _REPAIRED_FOR:
             self._problems.append(self._state.repaired)
@@ -366,38 +365,61 @@ class _Round:
     def _changed_files(self) -> tuple[str, ...] | None:
         """Return the paths of files that are missing, or differ from the installed release.
 
-        The release removes enclaves that it does not have: their certificates are included, too.
-        An enclave that somebody brought after the release is only reported.  None if no release is
-        installed with all its enclaves, or its seal cannot be read.
+        The release removes enclaves that it does not have: their certificates are included, too,
+        except those of `_newer_enclaves`.  None if no release is installed with all its enclaves,
+        or its seal cannot be read.
         """
-        state, changed_paths, released = self._state, [], set()
+        state = self._state
         if not state.accepted or state.release != state.accepted:
             return None
         try:
-            text = smime.parse(read_seal(self._folder)).text
+            released = self._released_files()
             with Folder(self._folder) as opened:
-                for line in text.splitlines():
-                    digest, mark, path = line.decode(errors="replace").partition("  ")
-                    released.add(path)
-                    if mark and _sha256(opened, path) != digest:
-                        changed_paths.append(path)
-            for name in self._enclaves():
-                path = f"{enclave_folder(name)}/{CERTIFICATE_FILE}"
-                if path in released:
-                    continue
-                begin = validity_of(read_certificate(self._folder / path)).not_before
-                if state.latest and begin <= state.latest:
-                    changed_paths.append(path)
-                else:
-                    self._brought.append(name)
-                    self._problems.append(
-                        f"{name} is newer than release {state.release}, which does not have it. "
-                        "Publish it (`sros fleet publish KEYSTORE PUB`), or remove it here: the "
-                        "next release without it removes it, with its key."
-                    )
+                changed_paths = [
+                    path for path, digest in released.items() if _sha256(opened, path) != digest
+                ]
         except (SrosError, OSError):
             return None
-        return tuple(changed_paths)
+        newer = self._newer_enclaves()
+        others = (_certificate_path(name) for name in self._enclaves() if name not in newer)
+        return (*changed_paths, *(path for path in others if path not in released))
+
+    def _released_files(self) -> dict[str, str]:
+        """Map the path of each file of the accepted release to its SHA-256, by the seal.
+
+        Raises:
+            SrosError: the seal is missing or damaged.
+        """
+        lines = smime.parse(read_seal(self._folder)).text.splitlines()
+        parts = (line.decode(errors="replace").partition("  ") for line in lines)
+        return {path: digest for digest, mark, path in parts if mark}
+
+    def _newer_enclaves(self) -> frozenset[str]:
+        """Return the enclaves whose certificate is newer than everything in accepted releases.
+
+        One whose certificate cannot be read is not among them: no process can run in it.
+        """
+        newer, latest = set(), self._state.latest
+        for name in self._enclaves():
+            with suppress(SrosError, OSError):
+                path = self._folder / _certificate_path(name)
+                if latest is None or validity_of(read_certificate(path)).not_before > latest:
+                    newer.add(name)
+        return frozenset(newer)
+
+    def _note_newer_enclaves(self) -> None:
+        """Report the enclaves that somebody brought after the accepted release."""
+        if not self._state.accepted:
+            return
+        with suppress(SrosError):  # the next installation writes the seal again
+            released = self._released_files()
+            for name in sorted(self._newer_enclaves()):
+                if _certificate_path(name) not in released:
+                    self._problems.append(
+                        f"{name} is newer than release {self._state.accepted}, which does not have "
+                        "it. Publish it (`sros fleet publish KEYSTORE PUB`), or remove it here: "
+                        "the next release without it removes it, with its key."
+                    )
 
     def _note_repaired(self, release: int, paths: Sequence[str], removed: Sequence[str]) -> None:
         """Remember what was replaced or removed: every message of the next day says so."""
@@ -460,7 +482,7 @@ class _Round:
                 installed=state.accepted,
                 pinned=frozenset(settings.authorities),
                 new_keys=keys,
-                keep=self._brought if release.number == state.accepted else (),
+                keep=self._newer_enclaves() if release.number == state.accepted else (),
                 before=before,
             )
         except SrosError as error:
@@ -871,6 +893,10 @@ def _of(names: Collection[str], moments: Mapping[str, float]) -> dict[str, float
 def _boot_digest(robot: str, boot: str) -> str | None:
     """Return a SHA-256 that hides the random id of the machine's start; None without an id."""
     return hashlib.sha256(f"{robot} {boot}".encode()).hexdigest() if boot else None
+
+
+def _certificate_path(name: str) -> str:
+    return f"{enclave_folder(name)}/{CERTIFICATE_FILE}"
 
 
 def _sha256(folder: Folder, path: str) -> str:

@@ -251,15 +251,25 @@ def test_enclaves_that_the_release_does_not_have(home: Home, r1: Robot) -> None:
     since = r1.folder / "enclaves/r1/since/cert.pem"
     since.parent.mkdir()
     since.write_bytes(home.renewed.files["enclaves/r1/a/cert.pem"])
-    for removed in (("/r2/x",), ()):
+    damaged = r1.folder / "enclaves/r1/damaged/cert.pem"
+    for number, removed in enumerate((("/r2/x",), (), ("/r1/damaged",), (), ())):
+        if number == 2:  # sorts before the newer one
+            damaged.parent.mkdir()
+            damaged.write_text("damaged")
+        if number == 3:
+            (r1.folder / ".agent/release.p7s").write_bytes(b"damaged")
+        if number == 4:  # so that the release is installed in part, again and again
+            shutil.rmtree(r1.folder / "enclaves/r1/b")
         done = r1.round()
         assert done.removed == removed and not (r1.folder / "enclaves/r2/x").exists()
-        problem = done.problems[0]
+        (problem,) = (each for each in done.problems if "newer" in each)
         assert problem.startswith("/r1/since is newer than release 1") and since.exists()
+    assert r1.round().removed == () and since.exists()
     r1.release = home.revoked
-    assert r1.round().removed == ("/r1/since",)
-    (problem,) = r1.round().problems
-    assert "removed: /r2/x. If they are of another robot" in problem, "for a day"
+    done = r1.round()
+    assert done.removed == ("/r1/since",) and not any("newer" in each for each in done.problems)
+    (problem,) = (each for each in r1.round().problems if "of another robot" in each)
+    assert "removed: /r1/damaged. If they are of another robot" in problem, "for a day"
 
 
 def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None:
