@@ -608,7 +608,7 @@ _CONSEQUENCE_TEXTS = (
         "participant", _FAST, r"Cannot create participant due to initialization error"
         r"|Problem creating RTPSParticipant|failed to create participant",
         "the process may not join, and this log gives no reason: Fast DDS 2.6 and 2.9 log "
-        "nothing about signatures, expired permissions and subjects, later releases do so on "
+        "nothing about signatures, expired permissions and subjects; later releases log why, on "
         "standard output or in the file of ROS_SECURITY_LOG_FILE",
         _EXPLAIN_OR_LOG_FILE, _ALL_FAULTS,
         remedy_without_fault=_LOG_FILE_REMEDY, vagueness=2,

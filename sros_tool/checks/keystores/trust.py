@@ -59,12 +59,12 @@ PEERS_REVOKED = FindingKind(
 PEERS_ACCEPT = FindingKind(
     "keystore.peers-accept-revoked",
     WARNING,
-    "a revocation list that lacks what that of another keystore or export revokes",
+    "a revocation list that lacks what the list of another keystore or export revokes",
     "A node with this list communicates with everybody whom only the other list revokes, such as "
     "the thief of a key.",
     "RFC 5280, 5.2.3; rmw_dds_common (crl.pem).",
-    "Export its enclaves again from the keystore, with `sros distribute_key KEYSTORE ENCLAVE "
-    "TARGET --force`, bring the files to the robot, and restart the processes.",
+    "Export the enclaves with this list again from their keystore, with `sros distribute_key "
+    "KEYSTORE ENCLAVE TARGET --force`, bring the files to the robot, and restart the processes.",
 )
 _REVOKE_AGAIN = (
     "This keystore was perhaps restored from a backup: before its next export, revoke again what "

@@ -80,8 +80,8 @@ OTHER_DOMAIN = FindingKind(
     "an enclave outside the ROS domains of the Zenoh network",
     "The enclave gets no configuration, and all enclaves of the network deny it everything.",
     _SOURCE,
-    "An enclave that runs on DDS needs none. For one that runs on Zenoh, name all domains of the "
-    "network: `sros zenoh KEYSTORE --domain IDS`.",
+    "An enclave that runs on DDS needs no configuration. For an enclave that runs on Zenoh, "
+    "name all domains of the network: `sros zenoh KEYSTORE --domain IDS`.",
 )
 SHARED_NODE = FindingKind(
     "zenoh.shared-node",
