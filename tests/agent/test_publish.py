@@ -344,6 +344,23 @@ def test_a_kill_after_the_keystore_changed_keeps_the_number(
     assert publisher.robot().gets().number == number
 
 
+@pytest.mark.parametrize("is_lost", [False, True])
+def test_a_kill_before_the_keystore_knows_its_first_releases(
+    publisher: Home, is_lost: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not is_lost:
+        forget_publishing(publisher.root)
+    shutil.rmtree(publisher.pub)
+    with monkeypatch.context() as patched:
+        patched.setattr(publishing._Run, "compose", _raise_killed)
+        with pytest.raises(_Killed):
+            publisher.publish(new_folder=is_lost)
+    killed = archives(publisher)
+    assert killed and not [*publisher.pub.glob("metadata/*")]
+    publisher.publish(new_folder=is_lost)
+    publisher.robot().gets()
+
+
 def test_a_disk_that_is_full_after_the_keystore_changed(
     publisher: Home, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -848,13 +848,17 @@ class _Run:
         self._notes += revocation.notes
 
     def _unknown_releases(self) -> list[Release]:
-        """Return the sealed releases, by number, that the keystore does not know, or whose list."""
+        """Return the sealed releases, by number, that the keystore does not know, or whose list.
+
+        One that has only files of the keystore undoes nothing: publishing was interrupted before
+        the ledger got its number.
+        """
         known = self._known_numbers()
         forgotten = Forgotten(self.keystore, self._now)
         unknown = [
             release
             for release in self._sealed_releases()
-            if release.number not in known
+            if (release.number not in known and not self._has_all_files_of(release))
             or any(
                 forgotten.add(content)
                 for path, content in release.files.items()
@@ -862,6 +866,14 @@ class _Run:
             )
         ]
         return sorted(unknown, key=lambda release: release.number)
+
+    def _has_all_files_of(self, release: Release) -> bool:
+        """Return whether the keystore has every file of a release, with the same content."""
+        with suppress(SrosError, OSError):
+            return all(
+                self.keystore.read(path, "file") == data for path, data in release.files.items()
+            )
+        return False
 
     def _known_numbers(self) -> set[int]:
         entries = self.keystore.ledger_with("what", "release").entries
