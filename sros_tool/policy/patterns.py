@@ -36,6 +36,8 @@ _RANGE = re.compile(r"(.)-(.)|(.)", re.DOTALL)
 _ALPHABET = frozenset(map(chr, range(33, 127)))  # wider than ROS names: DDS topics may be foreign
 _ANY = frozenset([""])
 """The pattern piece for ``*``."""
+ELSEWHERE = "/[\ue000]"
+"""Any namespace but ``/``: of the names that a file can have, only ``*`` covers the letter."""
 _ROS_LETTERS = f"_{digits}{ascii_letters}/"
 _CHOICE = re.compile(r"\[(!?)([^\]]+)\]|(\?)|([^?\[]+)")
 _STARS = re.compile(r"\*\*+")
@@ -400,14 +402,16 @@ def _grams(run: str) -> Iterator[str]:
 
 # Most questions need no automata, which take long to import.
 @cache
-def _ros_names(absolute: bool) -> NameSet:
-    """Return the set of all valid ROS names, with or without a leading "/"."""
+def _ros_names(absolute: bool, elsewhere: bool) -> NameSet:
+    """Return the set of all valid ROS names, with or without a leading "/", or in `ELSEWHERE`."""
     from sros_tool.automata import Automaton, Letters, NameSet
 
     word, slash = Letters.between([("A", "Z"), ("a", "z"), ("_", "_")]), Letters.of("/")
     parts = ((1, word, 2), (2, word | Letters.between([("0", "9")]), 2), (2, slash, 1))
-    begin = (0, slash, 1) if absolute else (0, word, 2)
-    return NameSet((), [Automaton((begin, *parts), frozenset((2,)))])
+    begin = [(0, slash, 1)] if absolute else [(0, word, 2)]
+    if elsewhere:
+        begin = [(0, slash, 3), (3, Letters.of(ELSEWHERE[2]), 4), (4, slash, 1)]
+    return NameSet((), [Automaton((*begin, *parts), frozenset((2,)))])
 
 
 @lru_cache(maxsize=_MANY)
@@ -435,8 +439,8 @@ def common_name(
 ) -> str | None:
     """Return the shortest name that matches all ``wanted_names`` and no ``unwanted_names``.
 
-    Without ``absolute``, the name has no leading "/", like DDS topics.  Returns None if there is no
-    such name.
+    Without ``absolute``, the name has no leading "/", like DDS topics.  If ``wanted_names`` begin
+    with `ELSEWHERE`, so does the name.  Returns None if there is no such name.
 
     Raises:
         DocumentError: there are too many ``?`` after ``*`` to decide it.
@@ -458,7 +462,8 @@ def common_name(
 def _search(wanted: tuple[str, ...], unwanted_names: tuple[str, ...], absolute: bool) -> str | None:
     from sros_tool.automata import NameSet
 
-    both = reduce(and_, map(_names_of, wanted), _ros_names(absolute))
+    elsewhere = any(name.startswith(ELSEWHERE) for name in wanted)
+    both = reduce(and_, map(_names_of, wanted), _ros_names(absolute, elsewhere))
     return (both - NameSet.union(map(_names_of, unwanted_names))).example()
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import re
-import secrets
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -66,6 +65,7 @@ from sros_tool.keystore.template import Template, load_template, read_template, 
 from sros_tool.names import expand
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Policy, Profile
+from sros_tool.policy.patterns import ELSEWHERE
 from sros_tool.policy.rights import (
     NodeName,
     PlacedRight,
@@ -1163,10 +1163,6 @@ def _is_same_file(base: CommitFiles | None, head: CommitFiles, path: str) -> boo
     return base is not None and base.files.get(path) == head.files.get(path)
 
 
-_SOMEWHERE = f"/n{secrets.token_hex(8)}"
-"""A namespace that no policy can know, into which users put the nodes of a package."""
-
-
 def _fixed_or_moving_names(before: AccessSource, after: AccessSource) -> Iterator[PlacedRight]:
     """Yield the rights in ``after`` that are new only for nodes in another namespace.
 
@@ -1200,7 +1196,7 @@ def _moved_rights(enclave: Enclave) -> Iterator[tuple[PlacedRight, Right]]:
     """Yield each right of an enclave, and the same right for a node in another namespace."""
 
     def elsewhere(profile: Profile) -> Profile:
-        return replace(profile, ns=f"{_SOMEWHERE}{profile.ns}".rstrip("/"))
+        return replace(profile, ns=f"{ELSEWHERE}{profile.ns}".rstrip("/"))
 
     moved = placed_rights(enclave.with_profiles(elsewhere))
     for placed, moved_right in zip(placed_rights(enclave), moved, strict=True):
