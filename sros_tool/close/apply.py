@@ -33,6 +33,7 @@ from sros_tool.runtime.environment import node_argument
 from sros_tool.runtime.processes import Process, program_of
 from sros_tool.runtime.units import unit_changes, write_units
 from sros_tool.values import FileChange
+from sros_tool.wording import enumerated
 from sros_tool.xml import read_bytes
 
 _SYSTEMD = Path("/etc/systemd/system")
@@ -159,16 +160,17 @@ class _RemainingProcesses:
         """Yield how to restart open the processes that run in enclaves, except those of units."""
         closed = [process for process in self._started_by_hand if process.enclave in self._secured]
         counts = Counter(process.enclave for process in closed)
-        steps = []
+        started_by: dict[str, dict[str, None]] = {}
         for process in closed:
-            secured = self._secured[process.enclave]
+            secured, name = self._secured[process.enclave], process.enclave
             is_alone = counts[process.enclave] == 1 and not process.launch
-            which = "it"
             if is_alone and not process.container and self._running.may_use_files(secured):
                 process = secured_process(secured, process.enclave)
-                which = f"process {secured.pid}"
-            steps.append(f"restart {which} open: {process.open_command(self._robot.domain)}")
-        yield from dict.fromkeys(steps)
+                name = f"process {secured.pid}"
+            command = process.open_command(self._robot.domain)
+            started_by.setdefault(command, {})[name] = None
+        for command, names in started_by.items():
+            yield f"restart {enumerated([*names])} open: {command}"
 
     def secured_units(self) -> Iterator[str]:
         """Yield the processes of units that run in enclaves though their units were restarted."""
