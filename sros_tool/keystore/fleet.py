@@ -182,11 +182,10 @@ def unrecorded_notes(
     for robot, (below, _) in found.items():
         if below:
             text = f"{first_few(below, _SHOWN)}: of no robot, because no policy for the fleet had "
-            text += "this path with a placeholder: it is not in what "
-            text += f"`--robot {robot}` chooses, nor in a release, and an agent removes it. "
-            text += "To make it an enclave of the robot: `sros "
-            text += f"generate_artifacts -k {quote(str(keystore.root))} -p POLICY --fleet FILE "
-            text += f"--robot {robot}`, with a policy that writes the path with {{robot}}."
+            text += f"the path with a placeholder: `--robot {robot}` does not choose such an "
+            text += "enclave, no release has it, and an agent removes it. To make it an enclave of "
+            text += f"the robot: `sros generate_artifacts -k {quote(str(keystore.root))} -p POLICY "
+            text += f"--fleet FILE --robot {robot}`, with a policy that has {{robot}} in the path."
             yield Note("fleet.unrecorded", text)
 
 
