@@ -217,6 +217,7 @@ class _Round:
         repaired = self._state.repaired_at
         if repaired and abs(now - repaired) < _REPAIRED_FOR:
             self._problems.append(self._state.repaired)
+        self._note_removed(now)
         names = self._enclaves()
         opened = open_installed(self._folder, names, now=now)
         if clock is not RobotClock.BEHIND:  # what is wrong is seen on a clock that is right
@@ -359,7 +360,9 @@ class _Round:
             repaired = (
                 path for path in changed_files or () if enclave_of(path) in installation.changed
             )
-            self._note_repaired(release.number, tuple(repaired), installation.removed)
+            self._note_repaired(release.number, tuple(repaired))
+            removed = dict.fromkeys(installation.removed, self._machine.now)
+            self._state = replace(self._state, removed={**self._state.removed, **removed})
         return installation, True
 
     def _changed_files(self) -> tuple[str, ...] | None:
@@ -421,23 +424,30 @@ class _Round:
                         "the next release without it removes it, with its key."
                     )
 
-    def _note_repaired(self, release: int, paths: Sequence[str], removed: Sequence[str]) -> None:
-        """Remember what was replaced or removed: every message of the next day says so."""
-        now, texts = self._machine.now, []
+    def _note_repaired(self, release: int, paths: Sequence[str]) -> None:
+        """Remember that files were replaced: every message of the next day says so."""
         if paths:
-            texts.append(
+            now = self._machine.now
+            text = (
                 f"At {iso(now)}, {counted(len(paths), 'file')} that release {release} has "
                 f"{'was' if len(paths) == 1 else 'were'} changed or missing here, and replaced: "
                 f"{first_few(paths, 3)}. Find out who or what changes files on this robot."
             )
-        if removed:
-            texts.append(
-                f"At {iso(now)}, enclaves that release {release} does not have were here, and were "
-                f"removed: {first_few(removed, 3)}. If they are of another robot, somebody may "
-                "have copied their keys: `sros renew KEYSTORE ENCLAVE --new-key --revoke-old`."
+            self._state = replace(self._state, repaired=text, repaired_at=now)
+
+    def _note_removed(self, now: datetime) -> None:
+        """Report for a day the enclaves that the installed release did not have."""
+        recent = {
+            name: at for name, at in self._state.removed.items() if abs(now - at) < _REPAIRED_FOR
+        }
+        self._state = replace(self._state, removed=recent)
+        if recent:
+            self._problems.append(
+                f"Until {iso(max(recent.values()))}, enclaves that the installed release did not "
+                f"have were here, and were removed: {first_few(sorted(recent), 3)}. If they are of "
+                "another robot, somebody may have copied their keys: `sros renew KEYSTORE ENCLAVE "
+                "--new-key --revoke-old`."
             )
-        if texts:
-            self._state = replace(self._state, repaired=" ".join(texts), repaired_at=now)
 
     def _note_closed_keys(self, exposed: Mapping[str, datetime], now: datetime) -> None:
         """Report the keys that others could read until the agent closed them, for a day."""

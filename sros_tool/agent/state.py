@@ -54,7 +54,8 @@ class AgentState:
     replaced their files, in seconds since the start of the machine: no setting of its clock changes
     that.  ``repaired`` is a sentence on files that were not those of the release and were replaced,
     at ``repaired_at``.  ``exposed`` maps paths of private keys that others could read, until the
-    agent closed them, to the time of that round.
+    agent closed them, to the time of that round; ``removed`` maps enclaves that the installed
+    release did not have to the time of the round that removed them.
     """
 
     release: int = 0
@@ -75,6 +76,7 @@ class AgentState:
     replaced: Mapping[str, float] = field(default_factory=dict)
     list_replaced: Mapping[str, float] = field(default_factory=dict)
     exposed: Mapping[str, datetime] = field(default_factory=dict)
+    removed: Mapping[str, datetime] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
 
     def next_sequence(self, now: datetime) -> int:
@@ -123,7 +125,7 @@ def _state_from(value: Any) -> AgentState:
         check_enclave_name(_text(name)): _text(text)
         for name, text in dict(value.get("files", {})).items()
     }
-    for moments in ("exposed", "list_since"):
+    for moments in ("exposed", "removed", "list_since"):
         value[moments] = {
             _text(path): parse_iso(_text(moment))
             for path, moment in dict(value.get(moments, {})).items()

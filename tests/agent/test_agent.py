@@ -269,7 +269,9 @@ def test_enclaves_that_the_release_does_not_have(home: Home, r1: Robot) -> None:
     done = r1.round()
     assert done.removed == ("/r1/since",) and not any("newer" in each for each in done.problems)
     (problem,) = (each for each in r1.round().problems if "of another robot" in each)
-    assert "removed: /r1/damaged. If they are of another robot" in problem, "for a day"
+    assert "removed: /r1/damaged, /r2/x. If they" in problem, "for a day"
+    late = r1.round(moment() + timedelta(days=1, minutes=1)).problems
+    assert not any("of another robot" in each for each in late)
 
 
 def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None:
