@@ -121,6 +121,9 @@ def test_a_keystore_from_before_a_revocation(keystore: Path, tmp_path: Path) -> 
         f"{nodes} revocation {of}",
         f"nodes of {robot} accept 1 certificate that the revocation list of {restored} revokes",
     ]
+    sros("crl", restored, "--refresh").ok()  # a later list: an export would replace the robot's
+    said = sros("check", restored, robot).out
+    assert "first revoke them there again" in said and "distribute_key" in said
 
 
 def test_protection_and_domains_that_keep_nodes_apart(keystore: Path, tmp_path: Path) -> None:

@@ -70,6 +70,11 @@ _REVOKE_AGAIN = (
     "This keystore was perhaps restored from a backup: before its next export, revoke again what "
     "the other list revokes, with `sros revoke KEYSTORE ENCLAVE`."
 )
+_REVOKE_FIRST = (
+    "The keystore was perhaps restored from a backup: the export's own list revokes certificates "
+    "that the keystore's does not. Unless they expired, first revoke them there again, with `sros "
+    f"revoke KEYSTORE ENCLAVE`. {PEERS_ACCEPT.remedy}"
+)
 PEERS_PROTECTION = FindingKind(
     "keystore.peers-protection",
     WARNING,
@@ -279,7 +284,7 @@ def _earlier_lists(targets: Targets) -> Iterator[Finding]:
                 if (folder / CRL_FILE).exists():
                     lists.append(keystore.read(folder / CRL_FILE, "revocation list"))
                 holders[_certificates(trusted), b"\n".join(lists)][shown] = None
-    found: dict[tuple[str, str], None] = {}
+    found: dict[tuple[str, str], str] = {}
     for (authorities, own_lists), earlier in holders.items():
         for authority in authorities:
             signer = authority.public_bytes(Encoding.PEM)
@@ -298,9 +303,10 @@ def _earlier_lists(targets: Targets) -> Iterator[Finding]:
                     f"{'newer ' * (newest > own.number)}revocation list of {names_text(holding)} "
                     "revokes"
                 )
-                found |= {(e, f"nodes of {e} {text}"): None for e in earlier if e not in holding}
-    for shown, text in found:
-        remedy = _REVOKE_AGAIN if targets[shown][0].is_original else ""
+                remedy = _REVOKE_FIRST if own.serials - other.serials else ""
+                found |= {(e, f"nodes of {e} {text}"): remedy for e in earlier if e not in holding}
+    for (shown, text), of_export in found.items():
+        remedy = _REVOKE_AGAIN if targets[shown][0].is_original else of_export
         yield PEERS_ACCEPT.found(shown, text, shown, remedy=remedy)
 
 
