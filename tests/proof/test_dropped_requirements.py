@@ -114,6 +114,12 @@ def test_an_exception_of_some_namespaces_is_weakened() -> None:
     assert dropped_requirements(after, after) == ()
 
 
+def test_another_kind_that_stays_is_weakened() -> None:
+    before, after = read(ONLY.replace('"/a"', '"a"')), read('[[nobody]]\npublish = ["/a", "/b*"]\n')
+    (found,) = dropped_requirements(before, after)
+    assert (found.change, found.kept, found.only_elsewhere) == ("weakened", (), True)
+
+
 @pytest.mark.parametrize("case", DROPPED)
 def test_what_is_not_demanded_is_dropped(case: str) -> None:
     before, after = map(read, DROPPED[case])
