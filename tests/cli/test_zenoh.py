@@ -262,6 +262,9 @@ def test_enclaves_outside_the_domains_of_the_network_lack_no_file(tmp_path: Path
         ended = sros(*line.split(), cwd=tmp_path).ok()
     said = "no file: enclave /d1: its permissions are for no domain of the network\n"
     assert ended.out == said
+    for name, notes in (("d1", 1), ("z1", 0)):
+        found = sros("check", f"ks/enclaves/{name}", "--severity", "note", cwd=tmp_path).out
+        assert found.count("[zenoh.other-domain]") == notes, found
     (tmp_path / "ks/enclaves/z1/permissions.p7s").unlink()
     sros("zenoh", "ks", cwd=tmp_path).ok()
     assert sros("zenoh", "ks", "--check", cwd=tmp_path).status == 1
