@@ -888,6 +888,8 @@ def test_releases_of_a_later_ca_in_a_folder_without_metadata(publisher: Home) ->
     backup = copy_of(publisher.root, publisher.folder / "backup")
     forget_publishing(backup)
     publisher.run("rotate_ca", "ks", "--finish", "--allow-unconfirmed")
+    shutil.rmtree(publisher.pub / "metadata")
+    publisher.publish(new_folder=True)  # the ledger has the releases of the earlier CA
     shutil.rmtree(publisher.pub)
     publisher.publish(new_folder=True)
     shutil.rmtree(publisher.pub / "metadata")

@@ -197,6 +197,7 @@ def test_a_name_of_another_format_is_refused(tmp_path: Path) -> None:
         assert (ended.status, f"Name it '{named}'" in ended.err) == (2, True)
         sros("view", policy, *form, "-o", named).ok()
     sros("view", policy, "--json", "-o", tmp_path / "a.picture").ok()
+    sros("view", policy, "--json", "--dry-run", "-o", tmp_path / "a.svg").ok()  # JSON of the plan
 
 
 def test_nothing_is_replaced_unasked_and_a_dry_run_writes_nothing(tmp_path: Path) -> None:
