@@ -23,26 +23,23 @@ from sros_tool.dds.governance import Governance
 from sros_tool.errors import UsageError
 from sros_tool.keystore.selection import likely_names
 from sros_tool.names import ACTION_SEPARATOR, dds_names, is_expression
-from sros_tool.policy.model import ALLOW, DENY, OTHER_SIDE, Qualifier
+from sros_tool.policy.model import ALLOW, DENY, OTHER_SIDE
 from sros_tool.policy.patterns import matches, overlap
 from sros_tool.policy.rights import Right
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, HopPath, Network, path_text, unguarded
 from sros_tool.report.compose import PictureSource, edge_order, namespace_of, protection_of
 from sros_tool.report.layout import (
     MARGIN,
-    SIDE_LETTERS,
     Card,
     Head,
     Link,
+    LinkedTie,
     Scene,
-    bottom_of,
     enclave_notes,
-    frames_of,
-    height_of,
-    linked_cards,
+    links_of,
     names_card,
-    stacked_cards,
-    wrapped_name,
+    placed,
+    side_card,
 )
 from sros_tool.report.picture import (
     Bundle,
@@ -465,32 +462,17 @@ def flow_scene(picture: Picture, hops: int = HOPS, *, with_places: bool = True) 
     """
     draft = _Draft(picture, FocusFlow.of(picture), hops)
     cards = draft.cards_in_columns()
-    links = draft.links(cards)
     names = {name for card in cards.values() if card.kind for name in card.members}
     scene = Scene(
         id="focus",
         title=", ".join(dict.fromkeys(focus.name for focus in picture.focus)),
         width=max((card.x + card.width for card in cards.values()), default=200) + MARGIN,
-        height=0,
         cards=tuple(cards.values()),
-        links=tuple(links),
-        frames=(),
-        onlookers=(),
+        links=tuple(draft.links(cards)),
         heads=tuple(draft.heads(cards)),
         shown=len(names),
     )
-    if not with_places:
-        return scene
-    cards = stacked_cards(
-        cards.values(), sorted({(link.source, link.target) for link in links}), draft.columns
-    )
-    return replace(
-        scene,
-        height=bottom_of(cards.values()),
-        cards=tuple(cards.values()),
-        links=linked_cards(cards, links),
-        frames=tuple(frames_of(cards.values())),
-    )
+    return placed(scene, draft.columns) if with_places else scene
 
 
 class _Stage(NamedTuple):
@@ -594,7 +576,7 @@ class _Draft:
             members[before, node].append(path)
         noted = enclave_notes(self._picture)
         for (before, node), paths in sorted(members.items()):
-            side = self._flow.before if before else self._flow.after
+            side = self._side(before)
             group, notes = "", []
             if node[0] == ":":
                 label = node.partition(" ")[2] or counted(len(paths), "enclave")
@@ -603,40 +585,21 @@ class _Draft:
                 group = self._groups[node]
                 label = node.removeprefix(group.rstrip("/") + "/") or node
                 notes = list(noted.get(node, ()))
-            lines = wrapped_name(label, SIDE_LETTERS)
-            yield Card(
-                id=f"{'s' if before else 'l'}{node}",
-                role="group" if node[0] == ":" else "enclave",
-                column=self._column_of(before, side[paths[0]]),
-                x=0,
-                y=0,
-                width=0,
-                height=height_of(lines, notes),
-                lines=lines,
-                notes=tuple(notes),
-                members=tuple(sorted(paths)),
-                group=group,
+            column = self._column_of(before, side[paths[0]])
+            card = f"{'s' if before else 'l'}{node}"
+            yield replace(
+                side_card(card, column, label, notes, sorted(paths), group),
                 chosen=node in self._flow.own,
             )
 
     def _further_cards(self) -> Iterator[Card]:
         for before, paths in zip((True, False), self._further, strict=True):
             if paths:
-                side = self._flow.before if before else self._flow.after
-                lines = (f"{len(paths)} more",)
-                notes = (f"over up to {max(side[path] for path in paths)} hops",)
-                yield Card(
-                    id="s:" if before else "l:",
-                    role="group",
-                    column=1 if before else self.columns - 2,  # next to the last hop
-                    x=0,
-                    y=0,
-                    width=0,
-                    height=height_of(lines, notes),
-                    lines=lines,
-                    notes=notes,
-                    members=paths,
-                )
+                side = self._side(before)
+                notes = [f"over up to {max(side[path] for path in paths)} hops"]
+                column = 1 if before else self.columns - 2  # next to the last hop
+                card = "s:" if before else "l:"
+                yield side_card(card, column, f"{len(paths)} more", notes, paths)
 
     def _names_cards(self) -> Iterator[Card]:
         for stage in self._stages:
@@ -649,38 +612,13 @@ class _Draft:
 
     def links(self, cards: Mapping[str, Card]) -> list[Link]:
         """Return all links, without the positions of their ends."""
-        groups: dict[tuple[str, str, str, bool, str, bool, bool], set[str]] = defaultdict(set)
+        ties: list[LinkedTie] = []
         for stage in self._stages:
             for number, (_, left, right) in enumerate(stage.bundles):
                 names = f"n{stage.column} {number}"
-                for ties, out in ((left, True), (right, False)):
-                    for tie in ties:
-                        ends = (tie.node, names) if out else (names, tie.node)
-                        key = (
-                            *ends,
-                            tie.qualifier.value,
-                            bool(tie.by),
-                            tie.mark.value,
-                            tie.violates,
-                            tie.differs,
-                        )
-                        groups[key].add(tie.right)
-        links = [
-            Link(
-                source,
-                target,
-                0,
-                0,
-                tuple(sorted(rights)),
-                Qualifier(qualifier),
-                (cards[source] if cards[source].role == "names" else cards[target]).level,
-                wildcard,
-                OverlaySide(mark),
-                *more,
-            )
-            for (source, target, qualifier, wildcard, mark, *more), rights in sorted(groups.items())
-        ]
-        return [*links, *self._further_links(cards)]
+                ties += ((tie.node, names, tie) for tie in left)
+                ties += ((names, tie.node, tie) for tie in right)
+        return [*links_of(cards, ties), *self._further_links(cards)]
 
     def _further_links(self, cards: Mapping[str, Card]) -> Iterator[Link]:
         """Yield links of the outermost drawn cards to the card of the enclaves further away."""

@@ -36,7 +36,7 @@ _SIDE_WIDTH, _NAMES_WIDTH, _GUTTER = 184, 330, 110
 LINE, PAD, SMALL = 16, 7, 14
 """Height of a text line, padding of a card, and height of a note line, in pixels."""
 _GAP, _LEAD, _TOP, MARGIN = 9.0, 24.0, 34.0, 14
-SIDE_LETTERS, _NAMES_LETTERS = 20, 35  # letters per line on a card
+_SIDE_LETTERS, _NAMES_LETTERS = 20, 35  # letters per line on a card
 _ONLOOKER_LINES, _ONLOOKER_SHARE = 8, 0.3  # onlookers have more bundles than both limits
 _MOST_ONLOOKERS = 26  # the number of letters
 _FEW_BUNDLES, _MOST_BUNDLES = 24, 80  # with more: private names are counted; bundles joined
@@ -88,7 +88,7 @@ class Head(NamedTuple):
     text: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
     """Cards and the links between them.
 
@@ -100,17 +100,17 @@ class Scene:
     id: str
     title: str
     width: int
-    height: int
+    height: int = 0
     cards: tuple[Card, ...]
     links: tuple[Link, ...]
-    frames: tuple[Frame, ...]
-    onlookers: tuple[Onlooker, ...]
+    frames: tuple[Frame, ...] = ()
+    onlookers: tuple[Onlooker, ...] = ()
     heads: tuple[Head, ...]
     hidden: int = 0
     shown: int = 0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Card:
     """A rectangle with text: an enclave, a group of enclaves, or a bundle of names.
 
@@ -124,9 +124,9 @@ class Card:
     id: str
     role: str
     column: int
-    x: int
-    y: int
-    width: int
+    x: int = 0
+    y: int = 0
+    width: int = 0
     height: int
     lines: tuple[str, ...]
     notes: tuple[str, ...]
@@ -253,7 +253,8 @@ def _scene(
     for edge in picture.edges:
         everybody[edge.kind, edge.name].add(owner(edge.enclave))
     draft = _Draft(picture, edges, owner, members, everybody)
-    scene = draft.placed_scene(name, title) if with_places else draft.scene(name, title)
+    scene = draft.scene(name, title)
+    scene = placed(scene, 3) if with_places else scene
     shown = _count_real_names({(edge.kind, edge.name) for edge in edges}, drawn_as or {})
     hidden = (
         _count_real_names({(name.kind, name.name) for name in picture.names}, drawn_as or {})
@@ -270,7 +271,7 @@ def _count_real_names(names: Iterable[tuple[str, str]], drawn_as: DrawnAs) -> in
 
 
 class _Draft:
-    """The builder of a scene: first the cards and links, then their positions.
+    """The builder of a scene before placement, with its cards and links.
 
     ``members`` maps each node of the scene to its enclaves; ``everybody`` maps each name to the
     nodes with any right to it, drawn or not.
@@ -301,15 +302,12 @@ class _Draft:
                 self._bundles.append(bundle)
         if len(self._bundles) > _MOST_BUNDLES:
             self._bundles = list(joined_by_senders(self._bundles))
-        self._ties: dict[tuple[str, str, Qualifier, bool, OverlaySide, bool, bool], set[str]]
-        self._ties = defaultdict(set)
+        self._ties: list[LinkedTie] = []
         for number, bundle in enumerate(self._bundles):
             for tie in bundle.ties:
                 if not self._is_onlooker(tie):
                     side, names = f"{'s' if tie.sends else 'l'}{tie.node}", f"n{number}"
-                    ends = (side, names) if tie.sends else (names, side)
-                    marks = tie.mark, tie.violates, tie.differs
-                    self._ties[*ends, tie.qualifier, bool(tie.by), *marks].add(tie.right)
+                    self._ties.append((side, names, tie) if tie.sends else (names, side, tie))
 
     def _is_onlooker(self, tie: Tie) -> bool:
         """Return whether a right is drawn as a letter on the card of the name, not as a line."""
@@ -333,10 +331,8 @@ class _Draft:
             id=name,
             title=title,
             width=width,
-            height=0,
             cards=tuple(cards.values()),
-            links=self._links(cards),
-            frames=(),
+            links=tuple(links_of(cards, self._ties)),
             onlookers=tuple(
                 Onlooker(tag, node, right) for (node, right), tag in self._tags.items()
             ),
@@ -347,24 +343,10 @@ class _Draft:
             ),
         )
 
-    def placed_scene(self, name: str, title: str) -> Scene:
-        """Return the scene with the positions of all cards, links and frames."""
-        scene = self.scene(name, title)
-        cards = {card.id: card for card in scene.cards}
-        lines = sorted({ends[:2] for ends in self._ties})
-        cards = stacked_cards(cards.values(), lines, 3)
-        return replace(
-            scene,
-            height=bottom_of(cards.values()),
-            cards=tuple(cards.values()),
-            links=self._links(cards),
-            frames=tuple(frames_of(cards.values())),
-        )
-
     # ── cards ──────────────────────────────────────────────────────────────────────────────
 
     def _cards(self) -> Iterable[Card]:
-        sides = {end for key in self._ties for end in key[:2] if end[0] in "sl"}
+        sides = {end for ends in self._ties for end in ends[:2] if end[0] in "sl"}
         sides |= {f"{'s' if SENDS[right] else 'l'}{node}" for node, right in self._looking}
         # The scene of a group has all enclaves of the group, but only neighbors with links.
         inner = {node for node in self._members if not node.startswith(":")}
@@ -399,20 +381,11 @@ class _Draft:
             for reach in (_REACHES[right],)
             if tagged == node and SENDS[right] is sends
         ]
-        lines = wrapped_name(label, SIDE_LETTERS)
-        return Card(
-            id=side,
-            role="group" if is_group else "enclave",
-            column=0 if sends else 2,
-            x=MARGIN if sends else MARGIN + _SIDE_WIDTH + _NAMES_WIDTH + 2 * _GUTTER,
-            y=0,
-            width=_SIDE_WIDTH,
-            height=height_of(lines, notes),
-            lines=lines,
-            notes=tuple(notes),
-            members=members,
-            group="" if is_group else self._groups[node],
+        card = side_card(
+            side, 0 if sends else 2, label, notes, members, "" if is_group else self._groups[node]
         )
+        x = MARGIN if sends else MARGIN + _SIDE_WIDTH + _NAMES_WIDTH + 2 * _GUTTER
+        return replace(card, x=x, width=_SIDE_WIDTH)
 
     def _names_card(self, number: int, bundle: Bundle) -> Card:
         drawn = {tie.node for tie in bundle.ties}
@@ -422,30 +395,6 @@ class _Draft:
         notes = (_COMMON[bundle.kind],) if shared else ()
         card = names_card(f"n{number}", bundle, 1, notes)
         return replace(card, x=x, width=_NAMES_WIDTH, tags="".join(sorted(tags)))
-
-    # ── links ──────────────────────────────────────────────────────────────────────────────
-
-    def _links(self, cards: Mapping[str, Card]) -> tuple[Link, ...]:
-        return linked_cards(
-            cards,
-            [
-                Link(
-                    source,
-                    target,
-                    0,
-                    0,
-                    tuple(sorted(rights)),
-                    qualifier,
-                    (cards[source] if cards[source].role == "names" else cards[target]).level,
-                    wildcard,
-                    mark,
-                    *more,
-                )
-                for (source, target, qualifier, wildcard, mark, *more), rights in sorted(
-                    self._ties.items()
-                )
-            ],
-        )
 
 
 def _onlookers(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
@@ -510,10 +459,35 @@ def enclave_notes(picture: Picture) -> Mapping[str, tuple[str, ...]]:
     }
 
 
+def side_card(
+    card: str,
+    column: int,
+    label: str,
+    notes: Sequence[str],
+    members: Iterable[str],
+    group: str = "",
+) -> Card:
+    """Return the card of an enclave in ``group``, or of several enclaves, without x, y and width.
+
+    ``card`` is its id, and ``label`` the text that names the enclave or the enclaves.
+    """
+    lines = _wrapped_name(label, _SIDE_LETTERS)
+    return Card(
+        id=card,
+        role="enclave" if group else "group",
+        column=column,
+        height=_height_of(lines, notes),
+        lines=lines,
+        notes=tuple(notes),
+        members=tuple(members),
+        group=group,
+    )
+
+
 def names_card(card: str, bundle: Bundle, column: int, more: tuple[str, ...] = ()) -> Card:
     """Return the card of a bundle, without x, y and width; ``more`` are additional notes."""
     titles, notes = _names_title(bundle)
-    lines = tuple(line for title in titles for line in wrapped_name(title, _NAMES_LETTERS))
+    lines = tuple(line for title in titles for line in _wrapped_name(title, _NAMES_LETTERS))
     notes += more
     if is_open := bundle.protection.open_text(bundle.kind):
         notes += (is_open,)
@@ -523,10 +497,7 @@ def names_card(card: str, bundle: Bundle, column: int, more: tuple[str, ...] = (
         id=card,
         role="names",
         column=column,
-        x=0,
-        y=0,
-        width=0,
-        height=height_of(lines, notes),
+        height=_height_of(lines, notes),
         lines=lines,
         notes=notes,
         members=bundle.names,
@@ -536,7 +507,7 @@ def names_card(card: str, bundle: Bundle, column: int, more: tuple[str, ...] = (
     )
 
 
-def height_of(lines: Sequence[str], notes: Sequence[str]) -> int:
+def _height_of(lines: Sequence[str], notes: Sequence[str]) -> int:
     """Return the height of a card with these text lines and notes, in pixels."""
     return 2 * PAD + LINE * len(lines) + SMALL * len(notes)
 
@@ -551,7 +522,7 @@ def _common_namespace(names: Sequence[str]) -> str:
     return "/".join(common_parts)
 
 
-def wrapped_name(text: str, letters: int) -> tuple[str, ...]:
+def _wrapped_name(text: str, letters: int) -> tuple[str, ...]:
     """Split ``text`` at slashes or underscores into lines of at most ``letters`` characters."""
     lines = []
     while len(text) > letters:
@@ -568,8 +539,48 @@ def wrapped_name(text: str, letters: int) -> tuple[str, ...]:
 
 # ── positions ──────────────────────────────────────────────────────────────────────────
 
+LinkedTie = tuple[str, str, Tie]
+"""The ids of two cards, in the direction of the arrow, and a right that their link shows."""
 
-def stacked_cards(
+
+def links_of(cards: Mapping[str, Card], ties: Iterable[LinkedTie]) -> list[Link]:
+    """Return the links for some rights, without positions; one for those that are drawn alike."""
+    groups: dict[tuple[str, str, Qualifier, bool, OverlaySide, bool, bool], set[str]]
+    groups = defaultdict(set)
+    for source, target, tie in ties:
+        marks = tie.mark, tie.violates, tie.differs
+        groups[source, target, tie.qualifier, bool(tie.by), *marks].add(tie.right)
+    return [
+        Link(
+            source,
+            target,
+            0,
+            0,
+            tuple(sorted(rights)),
+            qualifier,
+            (cards[source] if cards[source].role == "names" else cards[target]).level,
+            wildcard,
+            mark,
+            *more,
+        )
+        for (source, target, qualifier, wildcard, mark, *more), rights in sorted(groups.items())
+    ]
+
+
+def placed(scene: Scene, columns: int) -> Scene:
+    """Return a scene with the positions of all cards, links and frames."""
+    lines = sorted({(link.source, link.target) for link in scene.links})
+    cards = _stacked_cards(scene.cards, lines, columns)
+    return replace(
+        scene,
+        height=max((card.y + card.height for card in cards.values()), default=0) + MARGIN,
+        cards=tuple(cards.values()),
+        links=_linked_cards(cards, scene.links),
+        frames=tuple(_frames_of(cards.values())),
+    )
+
+
+def _stacked_cards(
     cards: Iterable[Card], lines: Sequence[tuple[str, str]], columns: int
 ) -> dict[str, Card]:
     """Return the cards with their y, by id, ordered by column and y.
@@ -589,12 +600,7 @@ def stacked_cards(
     }
 
 
-def bottom_of(cards: Iterable[Card]) -> int:
-    """Return the height of a scene with these cards, in pixels."""
-    return max((card.y + card.height for card in cards), default=0) + MARGIN
-
-
-def linked_cards(cards: Mapping[str, Card], links: Sequence[Link]) -> tuple[Link, ...]:
+def _linked_cards(cards: Mapping[str, Card], links: Sequence[Link]) -> tuple[Link, ...]:
     """Return the links with their ends spread along the edges of the cards."""
     ports: dict[tuple[str, bool], list[tuple[float, int]]] = defaultdict(list)
     for number, link in enumerate(links):
@@ -643,7 +649,7 @@ def _extent(column: Sequence[ColumnItem]) -> float:
     return sum(item.height + _GAP for item in column) + _LEAD * groups
 
 
-def frames_of(cards: Iterable[Card]) -> Iterable[Frame]:
+def _frames_of(cards: Iterable[Card]) -> Iterable[Frame]:
     """Yield a frame around the cards of each group in a column of enclaves."""
     groups: dict[tuple[int, str], list[Card]] = defaultdict(list)
     for card in cards:
