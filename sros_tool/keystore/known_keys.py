@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from functools import cached_property
@@ -37,6 +37,7 @@ from sros_tool.pki.certificates import (
     key_digest,
     load_request,
     subject_text,
+    validity_of,
 )
 from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.pki.keys import PublicKey, load_key
@@ -61,6 +62,45 @@ def revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
     recorded = {int(entry.serial, 16) for entry in entries if entry.what == "revocation"}
     listed = {entry.serial for crl in keystore.revocation_lists for entry in crl.revoked}
     return frozenset(recorded | listed)
+
+
+def known_expiries(keystore: OpenedKeystore, serials: Collection[int]) -> dict[int, str]:
+    """Map serial numbers to expiries (ISO 8601, UTC), from ledger and folder ``revoked``.
+
+    A certificate whose ledger entry is not certain has no expiry.
+    """
+    wanted = {f"{serial:x}" for serial in serials}
+    if not wanted:
+        return {}
+    # Version 0.2 of sros recorded the expiry with the certificate only.
+    recorded = {
+        entry.serial: entry.not_after
+        for entry in keystore.ledger_file.with_values("serial", wanted).certain
+        if entry.what in ("certificate", "revocation")
+        and entry.serial in wanted
+        and entry.not_after
+    }
+    expiries = {int(serial, 16): not_after for serial, not_after in recorded.items()}
+    for certificate in certificates_of_revoked(keystore, recorded):
+        if certificate.serial_number in serials:
+            expiries[certificate.serial_number] = iso(validity_of(certificate).not_after)
+    return expiries
+
+
+def certificates_of_revoked(
+    keystore: OpenedKeystore, known: Container[str] = ()
+) -> Iterator[x509.Certificate]:
+    """Yield the certificates in the folder ``revoked`` that a trusted identity CA issued.
+
+    Certificates whose serial number (hexadecimal) is in ``known`` are not read.
+    """
+    file = keystore.identity_file
+    trusted = keystore.certificates_of(file) if file else ()
+    for path in revoked_certificates(keystore.root, known):
+        with suppress(SrosError):  # a file that is not a certificate
+            certificate = keystore.certificate(path)
+            if any(issued_by(certificate, authority) for authority in trusted):
+                yield certificate
 
 
 def restored_at(keystore: OpenedKeystore) -> str:

@@ -144,10 +144,10 @@ def load_crl(data: bytes, name: str) -> RevocationList:
     expiry = next_update(crl)
     if expiry is None:
         raise PkiError(f"the revocation list {name} does not say when it expires", "", _RESTORE)
-    return RevocationList(list_number(crl), last_update(crl), expiry, revoked_in(crl), crl)
+    return RevocationList(list_number(crl), last_update(crl), expiry, _revoked_in(crl), crl)
 
 
-def revoked_in(crl: x509.CertificateRevocationList) -> tuple[Revoked, ...]:
+def _revoked_in(crl: x509.CertificateRevocationList) -> tuple[Revoked, ...]:
     """Return what a list revokes; an entry with the reason removeFromCRL revokes nothing."""
     return tuple(entry for entry in map(_revoked, crl) if entry.reason in REASONS)
 
@@ -321,6 +321,26 @@ def newest_list(data: bytes, authorities: bytes) -> x509.CertificateRevocationLi
         return None
     signed = [crl for crl in lists if any(signed_by(crl, signer) for signer in signers)]
     return max(signed, key=list_number, default=None)
+
+
+class Revocations(NamedTuple):
+    """Number of a revocation list, and the serial numbers on it; -1 and nothing without a list."""
+
+    number: int = -1
+    serials: frozenset[int] = frozenset()
+
+
+@lru_cache(maxsize=256)
+def newest_revocations(signer: bytes, *files: bytes) -> Revocations:
+    """Return what the newest list in ``files`` revokes, of the lists that the CA ``signer`` signed.
+
+    A file that cannot be read has no list.
+    """
+    lists = [crl for data in files if (crl := newest_list(data, signer)) is not None]
+    newest = max(lists, key=list_number, default=None)
+    if newest is None:  # a list that revokes nothing is false
+        return Revocations()
+    return Revocations(list_number(newest), frozenset(e.serial for e in _revoked_in(newest)))
 
 
 def list_number(crl: x509.CertificateRevocationList) -> int:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from itertools import combinations
 from pathlib import Path
 from shutil import rmtree
 
 from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.targets import path_findings
+from sros_tool.keystore.delivery.export import distribute
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
+from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
+from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.keystore.template import load_template
 from tests.support.harness import copy_of, sros
 
 FOUND = {
@@ -21,8 +26,8 @@ FOUND = {
 NOW = datetime.now(UTC)
 
 
-def strangers(*paths: Path, vendors: tuple[str, ...] = ()) -> list[str]:
-    found = path_findings(paths, Circumstances(NOW, vendors=vendors))
+def strangers(*paths: Path, vendors: tuple[str, ...] = (), at: datetime = NOW) -> list[str]:
+    found = path_findings(paths, Circumstances(at, vendors=vendors))
     return [each.text for each in found if each.id in FOUND]
 
 
@@ -121,9 +126,27 @@ def test_a_keystore_from_before_a_revocation(keystore: Path, tmp_path: Path) -> 
         f"{nodes} revocation {of}",
         f"nodes of {robot} accept 1 certificate that the revocation list of {restored} revokes",
     ]
-    sros("crl", restored, "--refresh").ok()  # a later list: an export would replace the robot's
+    for _ in range(2):
+        sros("crl", restored, "--refresh").ok()  # a later list: an export would replace the robot's
+    late = tmp_path / "late"
+    sros("distribute_key", restored, "/a", late).ok()
+    assert accepting()[0] == f"{nodes} revocation {of}"
+    assert len([text for text in strangers(robot, late) if "accept" in text]) == 1, "by the later"
     said = sros("check", restored, robot).out
+    assert "before its next export, revoke again" in said
     assert "first revoke them there again" in said and "distribute_key" in said
+
+
+def test_a_list_may_lack_what_expired(tmp_path: Path) -> None:
+    keystore, robot, later = tmp_path / "ks", tmp_path / "robot", NOW + timedelta(days=400)
+    create_keystore(keystore, template=load_template("production"), now=NOW)
+    create_enclaves(keystore, ["/a", "/gone"], now=NOW)
+    revoke(keystore, ["/gone"], now=NOW)
+    distribute(OpenedKeystore(keystore), ["/a"], robot, now=NOW)
+    for days in (0, 2):
+        refresh_crl(keystore, now=later + timedelta(days=days))
+    assert not OpenedKeystore(keystore).revocation_lists[0].revoked
+    assert [len(strangers(keystore, robot, at=moment)) for moment in (NOW, later)] == [1, 0]
 
 
 def test_protection_and_domains_that_keep_nodes_apart(keystore: Path, tmp_path: Path) -> None:

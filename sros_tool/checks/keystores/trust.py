@@ -11,27 +11,30 @@ from itertools import chain, combinations, product
 from typing import NamedTuple
 
 from cryptography import x509
-from cryptography.hazmat.primitives.serialization import Encoding
 
 from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, names_text
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.errors import SrosError
 from sros_tool.keystore.comparison import Mismatch, compare_governance, mismatch
+from sros_tool.keystore.known_keys import known_expiries
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
     GOVERNANCE_FILE,
+    IDENTITY,
     IDENTITY_CA_FILE,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
     ROLES,
 )
 from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.keystore.template import is_ca_service
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import issued_by, load_certificate, load_certificates
-from sros_tool.pki.crl import list_number, lists_as_revoked, newest_list, read_list, revoked_in
+from sros_tool.pki.certificates import issued_by, load_certificate, load_certificates, pem
+from sros_tool.pki.crl import Revocations, lists_as_revoked, newest_revocations, read_list
 from sros_tool.pki.distinguished_names import same_name
+from sros_tool.validity import iso
 from sros_tool.wording import counted, first_few
 
 STRANGERS = FindingKind(
@@ -147,7 +150,7 @@ def findings_between(
     yield from _strangers(targets, refused, on_zenoh=on_zenoh)
     if not on_zenoh:
         yield from _revoked(targets)
-        yield from _earlier_lists(targets)
+        yield from _earlier_lists(targets, now)
         governed = {shown: _Governed(*target, now) for shown, target in targets.items()}
         yield from _incompatible_governance_findings(governed, refused)
 
@@ -272,36 +275,45 @@ def _names_revoked(data: bytes, keystore: OpenedKeystore, enclaves: Sequence[str
                     yield name
 
 
-def _earlier_lists(targets: Targets) -> Iterator[Finding]:
-    """Yield findings about targets without what the newest list of another target revokes."""
-    holders: dict[tuple[_Certificates, bytes], dict[str, None]] = defaultdict(dict)
+def _earlier_lists(targets: Targets, now: datetime) -> Iterator[Finding]:
+    """Yield findings about targets without what the list of another target revokes.
+
+    A later list may lack what the ledger of the keystore knows to have expired; without a keystore
+    among the targets, nothing shows what that is.
+    """
+    holders: dict[tuple[_Certificates, bytes, bytes], dict[str, None]] = defaultdict(dict)
     for shown, (keystore, enclaves) in targets.items():
         for name in enclaves:
             folder = keystore.folder(name)
             with suppress(SrosError, ValueError, OSError):
                 trusted = keystore.read(folder / IDENTITY_CA_FILE, "CA certificate")
-                lists = [trusted]  # which has a list, too, in a rotation
+                listed = b""
                 if (folder / CRL_FILE).exists():
-                    lists.append(keystore.read(folder / CRL_FILE, "revocation list"))
-                holders[_certificates(trusted), b"\n".join(lists)][shown] = None
+                    listed = keystore.read(folder / CRL_FILE, "revocation list")
+                # In a rotation, the file of the CAs has a list, too.
+                holders[_certificates(trusted), trusted, listed][shown] = None
     found: dict[tuple[str, str], str] = {}
-    for (authorities, own_lists), earlier in holders.items():
+    for (authorities, *own_files), earlier in holders.items():
         for authority in authorities:
-            signer = authority.public_bytes(Encoding.PEM)
-            own = _newest_list(own_lists, signer)
-            of_list: dict[_List, list[str]] = defaultdict(list)
-            for (_, lists_of_others), names in holders.items():
-                of_list[_newest_list(lists_of_others, signer)] += names
+            signer = pem(authority)
+            own = newest_revocations(signer, *own_files)
+            of_list: dict[Revocations, list[str]] = defaultdict(list)
+            for (_, *files), names in holders.items():
+                of_list[newest_revocations(signer, *files)] += names
             newest = max(other.number for other in of_list)
+            said = own.serials.union(*(e.serials for e in of_list if e.number == newest))
             # If a keystore was restored from a backup, several lists may have the same number.
-            for other, holding in of_list.items():
+            for other, holding in sorted(of_list.items(), key=lambda held: -held[0].number):
                 lacking = other.serials - own.serials
-                if other.number < newest or not lacking:
+                if other.number < newest:
+                    lacking = _unexpired(lacking - said, authority, targets, now)
+                    said |= lacking
+                if not lacking:
                     continue
                 text = (
                     f"accept {counted(len(lacking), 'certificate')} that the "
-                    f"{'newer ' * (newest > own.number)}revocation list of {names_text(holding)} "
-                    "revokes"
+                    f"{'newer ' * (other.number > own.number)}revocation list of "
+                    f"{names_text(holding)} revokes"
                 )
                 remedy = _REVOKE_FIRST if own.serials - other.serials else ""
                 found |= {(e, f"nodes of {e} {text}"): remedy for e in earlier if e not in holding}
@@ -310,20 +322,24 @@ def _earlier_lists(targets: Targets) -> Iterator[Finding]:
         yield PEERS_ACCEPT.found(shown, text, shown, remedy=remedy)
 
 
-class _List(NamedTuple):
-    """Number of a revocation list, and what it revokes; -1 and nothing without a list."""
+def _unexpired(
+    serials: frozenset[int], authority: x509.Certificate, targets: Targets, now: datetime
+) -> frozenset[int]:
+    """Return the serials that no keystore of the CA ``authority`` can rightly have dropped.
 
-    number: int
-    serials: frozenset[int]
-
-
-@lru_cache(maxsize=256)
-def _newest_list(lists: bytes, signer: bytes) -> _List:
-    """Return the newest of the revocation lists that a CA signed."""
-    newest = newest_list(lists, signer)
-    if newest is None:
-        return _List(-1, frozenset())
-    return _List(list_number(newest), frozenset(entry.serial for entry in revoked_in(newest)))
+    None if there is no keystore, or the CA is a CA service, which knows more certificates.
+    """
+    may_be_expired = True
+    for keystore, _ in targets.values() if serials else ():
+        with suppress(SrosError):
+            if not keystore.is_original or authority not in keystore.authority(IDENTITY):
+                continue
+            if is_ca_service(keystore.template.identity_key):
+                return frozenset()
+            expiries = known_expiries(keystore, serials)
+            serials = frozenset(s for s in serials if expiries.get(s, iso(now)) >= iso(now))
+            may_be_expired = False
+    return frozenset() if may_be_expired else serials
 
 
 # ── governance and domains ─────────────────────────────────────────────────────────────────

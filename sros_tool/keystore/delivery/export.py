@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tomllib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -16,16 +16,20 @@ from typing import Annotated, NamedTuple
 
 from cryptography import x509
 
-from sros_tool.errors import KeystoreError, Note, SrosError
+from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.faults import Fault
 from sros_tool.files import staged_file
 from sros_tool.fleet.robots import robot_of
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import enclave_of
-from sros_tool.keystore.delivery.archive import SUFFIXES, file_mode, pack
+from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT, SUFFIXES, file_mode, pack, unpack
 from sros_tool.keystore.delivery.robot import check_same_authority
 from sros_tool.keystore.fleet import load_fleet, unrecorded_notes
-from sros_tool.keystore.known_keys import known_authorities, unlisted_revocations
+from sros_tool.keystore.known_keys import (
+    known_authorities,
+    known_expiries,
+    unlisted_revocations,
+)
 from sros_tool.keystore.layout import (
     AGENT,
     CRL_FILE,
@@ -56,6 +60,7 @@ from sros_tool.keystore.outcomes import (
 from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
 from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore
 from sros_tool.keystore.selection import missing_enclave_error
+from sros_tool.keystore.template import is_ca_service
 from sros_tool.keystore.transaction import Change, Transaction
 from sros_tool.keystore.zenoh_files import open_zenoh
 from sros_tool.names import check_enclave_name
@@ -65,13 +70,15 @@ from sros_tool.pki.certificates import (
     digest,
     fingerprints,
     load_certificates,
+    pem,
     validity_of,
 )
-from sros_tool.pki.crl import list_number, newest_list
+from sros_tool.pki.crl import newest_revocations
 from sros_tool.pki.keys import holds_private_key
 from sros_tool.pki.token import read_token_file
+from sros_tool.validity import iso
 from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes, Words
-from sros_tool.wording import first_few
+from sros_tool.wording import counted, first_few
 from sros_tool.xml import read_bytes
 
 _ARCHIVE_SUFFIXES = SUFFIXES
@@ -152,8 +159,9 @@ def distribute(
     files = exported_files(keystore, names, now, keyless=keyless)
     notes = (*_token_notes(files), *unrecorded_notes(keystore, load_fleet(keystore), names))
     if target.name.endswith(_ARCHIVE_SUFFIXES):
-        return Export(target, tuple(names), _write_archive(target, files, force, dry_run), notes)
-    changes = _write_folder(keystore, target, files, force, dry_run)
+        changes = _write_archive(keystore, target, files, now=now, force=force, dry_run=dry_run)
+        return Export(target, tuple(names), changes, notes)
+    changes = _write_folder(keystore, target, files, now=now, force=force, dry_run=dry_run)
     notes += (*_readable_key_notes(target, names), *_notes(keystore, target))
     return Export(target, tuple(names), changes, notes)
 
@@ -466,13 +474,23 @@ def _ca_key_error(path: Path) -> KeystoreError:
     )
 
 
+def _content(path: Path) -> bytes:
+    return read_bytes(path, "file") if path.is_file() else b""
+
+
 def _real_path(path: Path) -> Path:
     # Unlike Path.resolve, realpath does not fail at a loop of links.
     return Path(os.path.realpath(path))
 
 
 def _write_folder(
-    keystore: OpenedKeystore, target: Path, files: dict[str, bytes], force: bool, dry_run: bool
+    keystore: OpenedKeystore,
+    target: Path,
+    files: dict[str, bytes],
+    *,
+    now: datetime,
+    force: bool,
+    dry_run: bool,
 ) -> Sequence[Change]:
     if _real_path(target).is_relative_to(_real_path(keystore.root)):
         raise KeystoreError(
@@ -490,8 +508,7 @@ def _write_folder(
         )
     check_same_authority(target, files)
     _check_robot(keystore, target, files)
-    _check_later_authorities(keystore, target, files)
-    _check_lists(target, files)
+    _check_trust(keystore, target, lambda path: _content(target / path), files, now)
     stale = _stale_paths(target, files)
     different = {
         path: data
@@ -532,70 +549,118 @@ def _check_robot(keystore: OpenedKeystore, target: Path, files: Mapping[str, byt
             )
 
 
-def _check_later_authorities(
-    keystore: OpenedKeystore, target: Path, files: Mapping[str, bytes]
+def _check_trust(
+    keystore: OpenedKeystore,
+    target: Path,
+    present: Callable[[str], bytes],
+    files: Mapping[str, bytes],
+    now: datetime,
 ) -> None:
-    """Raise `KeystoreError` if an enclave in ``target`` trusts a CA that replaced the keystore's.
+    """Raise `KeystoreError` if enclaves in ``target`` would trust again what they no longer trust.
+
+    ``present`` returns the content of a file in ``target``, by its path; b"" if there is none.
+    """
+    backup = "The keystore may come from a backup: "
+    if later := _later_authorities(keystore, present, files):
+        path, authority = next(iter(later.items()))
+        role = _ROLES_OF_FILES[path.rpartition("/")[2]]
+        raise KeystoreError(
+            f"'{target / path}' has a later {role} CA than the keystore's",
+            f"It trusts {authority_text(authority)}, which the keystore does not know: the robot "
+            "would trust the earlier CA again, and what was revoked since. Nothing was changed.",
+            f"{backup}docs/howto/keystore_is_lost.md says how to go on. If the keystore's CA is "
+            f"right, first {_removal_of(target, later)}",
+        )
+    if lost := _lost_revocations(keystore, present, files, now):
+        path, (what, why) = next(iter(lost.items()))
+        raise KeystoreError(
+            f"'{target / path}' {what}",
+            f"{why}: what is revoked would be trusted again. Nothing was changed.",
+            f"{backup}docs/howto/keystore_is_lost.md says how it takes over the list. If the "
+            f"keystore's list is right, first {_removal_of(target, lost)}",
+        )
+
+
+def _removal_of(target: Path, paths: Iterable[str]) -> str:
+    if target.name.endswith(_ARCHIVE_SUFFIXES):
+        return f"remove the archive: `rm {quote(str(target))}`."
+    files = " ".join(quote(str(target / path)) for path in paths)
+    return f"remove the other: `rm {files}`."
+
+
+def _later_authorities(
+    keystore: OpenedKeystore, present: Callable[[str], bytes], files: Mapping[str, bytes]
+) -> Mapping[str, x509.Certificate]:
+    """Map paths of CA files in ``present`` to a CA in them that replaced the keystore's.
 
     That is a CA with another key, at least as late as the CAs in ``files``, that the ledger does
     not have: the keystore is from before a rotation.
     """
     recorded = {e.sha256 for e in keystore.ledger_with("what", "ca").entries if e.what == "ca"}
+    later: dict[str, x509.Certificate] = {}
     for path, data in files.items():
-        role = _ROLES_OF_FILES.get(path.rpartition("/")[2])
-        place = target / path
-        if role is None or not place.is_file() or read_bytes(place, "CA file") == data:
+        if path.rpartition("/")[2] not in _ROLES_OF_FILES or present(path) in (data, b""):
             continue
-        sent, present = load_certificates(data, path), list[x509.Certificate]()
-        with suppress(SrosError):  # a damaged file trusts nobody
-            present += load_certificates(read_bytes(place, "CA file"), str(place))
+        sent = load_certificates(data, path)
         newest = max(validity_of(authority).not_before for authority in sent)
-        for authority in present:
-            if (
-                authority_key(authority) not in map(authority_key, sent)
-                and digest(authority) not in recorded
-                and validity_of(authority).not_before >= newest
-            ):
-                raise KeystoreError(
-                    f"'{place}' has a later {role} CA than the keystore's",
-                    f"It trusts {authority_text(authority)}, which the keystore does not know: the "
-                    "robot would trust the earlier CA again, and what was revoked since. Nothing "
-                    "was changed.",
-                    "The keystore may come from a backup: docs/howto/keystore_is_lost.md says how "
-                    f"to go on. If the keystore's CA is right, remove '{place}' first.",
-                )
+        with suppress(SrosError):  # a damaged file trusts nobody
+            for authority in load_certificates(present(path), path):
+                if (
+                    authority_key(authority) not in map(authority_key, sent)
+                    and digest(authority) not in recorded
+                    and validity_of(authority).not_before >= newest
+                ):
+                    later[path] = authority
+    return later
 
 
-def _check_lists(target: Path, files: Mapping[str, bytes]) -> None:
-    """Raise `KeystoreError` if ``target`` has a newer revocation list than an enclave in ``files``.
+def _lost_revocations(
+    keystore: OpenedKeystore,
+    present: Callable[[str], bytes],
+    files: Mapping[str, bytes],
+    now: datetime,
+) -> Mapping[str, tuple[str, str]]:
+    """Map paths in ``present`` to what shows that the keystore lacks their revocation list.
 
-    Only lists count that a CA in ``files`` signed.
+    Only lists count that a CA in ``files`` signed.  The list of the same CA in ``files`` has to
+    have a number as high, and every certificate on it, but for those that the ledger knows to have
+    expired; and those of a CA service, which knows more certificates than the ledger.
     """
+    lost: dict[str, tuple[str, str]] = {}
     for path, authorities in files.items():
         folder, _, file = path.rpartition("/")
-        place = target / folder / CRL_FILE
-        if file != IDENTITY_CA_FILE or not place.is_file():
+        if file != IDENTITY_CA_FILE:
             continue
-        present = newest_list(read_bytes(place, "revocation list"), authorities)
-        sent = newest_list(files.get(f"{folder}/{CRL_FILE}", b""), authorities)
-        if present is None:
-            continue
-        if sent is None or list_number(sent) < list_number(present):
-            has = "none" if sent is None else f"the number {list_number(sent)}"
-            raise KeystoreError(
-                f"'{place}' is a newer revocation list than the keystore's",
-                f"It has the number {list_number(present)}, the keystore has {has}: revoked "
-                "enclaves would be trusted again. Nothing was changed.",
-                "The keystore may come from a backup: docs/howto/keystore_is_lost.md says how it "
-                f"takes over the list. If the older list is right, remove '{place}' first.",
-            )
+        # In a rotation, the list of the second CA is in the file of the CAs.
+        paths = (f"{folder}/{CRL_FILE}", path)
+        for authority in load_certificates(authorities, path):
+            signer = pem(authority)
+            sent = newest_revocations(signer, *(files.get(path, b"") for path in paths))
+            for place in paths:
+                there = newest_revocations(signer, present(place))
+                missing = there.serials - sent.serials
+                expiries = known_expiries(keystore, missing)
+                lacking = [s for s in missing if expiries.get(s, iso(now)) >= iso(now)]
+                if there.number > sent.number:
+                    has = "none" if sent.number < 0 else f"the number {sent.number}"
+                    lost[place] = (
+                        "is a newer revocation list than the keystore's",
+                        f"It has the number {there.number}, the keystore has {has}",
+                    )
+                elif lacking and not is_ca_service(keystore.template.identity_key):
+                    lost[place] = (
+                        f"revokes {counted(len(lacking), 'certificate')} that the keystore's "
+                        "revocation list lacks",
+                        f"The first one has the serial number {min(lacking):x}",
+                    )
+    return lost
 
 
 def _stale_paths(target: Path, files: dict[str, bytes]) -> list[str]:
     """Return the paths in ``target`` of files that the enclaves no longer have.
 
     These are Zenoh files, keys, and revocation lists of other CAs, with which nothing starts
-    (`_check_lists` refuses to lose a list of the enclave's own CA).  An enclave that is exported
+    (`_check_trust` refuses to lose a list of the enclave's own CA).  An enclave that is exported
     without a key keeps the key in ``target``: no other copy exists.
     """
     folders = {path.rpartition("/")[0] for path in files}
@@ -612,7 +677,13 @@ def _stale_paths(target: Path, files: dict[str, bytes]) -> list[str]:
 
 
 def _write_archive(
-    target: Path, files: dict[str, bytes], force: bool, dry_run: bool
+    keystore: OpenedKeystore,
+    target: Path,
+    files: dict[str, bytes],
+    *,
+    now: datetime,
+    force: bool,
+    dry_run: bool,
 ) -> Sequence[Change]:
     data = pack(files)
     if target.exists():
@@ -628,11 +699,29 @@ def _write_archive(
                 "Nothing was changed.",
                 "Add --force to replace it, or choose another name.",
             )
+        present = _unpacked(target)
+        _check_trust(keystore, target, lambda path: present.get(path, b""), files, now)
     change = Change("replace" if target.exists() else "create", target.name)
     if not dry_run:
         with staged_file(target, data) as put_in_place:
             put_in_place()
     return (change,)
+
+
+def _unpacked(target: Path) -> Mapping[str, bytes]:
+    """Map the paths in an archive to the content of its files.
+
+    Raises:
+        KeystoreError: it cannot be read: it may have a later CA, or a newer revocation list.
+    """
+    try:
+        return unpack(read_bytes(target, "archive", max_bytes=OF_ONE_ROBOT.packed), OF_ONE_ROBOT)
+    except DocumentError as error:
+        raise KeystoreError(
+            f"'{target}' cannot be compared with the new archive",
+            f"{error}. It may have a later CA or a newer revocation list. Nothing was changed.",
+            "Choose another name, or remove it first.",
+        ) from error
 
 
 # ── as JSON ────────────────────────────────────────────────────────────────────────────────

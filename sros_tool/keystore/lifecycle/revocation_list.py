@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence, Set
-from contextlib import suppress
+from collections.abc import Collection, Container, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from datetime import datetime
 from shlex import quote
@@ -23,7 +22,13 @@ from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.keystore.fleet import publish_command
 from sros_tool.keystore.issuing.authority import Authority, write_bundle
 from sros_tool.keystore.issuing.keyring import Keyring
-from sros_tool.keystore.known_keys import restored_at, revoked_issues, revoked_serials
+from sros_tool.keystore.known_keys import (
+    certificates_of_revoked,
+    known_expiries,
+    restored_at,
+    revoked_issues,
+    revoked_serials,
+)
 from sros_tool.keystore.layout import (
     CRL,
     CRL_FILE,
@@ -202,22 +207,6 @@ def _carried_over(old: RevocationList | None, expiries: Mapping[int, str]) -> li
     return [entry for entry in old.revoked if expiries.get(entry.serial, issued) >= issued]
 
 
-def _certificates_of_revoked(
-    keystore: OpenedKeystore, known: Container[str] = ()
-) -> Iterator[x509.Certificate]:
-    """Yield the certificates in the folder ``revoked`` that a trusted identity CA issued.
-
-    Certificates whose serial number (hexadecimal) is in ``known`` are not read.
-    """
-    file = keystore.identity_file
-    trusted = keystore.certificates_of(file) if file else ()
-    for path in revoked_certificates(keystore.root, known):
-        with suppress(SrosError):  # a file that is not a certificate
-            certificate = keystore.certificate(path)
-            if any(issued_by(certificate, authority) for authority in trusted):
-                yield certificate
-
-
 class RevocationListSigner:
     """Signer of the revocation lists of all trusted identity CAs, within a transaction.
 
@@ -348,7 +337,7 @@ class RevocationListSigner:
                 and not expired
             ):
                 certificates[entry.enclave][int(entry.serial, 16)] = entry
-        for certificate in _certificates_of_revoked(
+        for certificate in certificates_of_revoked(
             self._keystore, self._recorded_as_moved(listed_serials)
         ):
             name = common_name_of(certificate.subject)
@@ -437,7 +426,7 @@ class RevocationListSigner:
         """
         date = self._now.replace(microsecond=0)
         new_entries = [Revoked(int(entry.serial, 16), date, entry.reason) for entry in revocations]
-        expiries = self._expiries()
+        expiries = known_expiries(self._keystore, revoked_serials(self._keystore))
         if lost := self._lost_revocations(expiries):
             new_entries = [*new_entries, *lost]
             text = (
@@ -555,32 +544,6 @@ class RevocationListSigner:
             if expiries.get(serial, moment) >= moment
             for reason in (entry.reason if entry.reason in REASONS else "unspecified",)
         ]
-
-    def _expiries(self) -> dict[int, str]:
-        """Map serial numbers to expiries (ISO 8601, UTC), from ledger and folder ``revoked``.
-
-        A certificate whose ledger entry is not certain has no expiry, and so stays on the list.
-        """
-        ledger = self._keystore.ledger_with("what", "revocation")
-        serials = {entry.serial for entry in ledger.entries if entry.what == "revocation"}
-        for crl in self._keystore.revocation_lists:
-            serials.update(f"{entry.serial:x}" for entry in crl.revoked)
-        recorded = {
-            entry.serial: entry.not_after
-            for entry in ledger.certain
-            if entry.what == "revocation" and entry.not_after
-        }
-        # Version 0.2 of sros recorded the expiry with the certificate only.
-        others = self._keystore.ledger_file.with_values("serial", serials - recorded.keys())
-        recorded |= {
-            entry.serial: entry.not_after
-            for entry in others.certain
-            if entry.what == "certificate" and entry.serial and entry.not_after
-        }
-        expiries = {int(serial, 16): not_after for serial, not_after in recorded.items()}
-        for certificate in _certificates_of_revoked(self._keystore, recorded):
-            expiries.setdefault(certificate.serial_number, iso(validity_of(certificate).not_after))
-        return expiries
 
     # ── the second CA during a rotation ────────────────────────────────────────────────────
 
