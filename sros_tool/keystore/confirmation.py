@@ -389,11 +389,8 @@ def parse_confirmation(data: bytes, label: str) -> Confirmation:
         raise DocumentError(
             f"{label} is too large", f"A confirmation has at most {MAX_BYTES // 1024**2} MiB."
         )
-    try:
-        value = parse_json(data)
-    except ValueError as error:
-        raise _invalid_confirmation_error(label, "it is not JSON") from error
-    return _confirmation_from(value, label)
+    with _named_in_errors(label):
+        return _confirmation_from(_json_value(data))
 
 
 class LastMessage(NamedTuple):
@@ -623,213 +620,197 @@ def last_confirmation(keystore: OpenedKeystore, robot: str) -> Received | None:
     path = keystore.root / confirmation_file(robot)
     if not os.path.lexists(path):
         return None
-    shown_path = f"'{path}'"
+    data = read_bytes(path, "confirmation", max_bytes=2 * MAX_BYTES)
+    with _named_in_errors(f"'{path}'"):
+        value = _json_value(data)
+        if not isinstance(value, dict) or value.keys() - {"message"} != {
+            "received",
+            "confirmation",
+        }:
+            raise _FormError('its keys are not "received" and "confirmation"')
+        confirmation = _confirmation_from(value["confirmation"])
+        if confirmation.robot != robot:
+            raise _FormError(f"it is the confirmation of {confirmation.robot}")
+        message = _message_from(value["message"]) if "message" in value else None
+        return Received(confirmation, _moment(value["received"]), message)
+
+
+# The readers of the parts of a confirmation; each raises `_FormError` for another form.
+
+_AGAIN = "Make the confirmation again on the robot."
+
+
+class _FormError(ValueError):
+    """A part of a confirmation has another form, which the text states as a clause."""
+
+    def __init__(self, why: str, remedy: str = _AGAIN) -> None:
+        super().__init__(why)
+        self.remedy = remedy
+
+
+@contextmanager
+def _named_in_errors(label: str) -> Iterator[None]:
+    """Make a `DocumentError` of a `_FormError` of the body: ``label`` is not a confirmation."""
     try:
-        value = parse_json(read_bytes(path, "confirmation", max_bytes=2 * MAX_BYTES))
+        yield
+    except _FormError as error:
+        raise DocumentError(f"{label} is not a confirmation: {error}", "", error.remedy) from error
+
+
+def _json_value(data: bytes) -> Any:
+    try:
+        return parse_json(data)
     except ValueError as error:
-        raise _invalid_confirmation_error(shown_path, "it is not JSON") from error
-    if not isinstance(value, dict) or value.keys() - {"message"} != {"received", "confirmation"}:
-        raise _invalid_confirmation_error(
-            shown_path, 'its keys are not "received" and "confirmation"'
-        )
-    confirmation = _confirmation_from(value["confirmation"], shown_path)
-    if confirmation.robot != robot:
-        raise _invalid_confirmation_error(
-            shown_path, f"it is the confirmation of {confirmation.robot}"
-        )
-    message = _message_from(value["message"], shown_path) if "message" in value else None
-    return Received(confirmation, _moment(value["received"], shown_path), message)
+        raise _FormError("it is not JSON") from error
 
 
-def _message_from(value: Any, label: str) -> LastMessage:
-    """Return the last message of a robot's agent in a JSON value.
-
-    Raises:
-        DocumentError: the value has another form.
-    """
+def _message_from(value: Any) -> LastMessage:
+    """Return the last message of a robot's agent."""
     later = {"boots", "alternated"}  # than release 0.3.0 of sros
     if not isinstance(value, dict) or value.keys() | later != set(LastMessage._fields):
-        raise _invalid_confirmation_error(
-            label, 'the keys of its message are not "sequence", "sha256" and "enclave"'
-        )
-    if not _is_digest(value["sha256"]):
-        raise _invalid_confirmation_error(
-            label, "the digest of its message is not a SHA-256 digest"
-        )
-    sequence = _sequence_from(value["sequence"], label)
+        raise _FormError('the keys of its message are not "sequence", "sha256" and "enclave"')
+    sha256 = _digest_from(value["sha256"], "the digest of its message")
+    sequence = _sequence_from(value["sequence"])
     boots, alternated = value.get("boots", []), value.get("alternated")
     if not isinstance(boots, list) or not all(map(_is_digest, boots)):
-        raise _invalid_confirmation_error(label, '"boots" of its message are not SHA-256 digests')
-    return LastMessage(
-        sequence,
-        value["sha256"],
-        _enclave_from(value["enclave"], label),
-        tuple(boots),
-        None if alternated is None else _moment(alternated, label),
-    )
+        raise _FormError('"boots" of its message are not SHA-256 digests')
+    enclave = _enclave_from(value["enclave"])
+    moment = None if alternated is None else _moment(alternated)
+    return LastMessage(sequence, sha256, enclave, tuple(boots), moment)
 
 
-def _confirmation_from(value: Any, label: str) -> Confirmation:
-    """Return the confirmation in a JSON value; ``label`` names the value in errors.
-
-    Raises:
-        DocumentError: as `parse_confirmation`.
-    """
+def _confirmation_from(value: Any) -> Confirmation:
     if not isinstance(value, dict):
-        raise _invalid_confirmation_error(label, "it is not a JSON object")
+        raise _FormError("it is not a JSON object")
     if value.get("format") != _FORMAT or type(value["format"]) is not int:
-        raise _invalid_confirmation_error(
-            label, f"its format is not {_FORMAT}", "Use an sros of the same version."
-        )
+        raise _FormError(f"its format is not {_FORMAT}", "Use an sros of the same version.")
     if unknown := sorted(value.keys() - _KEYS - _OPTIONAL_KEYS):
-        raise _invalid_confirmation_error(
-            label,
+        raise _FormError(
             f"it has the unknown key {_shortened(unknown[0])}; if the robot has a later release of "
             "sros, update sros here first",
         )
     if missing := sorted(_KEYS - value.keys()):
-        raise _invalid_confirmation_error(label, f"it lacks {', '.join(missing)}")
+        raise _FormError(f"it lacks {', '.join(missing)}")
     robot = value["robot"]
     if not isinstance(robot, str) or name_problem(robot):
-        raise _invalid_confirmation_error(label, f"{_shortened(robot)} is not the name of a robot")
-    files = dict(_entries(value, "files", label))
-    for path, digest in files.items():
-        if not _is_digest(digest):
-            raise _invalid_confirmation_error(
-                label, f"the digest of {path} is not a SHA-256 digest"
-            )
+        raise _FormError(f"{_shortened(robot)} is not the name of a robot")
+    files = {
+        path: _digest_from(digest, f"the digest of {path}")
+        for path, digest in _entries(value, "files")
+    }
     certificates = {}
-    for path, digests in _entries({"certificates": {}, **value}, "certificates", label):
+    for path, digests in _entries({"certificates": {}, **value}, "certificates"):
         if path not in files or path.rpartition("/")[2] not in _CERTIFICATE_FILES:
-            raise _invalid_confirmation_error(
-                label, f"it lists certificates of {path}, which is not a certificate file"
-            )
+            raise _FormError(f"it lists certificates of {path}, which is not a certificate file")
         is_short_list = isinstance(digests, list) and len(digests) <= _MOST_CERTIFICATES
-        if not is_short_list or not all(_is_digest(digest) for digest in digests):
-            raise _invalid_confirmation_error(
-                label, f"the certificates of {path} are not a list of SHA-256 digests"
-            )
+        if not is_short_list or not all(map(_is_digest, digests)):
+            raise _FormError(f"the certificates of {path} are not a list of SHA-256 digests")
         certificates[path] = tuple(digests)
-    dds = _dds_from(value["dds"], label) if "dds" in value else None
-    restart = _restart_from(value["restart"], label) if "restart" in value else None
-    time = _moment(value["time"], label)
-    agent = {key: _AGENT_READERS[key](value[key], label) for key in _OF_AGENT if key in value}
+    dds = _dds_from(value["dds"]) if "dds" in value else None
+    restart = _restart_from(value["restart"]) if "restart" in value else None
+    time = _moment(value["time"])
+    agent = {key: _AGENT_READERS[key](value[key]) for key in _OF_AGENT if key in value}
     return Confirmation(robot, time, files, certificates, dds, restart, **agent)
 
 
-def _restart_from(value: Any, label: str) -> tuple[str, ...]:
-    """Return the names of enclaves in a JSON value.
-
-    Raises:
-        DocumentError: the value is not a list of such names.
-    """
+def _restart_from(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list):
-        raise _invalid_confirmation_error(label, '"restart" or "crl_restart" is not a list')
-    return tuple(sorted({_enclave_from(name, label) for name in value}))
+        raise _FormError('"restart" or "crl_restart" is not a list')
+    return tuple(sorted(set(map(_enclave_from, value))))
 
 
-def _enclave_from(name: Any, label: str) -> str:
-    """Return the name of an enclave in a JSON value.
-
-    Raises:
-        DocumentError: the value is not the name of an enclave.
-    """
+def _enclave_from(name: Any) -> str:
     try:
         return check_enclave_name(name if isinstance(name, str) else "")
     except InvalidNameError:
-        raise _invalid_confirmation_error(
-            label, f"{_shortened(name)} is not the name of an enclave"
-        ) from None
+        raise _FormError(f"{_shortened(name)} is not the name of an enclave") from None
 
 
-# The readers of the keys that `sros agent` writes; each raises `DocumentError` for another form.
-
-
-def _sequence_from(value: Any, label: str) -> int:
-    if type(value) is not int or not 1 <= value <= _MOST_NUMBER:
-        raise _invalid_confirmation_error(label, '"sequence" is not a positive number')
-    return value
-
-
-def _release_from(value: Any, label: str) -> int:
-    if type(value) is not int or not 0 <= value <= _MOST_NUMBER:
-        raise _invalid_confirmation_error(label, '"release" is not a number')
-    return value
-
-
-def _expiry_from(value: Any, label: str) -> dict[str, EnclaveExpiry]:
-    if not isinstance(value, dict):
-        raise _invalid_confirmation_error(label, '"expiry" is not an object')
-    expiry = {}
-    for name, times in value.items():
-        if not isinstance(times, dict) or times.keys() != set(EnclaveExpiry._fields):
-            raise _invalid_confirmation_error(
-                label, 'the keys of an expiry are not "certificate" and "permissions"'
-            )
-        moments = (
-            None if times[file] is None else _moment(times[file], label)
-            for file in EnclaveExpiry._fields
-        )
-        expiry[_enclave_from(name, label)] = EnclaveExpiry(*moments)
-    return expiry
-
-
-def _running_from(value: Any, label: str) -> dict[str, RunningFiles]:
-    if not isinstance(value, dict):
-        raise _invalid_confirmation_error(label, '"running" is not an object')
-    for state in value.values():
-        if state not in tuple(RunningFiles):
-            raise _invalid_confirmation_error(
-                label, f"{_shortened(state)} is not a state of running processes"
-            )
-    return {_enclave_from(name, label): RunningFiles(state) for name, state in value.items()}
-
-
-def _clock_from(value: Any, label: str) -> RobotClock:
-    if value not in tuple(RobotClock):
-        raise _invalid_confirmation_error(label, f"{_shortened(value)} is not the state of a clock")
-    return RobotClock(value)
-
-
-def _problems_from(value: Any, label: str) -> tuple[str, ...]:
-    if not isinstance(value, list) or len(value) > MOST_PROBLEMS:
-        raise _invalid_confirmation_error(
-            label, f"its problems are not a list of at most {MOST_PROBLEMS}"
-        )
-    for text in value:
-        if not (isinstance(text, str) and text.isprintable() and 0 < len(text) <= LONGEST_PROBLEM):
-            raise _invalid_confirmation_error(
-                label, f"a problem is not printable text of at most {LONGEST_PROBLEM} characters"
-            )
-    return tuple(value)
-
-
-def _requests_from(value: Any, label: str) -> tuple[str, ...]:
-    if not isinstance(value, list) or len(value) > MOST_REQUESTS:
-        raise _invalid_confirmation_error(
-            label, f"its requests are not a list of at most {MOST_REQUESTS}"
-        )
-    for text in value:
-        if not (isinstance(text, str) and len(text) <= _LONGEST_REQUEST and _REQUEST.match(text)):
-            raise _invalid_confirmation_error(
-                label, "one of its requests is not exactly one signing request in PEM"
-            )
-    return tuple(value)
-
-
-def _crl_from(value: Any, label: str) -> str:
-    if not (isinstance(value, str) and len(value) <= LONGEST_LIST and _LIST.match(value)):
-        raise _invalid_confirmation_error(label, "its crl is not one revocation list in PEM")
-    return value
-
-
-def _boot_from(value: Any, label: str) -> str:
+def _digest_from(value: Any, what: str) -> str:
     if not _is_digest(value):
-        raise _invalid_confirmation_error(label, '"boot" is not a SHA-256 digest')
+        raise _FormError(f"{what} is not a SHA-256 digest")
     return str(value)
 
 
-_AGENT_READERS: Mapping[str, Callable[[Any, str], Any]] = {
+def _sequence_from(value: Any) -> int:
+    return _number_from(value, '"sequence" is not a positive number', least=1)
+
+
+def _release_from(value: Any) -> int:
+    return _number_from(value, '"release" is not a number')
+
+
+def _number_from(value: Any, why: str, *, least: int = 0, most: int = _MOST_NUMBER) -> int:
+    """Return a whole number from ``least`` to ``most``; ``why`` is the error for another value."""
+    if type(value) is not int or not least <= value <= most:
+        raise _FormError(why)
+    return value
+
+
+def _expiry_from(value: Any) -> dict[str, EnclaveExpiry]:
+    if not isinstance(value, dict):
+        raise _FormError('"expiry" is not an object')
+    expiry = {}
+    for name, times in value.items():
+        if not isinstance(times, dict) or times.keys() != set(EnclaveExpiry._fields):
+            raise _FormError('the keys of an expiry are not "certificate" and "permissions"')
+        moments = (
+            None if times[file] is None else _moment(times[file]) for file in EnclaveExpiry._fields
+        )
+        expiry[_enclave_from(name)] = EnclaveExpiry(*moments)
+    return expiry
+
+
+def _running_from(value: Any) -> dict[str, RunningFiles]:
+    if not isinstance(value, dict):
+        raise _FormError('"running" is not an object')
+    for state in value.values():
+        if state not in tuple(RunningFiles):
+            raise _FormError(f"{_shortened(state)} is not a state of running processes")
+    return {_enclave_from(name): RunningFiles(state) for name, state in value.items()}
+
+
+def _clock_from(value: Any) -> RobotClock:
+    if value not in tuple(RobotClock):
+        raise _FormError(f"{_shortened(value)} is not the state of a clock")
+    return RobotClock(value)
+
+
+def _problems_from(value: Any) -> tuple[str, ...]:
+    problems = _list_from(value, MOST_PROBLEMS, "problems")
+    for text in problems:
+        if not (isinstance(text, str) and text.isprintable() and 0 < len(text) <= LONGEST_PROBLEM):
+            raise _FormError(
+                f"a problem is not printable text of at most {LONGEST_PROBLEM} characters"
+            )
+    return tuple(problems)
+
+
+def _requests_from(value: Any) -> tuple[str, ...]:
+    requests = _list_from(value, MOST_REQUESTS, "requests")
+    for text in requests:
+        if not (isinstance(text, str) and len(text) <= _LONGEST_REQUEST and _REQUEST.match(text)):
+            raise _FormError("one of its requests is not exactly one signing request in PEM")
+    return tuple(requests)
+
+
+def _list_from(value: Any, most: int, what: str) -> list[Any]:
+    if not isinstance(value, list) or len(value) > most:
+        raise _FormError(f"its {what} are not a list of at most {most}")
+    return value
+
+
+def _crl_from(value: Any) -> str:
+    if not (isinstance(value, str) and len(value) <= LONGEST_LIST and _LIST.match(value)):
+        raise _FormError("its crl is not one revocation list in PEM")
+    return value
+
+
+def _boot_from(value: Any) -> str:
+    return _digest_from(value, '"boot"')
+
+
+_AGENT_READERS: Mapping[str, Callable[[Any], Any]] = {
     "sequence": _sequence_from,
     "release": _release_from,
     "expiry": _expiry_from,
@@ -843,72 +824,47 @@ _AGENT_READERS: Mapping[str, Callable[[Any, str], Any]] = {
 }
 
 
-def _dds_from(value: Any, label: str) -> RobotDds:
-    """Return the DDS of a robot in a JSON value.
-
-    Raises:
-        DocumentError: the value has another form.
-    """
+def _dds_from(value: Any) -> RobotDds:
     if not isinstance(value, dict) or value.keys() != set(RobotDds._fields):
-        raise _invalid_confirmation_error(
-            label, 'the keys of "dds" are not "libraries" and "unseen"'
-        )
-    listed_libraries, unseen = value["libraries"], value["unseen"]
-    if type(unseen) is not int or not 0 <= unseen <= _MOST_UNSEEN:
-        raise _invalid_confirmation_error(label, "its number of unseen processes is not a number")
-    if not isinstance(listed_libraries, list) or len(listed_libraries) > _MOST_LIBRARIES:
-        raise _invalid_confirmation_error(
-            label, f"its DDS libraries are not a list of at most {_MOST_LIBRARIES}"
-        )
-    libraries = []
-    for library in listed_libraries:
-        if not isinstance(library, dict) or library.keys() != set(RobotLibrary._fields):
-            raise _invalid_confirmation_error(
-                label, ('the keys of a library of its DDS are not "product", "version", ...')
-            )
-        product, version, path, seen = (library[key] for key in RobotLibrary._fields)
-        if product not in PRODUCTS:
-            raise _invalid_confirmation_error(
-                label, f"{_shortened(product)} is not a DDS that confirmations name"
-            )
-        if not isinstance(version, str) or (version and not _LIBRARY_VERSION.match(version)):
-            raise _invalid_confirmation_error(
-                label, f"{_shortened(version)} is not the version of a DDS"
-            )
-        if not isinstance(path, str) or not _LIBRARY_PATH.match(path):
-            raise _invalid_confirmation_error(
-                label, f"{_shortened(path)} is not the path of a library"
-            )
-        if seen not in tuple(Seen):
-            raise _invalid_confirmation_error(
-                label, f"{_shortened(seen)} does not say where a library was seen"
-            )
-        libraries.append(RobotLibrary(product, version, path, Seen(seen)))
-    return RobotDds(tuple(libraries), unseen)
+        raise _FormError('the keys of "dds" are not "libraries" and "unseen"')
+    why = "its number of unseen processes is not a number"
+    unseen = _number_from(value["unseen"], why, most=_MOST_UNSEEN)
+    libraries = _list_from(value["libraries"], _MOST_LIBRARIES, "DDS libraries")
+    return RobotDds(tuple(map(_library_from, libraries)), unseen)
 
 
-def _entries(value: Mapping[str, Any], key: str, label: str) -> Iterator[tuple[str, Any]]:
+def _library_from(value: Any) -> RobotLibrary:
+    if not isinstance(value, dict) or value.keys() != set(RobotLibrary._fields):
+        raise _FormError('the keys of a library of its DDS are not "product", "version", ...')
+    product, version, path, seen = (value[key] for key in RobotLibrary._fields)
+    if product not in PRODUCTS:
+        raise _FormError(f"{_shortened(product)} is not a DDS that confirmations name")
+    if not isinstance(version, str) or (version and not _LIBRARY_VERSION.match(version)):
+        raise _FormError(f"{_shortened(version)} is not the version of a DDS")
+    if not isinstance(path, str) or not _LIBRARY_PATH.match(path):
+        raise _FormError(f"{_shortened(path)} is not the path of a library")
+    if seen not in tuple(Seen):
+        raise _FormError(f"{_shortened(seen)} does not say where a library was seen")
+    return RobotLibrary(product, version, path, Seen(seen))
+
+
+def _entries(value: Mapping[str, Any], key: str) -> Iterator[tuple[str, Any]]:
     """Yield the (path, value) pairs of the JSON object at ``key``.
 
-    Raises:
-        DocumentError: a path is not the path of an enclave file that confirmations list.
+    Every path is that of an enclave file that confirmations list.
     """
     entries = value[key]
     if not isinstance(entries, dict):
-        raise _invalid_confirmation_error(label, f"{key} is not an object")
+        raise _FormError(f"{key} is not an object")
     checked_folders: set[str] = set()
     for path, entry in entries.items():
         folder, _, file = path.rpartition("/")
         if folder not in checked_folders:
             if not _is_enclave_folder(folder):
-                raise _invalid_confirmation_error(
-                    label, f"{_shortened(path)} is not the path of a file of an enclave"
-                )
+                raise _FormError(f"{_shortened(path)} is not the path of a file of an enclave")
             checked_folders.add(folder)
         if file not in CONFIRMED_FILES:
-            raise _invalid_confirmation_error(
-                label, f"{_shortened(path)} is not a file that a confirmation lists"
-            )
+            raise _FormError(f"{_shortened(path)} is not a file that a confirmation lists")
         yield path, entry
 
 
@@ -921,22 +877,13 @@ def _is_digest(value: object) -> bool:
     return isinstance(value, str) and bool(_DIGEST.match(value))
 
 
-def _moment(text: object, label: str) -> datetime:
+def _moment(text: object) -> datetime:
     if isinstance(text, str) and _MOMENT.match(text):
         try:
             return parse_iso(text)
         except ValueError:
             pass
-    raise _invalid_confirmation_error(
-        label, f"its time {_shortened(text)} does not have the form 2027-05-21T12:50:48Z"
-    )
-
-
-_AGAIN = "Make the confirmation again on the robot."
-
-
-def _invalid_confirmation_error(name: str, why: str, remedy: str = _AGAIN) -> DocumentError:
-    return DocumentError(f"{name} is not a confirmation: {why}", "", remedy)
+    raise _FormError(f"its time {_shortened(text)} does not have the form 2027-05-21T12:50:48Z")
 
 
 def _shortened(value: object) -> str:
