@@ -21,7 +21,9 @@ from cryptography import x509
 from sros_tool.errors import KeystoreError, Note, PkiError, SrosError
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
+    IDENTITY,
     KEY_FILE,
+    PERMISSIONS,
     REQUEST,
     REVOKED,
     revoked_certificates,
@@ -109,15 +111,16 @@ def restored_at(keystore: OpenedKeystore) -> str:
     return next((entry.time for entry in reversed(entries) if entry.what == RESTORED), "")
 
 
-def _since_trusted(keystore: OpenedKeystore, entries: Sequence[Entry]) -> Sequence[Entry]:
-    """Return the entries from when the key of an identity CA that is trusted was recorded.
+def _since_trusted(
+    keystore: OpenedKeystore, entries: Sequence[Entry], role: str = IDENTITY
+) -> Sequence[Entry]:
+    """Return the entries from when the key of a CA that is trusted in a role was recorded.
 
     ``entries`` are of a reading of the ledger, each of which has all CAs; all are returned if there
     is no trusted CA, if a trusted CA was recorded only when it was renewed, because the ledger from
     before was lost, or if CAs are recorded without keys, as by earlier versions of sros.
     """
-    file = keystore.identity_file
-    trusted = {_digest_of(ca) for ca in (keystore.certificates_of(file) if file else ())}
+    trusted = {_digest_of(ca) for ca in keystore.authority(role)}
     authorities = [
         place
         for place, entry in enumerate(entries)
@@ -237,7 +240,8 @@ def _may_be_of_trusted(keystore: OpenedKeystore, entry: Entry) -> bool:
 class IssuedEarlier:
     """The certificates and permissions of enclaves in the ledger, without revoked certificates.
 
-    Permissions work with a certificate for their subject, until one of the two expires.
+    Permissions work with a certificate for their subject, until one of the two expires.  What was
+    issued before all CAs that are trusted now is left out.
     """
 
     def __init__(self, keystore: OpenedKeystore, names: Collection[str]) -> None:
@@ -245,10 +249,11 @@ class IssuedEarlier:
         self._permissions: defaultdict[str, list[Entry]] = defaultdict(list)
         self._certificates: defaultdict[str, dict[str, str]] = defaultdict(dict)
         revoked = revoked_serials(keystore)
-        for entry in self.ledger.entries:
+        for entry in _since_trusted(keystore, self.ledger.entries, PERMISSIONS):
             if entry.what == "permissions":
                 self._permissions[entry.enclave].append(entry)
-            elif entry.what == "certificate" and not (
+        for entry in _since_trusted(keystore, self.ledger.entries, IDENTITY):
+            if entry.what == "certificate" and not (
                 entry.serial and int(entry.serial, 16) in revoked
             ):
                 expiry = self._certificates[entry.enclave]

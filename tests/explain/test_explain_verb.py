@@ -888,6 +888,21 @@ def test_earlier_permissions_that_still_allow_it(keystore: Path, tmp_path: Path)
             ledger.mkdir()
 
 
+@pytest.mark.parametrize("role", ["--permissions", "--identity"])
+def test_earlier_permissions_of_a_ca_that_is_retired(
+    keystore: Path, role: str, tmp_path: Path
+) -> None:
+    policy = tmp_path / "robot.xml"
+    policy.write_text(policy_text({ENCLAVE: publish("/other")}))
+    sros("create_permission", keystore, ENCLAVE, policy).ok()
+    asked = (keystore, "--who", "publish", "/chatter")
+    sros("rotate_ca", keystore, role, "--to", "distribute").ok()
+    assert "earlier-permissions" in explain(*asked).err
+    sros("rotate_ca", keystore, role, "--finish").ok()
+    # with a new identity CA alone, earlier permissions fit the certificate from the new one
+    assert ("earlier-permissions" in explain(*asked).err) is (role == "--identity")
+
+
 def test_who_tells_wildcards_and_what_cannot_run(keystore: Path) -> None:
     sros("create_enclave", keystore, "/open").ok()
     BREAKAGES["certificate expired"](Enclave(keystore))
