@@ -49,9 +49,6 @@ _IN_EXPORT = {
     "has the CA keys: `sros renew {root} {enclave}`. Then export the enclave again.",
     _CLOCK_OF_CRL: "Set the clock of this host; if the clock is right, sign the list again in the "
     "keystore that has the CA keys: `sros crl {root} --refresh`. Then export the enclave again.",
-    REPLACE: "Export the enclave again. If `sros check {root}` finds the same in the keystore that "
-    "has the CA keys, first replace the file there: `rm {path} && sros create_enclave {root} "
-    "{enclave}`.",
     _DOMAIN: f"{_SET_DOMAIN} To add a domain, name all domains in the {ORIGINAL_KEYSTORE}: `sros "
     "update_keystore KEYSTORE --domain IDS --allow-looser`. Then export the enclave again.",
 }
@@ -62,6 +59,8 @@ _GOVERNANCE = (
     "{root}/enclaves/governance.xml -out {root}/enclaves/governance.p7s -signer "
     "{root}/public/permissions_ca.cert.pem -inkey {root}/private/permissions_ca.key.pem`."
 )
+_RIGHT_IN_KEYSTORE = (_SIGN, _COMPLETE, REPLACE, _GOVERNANCE)
+"""Remedies for faults that an export mostly has alone: files that were edited, damaged or lost."""
 _AUTHORITY = (
     "Replace the CA and the files that expired: `sros rotate_ca {root} --finish && sros renew "
     "{root} --all-expiring 30d`; then restart all processes together."
@@ -455,11 +454,11 @@ class Fault(Enum):
             return text
         if text in _IN_EXPORT:
             return _IN_EXPORT[text]
-        if self in (Fault.FILE_MISSING, Fault.LINK_DANGLING):
+        if text in _RIGHT_IN_KEYSTORE:
             return (
                 f"Export the enclave again from the {ORIGINAL_KEYSTORE}: `sros distribute_key "
-                "{root} {enclave} TARGET --force`. If the file is missing there, too, first "
-                f"{text[0].lower()}{text[1:]}"
+                "{root} {enclave} TARGET --force`. Only if `sros check {root}` finds the same "
+                f"there, do this first: {text[0].lower()}{text[1:]}"
             )
         return remedy_in_original_keystore(text)
 

@@ -333,6 +333,7 @@ def test_verify_reports_faults_and_sets_its_exit_status(keystore: Path, tmp_path
     assert sros("verify", out, "--domain", "0").ok().err == ""
     (out / "enclaves/a/key.pem").chmod(0o644)
     (out / "enclaves/b/cert.pem").unlink()
+    (out / "enclaves/b/permissions.p7s").write_text("edited")
     ended = sros("verify", out)
     assert ended.status == 1
     assert "/b  NOT LOADABLE\n" in ended.out
@@ -341,8 +342,9 @@ def test_verify_reports_faults_and_sets_its_exit_status(keystore: Path, tmp_path
     assert (
         "Export the enclave again from the keystore that has the CA keys: `sros distribute_key "
     ) in ended.out
-    assert "If the file is missing there, too, first create the missing file: `sros " in ended.out
-    assert "`sros create_enclave KEYSTORE /b`." in ended.out
+    first = "Only if `sros check KEYSTORE` finds the same there, do this first: "
+    assert f"{first}create the missing file: `sros create_enclave KEYSTORE /b`." in ended.out
+    assert f"{first}sign the permissions again: `sros create_permission KEYSTORE /b " in ended.out
     assert f"{out}/enclaves/a/key.pem: error: a private key that others can read" in ended.out
     assert f"chmod 600 {out}/enclaves/a/key.pem`" in ended.out
     said = json.loads(sros("verify", out, "--json", "--at", "2026-12-24", "--domain", "7").out)
