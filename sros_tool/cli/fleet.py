@@ -700,7 +700,7 @@ def _status(
             _WORDS,
             list(_facts(compared)),
             rows,
-            _remedies(root, {to_do for *_, to_do, _ in rows}),
+            _remedies(status, {to_do for *_, to_do, _ in rows}),
             _list_in_force(status),
         )
     else:
@@ -834,21 +834,22 @@ def _list_in_force(status: FleetStatus) -> tuple[int, int] | None:
     return sum(bool(robot.crl_in_force) for robot in robots), len(robots)
 
 
-def _remedies(root: Path, to_dos: Collection[str]) -> Mapping[str, str]:
+def _remedies(status: FleetStatus, to_dos: Collection[str]) -> Mapping[str, str]:
     """Map each entry of the column `to do` to instructions."""
     from sros_tool.keystore.expiry import renewal_command
     from sros_tool.keystore.fleet import publish_command
 
+    root = status.keystore
     where = quote(str(root))
     by_hand = (
         f"`sros distribute_key {where} --robot NAME FOLDER --force`, bring FOLDER to the robot, "
         "and restart its processes; with Ansible, run the play `deliver`"
     )
-    publish = publish_command(root)
+    to_renew = [robot for robot in status.robots if robot.to_do == "renew"]
     known = {
         "deliver": by_hand,
-        "publish": publish,
-        "renew": f"`{renewal_command(root)}`, then {publish or 'deliver'}",
+        "publish": publish_command(root),
+        "renew": f"`{renewal_command(root)}`, then {_bringing(root, to_renew)}",
         "take it out of the fleet file": "remove the robot from the fleet file, and run "
         f"`sros generate_artifacts -k {where} -p POLICY --fleet FILE`",
         "upgrade the DDS": "upgrade the package of the library, which is named below, on the "
@@ -859,12 +860,22 @@ def _remedies(root: Path, to_dos: Collection[str]) -> Mapping[str, str]:
     }
 
 
+def _bringing(root: Path, robots: Sequence[RobotStatus]) -> str:
+    """Return how renewed files get to robots: most of those that fetch get what is published."""
+    from sros_tool.keystore.fleet import publish_command
+
+    publish = publish_command(root)
+    if not publish or not any(robot.fetches for robot in robots):
+        return "deliver"
+    all_fetch = all(robot.fetches for robot in robots)
+    return publish if all_fetch else f"{publish}, and deliver to the robots that do not fetch"
+
+
 def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     """Yield when the first file on a robot expires, if that is soon, and what to do."""
     from datetime import timedelta
 
     from sros_tool.keystore.expiry import renewal_command
-    from sros_tool.keystore.fleet import publish_command
     from sros_tool.validity import iso
 
     soon = [
@@ -891,7 +902,7 @@ def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         command = f"`sros crl {quote(str(root))} --refresh`, then "
     if not any("current" in robot.files.get(kind, ()) for robot in soon):
         command = ""  # the keystore has renewed them
-    bring = f"{command}{publish_command(root) or 'deliver'}"
+    bring = f"{command}{_bringing(root, soon)}"
     if not command and all(robot.has_release for robot in soon):
         bring = "new files are published; the column `to do` says what to do"
     yield (

@@ -19,7 +19,14 @@ from prometheus_client.parser import text_string_to_metric_families
 from sros_tool.agent.running import EnclaveProcesses
 from sros_tool.agent.state import AgentState, write_state
 from sros_tool.cli import fleet as fleet_verbs
-from sros_tool.cli.fleet import ComparedFleet, _facts, _joined_durations, _lines, _robot_names
+from sros_tool.cli.fleet import (
+    ComparedFleet,
+    _facts,
+    _joined_durations,
+    _lines,
+    _remedies,
+    _robot_names,
+)
 from sros_tool.keystore.confirmation import (
     MESSAGE_FILE,
     RobotDds,
@@ -923,6 +930,19 @@ def test_robots_with_files_that_expire_soon_are_named(
     )
     named = "`sros renew ks /r1/base /r3/base --all-expiring soon`, then deliver"
     assert command(fleet_status(OpenedKeystore(field.root))).replace(str(field.root), "ks") == named
+    monkeypatch.setattr("sros_tool.keystore.fleet.publish_command", lambda _: "publish")
+    for fetching, bring in (
+        (0, "deliver"),
+        (2, "publish, and deliver to the robots that do not fetch"),
+        (3, "publish"),
+    ):
+        robots = [
+            replace(robot, fetches=place < fetching, to_do="renew")
+            for place, robot in enumerate(status.robots)
+        ]
+        given = replace(status, robots=tuple(robots))
+        assert command(given).endswith(f"soon`, then {bring}")
+        assert _remedies(given, {"renew"})["renew"].endswith(f"soon`, then {bring}")
 
 
 def test_a_robot_whose_files_have_expired_is_not_in_order(field: Field) -> None:
