@@ -344,9 +344,10 @@ def test_a_kill_after_the_keystore_changed_keeps_the_number(
     assert publisher.robot().gets().number == number
 
 
+@pytest.mark.parametrize("changed", ["", "renew", "revoke"])
 @pytest.mark.parametrize("is_lost", [False, True])
 def test_a_kill_before_the_keystore_knows_its_first_releases(
-    publisher: Home, is_lost: bool, monkeypatch: pytest.MonkeyPatch
+    publisher: Home, is_lost: bool, changed: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not is_lost:
         forget_publishing(publisher.root)
@@ -357,8 +358,10 @@ def test_a_kill_before_the_keystore_knows_its_first_releases(
             publisher.publish(new_folder=is_lost)
     killed = archives(publisher)
     assert killed and not [*publisher.pub.glob("metadata/*")]
+    if changed:
+        publisher.run(changed, "ks", "/r1/base")
     publisher.publish(new_folder=is_lost)
-    publisher.robot().gets()
+    publisher.robot("r2").gets()
 
 
 def test_a_disk_that_is_full_after_the_keystore_changed(
@@ -882,6 +885,25 @@ def test_a_folder_without_metadata_has_releases_that_the_keystore_does_not_know(
     assert done.notes[0].id == "fleet.revocations-restored" and "/r5/base" in done.notes[0].text
     publisher.robot().gets()
     publisher.robot("r5").refuses(FetchProblem.NOT_FOR_ROBOT)
+
+
+def test_all_unknown_releases_in_a_folder_without_metadata_revoke(publisher: Home) -> None:
+    """Also if the last one is of another copy of the keystore, which revoked nothing."""
+    backup = copy_of(publisher.root, publisher.folder / "backup")
+    copy = copy_of(publisher.root, publisher.folder / "copy")
+    publisher.run("revoke", "ks", "--robot", "r5")
+    publisher.publish()
+    for _ in range(2):
+        publisher.run("renew", copy, "--all")
+    publisher.run("fleet", "publish", copy, "other", "--new-folder")
+    shutil.copytree(
+        publisher.folder / "other/targets", publisher.pub / "targets", dirs_exist_ok=True
+    )
+    shutil.rmtree(publisher.pub / "metadata")
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    done = publisher.publish(restored=True, new_folder=True)
+    assert done.notes[0].id == "fleet.revocations-restored" and "/r5/base" in done.notes[0].text
 
 
 def test_releases_of_a_later_ca_in_a_folder_without_metadata(publisher: Home) -> None:

@@ -15,7 +15,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache, partial
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -63,11 +63,12 @@ from sros_tool.keystore.layout import (
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
     PUBLISHED,
+    ca_certificate,
     enclave_folder,
     enclave_path,
     fleet_key,
 )
-from sros_tool.keystore.ledger import RESTORED, Entry
+from sros_tool.keystore.ledger import REPORTED, RESTORED, Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import Forgotten
 from sros_tool.keystore.lifecycle.revoke import (
@@ -79,7 +80,13 @@ from sros_tool.keystore.outcomes import changes_below
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.transaction import KeystoreLock
 from sros_tool.parallel import map_slices, tick
-from sros_tool.pki.certificates import authority_key, authority_text, load_certificates, validity_of
+from sros_tool.pki.certificates import (
+    authority_key,
+    authority_text,
+    digest,
+    load_certificates,
+    validity_of,
+)
 from sros_tool.pki.crl import lists_as_revoked, read_list
 from sros_tool.validity import iso
 from sros_tool.values import (
@@ -638,9 +645,9 @@ class _Run:
         if restored:
             forgotten = Forgotten(self.keystore, self._now)
             if is_later or unknown:
-                last = self._last_read() if is_later else unknown[-1]
-                self._check_authorities(last)
-                for path, content in last.files.items():
+                unknown = [self._last_read()] if is_later else unknown
+                self._check_authorities(unknown[-1])
+                for path, content in chain.from_iterable(of.files.items() for of in unknown):
                     if path.endswith(f"/{CRL_FILE}"):
                         forgotten.add(content)
             self._restore(forgotten, keyring)
@@ -850,15 +857,15 @@ class _Run:
     def _unknown_releases(self) -> list[Release]:
         """Return the sealed releases, by number, that the keystore does not know, or whose list.
 
-        One that has only files of the keystore undoes nothing: publishing was interrupted before
-        the ledger got its number.
+        One that has only files that the keystore has or issued undoes nothing: publishing was
+        interrupted before the ledger got its number.
         """
         known = self._known_numbers()
         forgotten = Forgotten(self.keystore, self._now)
         unknown = [
             release
             for release in self._sealed_releases()
-            if (release.number not in known and not self._has_all_files_of(release))
+            if (release.number not in known and not self._issued_all_files_of(release))
             or any(
                 forgotten.add(content)
                 for path, content in release.files.items()
@@ -867,11 +874,23 @@ class _Run:
         ]
         return sorted(unknown, key=lambda release: release.number)
 
-    def _has_all_files_of(self, release: Release) -> bool:
-        """Return whether the keystore has every file of a release, with the same content."""
+    def _issued_all_files_of(self, release: Release) -> bool:
+        """Return whether the keystore has every file of a release, or issued what is in it."""
         with suppress(SrosError, OSError):
+            digests = {
+                path: digest(load_certificates(data, path)[0])
+                if path.endswith(f"/{CERTIFICATE_FILE}")
+                else hashlib.sha256(data).hexdigest()
+                for path, data in release.files.items()
+            }
+            entries = self.keystore.ledger_file.with_values("sha256", digests.values()).entries
+            issued = {entry.sha256 for entry in entries if entry.reason != REPORTED}
+            for role in (IDENTITY, PERMISSIONS):
+                authority = self.keystore.read(ca_certificate(role), "CA certificate")
+                issued.add(hashlib.sha256(authority).hexdigest())
             return all(
-                self.keystore.read(path, "file") == data for path, data in release.files.items()
+                digests[path] in issued or self.keystore.read(path, "file") == data
+                for path, data in release.files.items()
             )
         return False
 
