@@ -194,7 +194,9 @@ def choose_backend(wished_backend: str, probe: ProbeEnclave) -> Backend:
             return Backend(RCLPY, f"{stack.dds} {stack.version}".strip(), why, stack.rmw)
     reason = _why_not(stacks)
     if wished_backend == RCLPY:
-        raise UnavailableError("no RMW under rclpy enforces security here", reason, _NO_RCLPY)
+        raise UnavailableError(
+            "no RMW under rclpy is known to enforce security here", reason, _NO_RCLPY
+        )
     return _cyclone(cyclone_stack(probe), reason)
 
 
@@ -231,7 +233,7 @@ def zenoh_backend() -> Backend:
 def _cyclone(stack: Stack, why: str) -> Backend:
     if not stack.enforces:
         raise UnavailableError(
-            "no DDS here enforces security",
+            "no DDS here is known to enforce security",
             f"{stack.name}: {stack.evidence}. {'' if why == _ASKED else why}",
             INSTALL_ADVICE,
         )
@@ -250,10 +252,15 @@ def _observing_rmw() -> str | None:
 
 
 def _why_not(stacks: Sequence[Stack]) -> str:
-    if not any(stack.present for stack in stacks):
+    present = [stack for stack in stacks if stack.present]
+    if not present:
         return "rclpy is not installed here"
-    names = " and ".join(stack.rmw or "its RMW" for stack in stacks)
-    return f"rclpy with {names} does not enforce security here (`sros doctor` shows why)"
+    clauses = []
+    for was_tried, what in ((True, "does not enforce security"), (False, "could not be tried")):
+        of_it = [stack for stack in present if (stack.enforces is not None) is was_tried]
+        names = " and ".join(stack.rmw or "its RMW" for stack in of_it)
+        clauses += [f"rclpy with {names} {what} here"] if names else []
+    return f"{', and '.join(clauses)} (`sros doctor` shows why)"
 
 
 _SIGNERS_CHECKED = ((2, 1, 4), (2, 6, 5), (2, 8, 2), (2, 9, 2))

@@ -106,7 +106,7 @@ def test_the_policy_follows_the_topic_and_leaves_two_enclaves_without_it() -> No
     [
         ("auto", ENFORCING, CYCLONE, "rclpy", "enforces security here"),
         ("auto", ENFORCING._replace(enforces=False), CYCLONE, "cyclone", "does not enforce"),
-        ("auto", ENFORCING._replace(enforces=None), CYCLONE, "cyclone", "does not enforce"),
+        ("auto", ENFORCING._replace(enforces=None), CYCLONE, "cyclone", "could not be tried"),
         ("auto", ABSENT, CYCLONE, "cyclone", "rclpy is not installed here"),
         ("cyclone", ENFORCING, CYCLONE, "cyclone", "chosen with --backend"),
         ("rclpy", ENFORCING, CYCLONE, "rclpy", "chosen with --backend"),
