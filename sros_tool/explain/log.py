@@ -719,7 +719,8 @@ class _Examiner:
 
     def _with_names(self, text: str, enclave: LoadedEnclave | None, hit: _Hit) -> str:
         """Return a remedy with keystore, enclave and the hit's fields for its placeholders."""
-        own_name = "" if hit.meaning in (NO_ENCLAVE, RUNS_OPEN) or not enclave else enclave.name
+        own_name = enclave.name if enclave else hit.enclave.rstrip("/")
+        own_name = "" if hit.meaning in (NO_ENCLAVE, RUNS_OPEN) else own_name
         if self._is_export and NEEDS_CA_KEYS.search(text):
             text = self._for_export(text)
         else:

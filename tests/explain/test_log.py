@@ -587,6 +587,10 @@ def test_a_remedy_names_the_keystore_and_the_enclave_that_the_user_named(
     assert f"`sros explain {keystore} {ENCLAVE} publish /x`" in denied
     unnamed = sros("explain", "--log", tmp_path / "robot.log").out
     assert "`sros explain KEYSTORE ENCLAVE join`" in unnamed
+    started = "[INFO] [1.0] [rcl]: Found security directory: /robot/keystore/enclaves/a/b\n"
+    (tmp_path / "robot.log").write_text(f"{started}[SECURITY Error] Bad thing -> Function set\n")
+    of_log = sros("explain", "--log", tmp_path / "robot.log").out
+    assert "`sros explain KEYSTORE /a/b join`" in of_log
     line = f"filesystem error: status: Permission denied [{keystore}/enclaves/a/governance.p7s]"
     (tmp_path / "user.log").write_text(f"RuntimeError: {line}\n")
     unreadable = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "user.log").out
