@@ -221,10 +221,13 @@ def due_enclaves(
     return ExpiryCheck(due, unreadable, len(lasting), short_lived, moment)
 
 
-def refuse_unreadable(unreadable: tuple[UnreadableEnclave, ...], verb: str) -> None:
+def refuse_unreadable(
+    unreadable: tuple[UnreadableEnclave, ...], verb: str, *, takes_names: bool = True
+) -> None:
     """Raise an error that names all ``unreadable`` enclaves; return if there are none.
 
-    ``verb`` is the past participle for the message, such as "renewed".
+    ``verb`` is the past participle for the message, such as "renewed".  ``takes_names`` says
+    whether the command could name the other enclaves alone.
     """
     if len(unreadable) == 1:
         raise unreadable[0].error
@@ -233,10 +236,11 @@ def refuse_unreadable(unreadable: tuple[UnreadableEnclave, ...], verb: str) -> N
         reasons = " ".join(f"{enclave.error.what}." for enclave in unreadable)
         first = unreadable[0]
         how = f" For {first.name}: {first.error.remedy}" if first.error.remedy else ""
+        others = ", or name the other enclaves in the command" * takes_names
         raise KeystoreError(
             f"{len(unreadable)} enclaves cannot be {verb}: {names}",
             f"{reasons} Nothing was changed.",
-            f"Repair or revoke them, or name the other enclaves in the command.{how}",
+            f"Repair or revoke them{others}.{how}",
         )
 
 

@@ -381,8 +381,12 @@ def test_every_one_that_cannot_be_renewed_is_named_at_once(
     for chosen, expiring in ((names, None), ([], parse_threshold("100y"))):
         with pytest.raises(KeystoreError, match="2 enclaves cannot be renewed: /n003, /n0") as told:
             renew(root, chosen, now=LATER, expiring=expiring)
-        assert told.value.remedy.partition(" For /n003: ")[2]
+        assert ", or name the other enclaves in the command. For /n003: " in told.value.remedy
         assert snapshot(root) == before
+    updated = sros("update_keystore", root, "--domain", "0-9", "--allow-looser")
+    assert "2 enclaves cannot be updated: /n003, /n023" in updated.err
+    assert "Repair or revoke them. For /n003: " in updated.err
+    assert snapshot(root) == before
     assert len(renew(root, names[4:-1], now=LATER).names("renewed")) == 19
 
 

@@ -547,7 +547,7 @@ class _Updater:
 
         results = self._writer.for_each(names, work, progress).values()
         unreadable = tuple(result for result in results if isinstance(result, UnreadableEnclave))
-        refuse_unreadable(unreadable, "updated")
+        refuse_unreadable(unreadable, "updated", takes_names=False)
         opened = [kept_open for kept_open in results if isinstance(kept_open, _KeptOpen)]
         self._kept_open = tuple(kept_open.name for kept_open in opened)
         reissued = [
