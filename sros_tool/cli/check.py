@@ -388,7 +388,7 @@ def _requirements(
     from sros_tool.proof.requirements import dropped_findings, read_all_requirements
 
     one_robot = _paths_of_one_system(family, paths, "--requirements")
-    places = [check_plain_namespace(namespace) for namespace in namespaces] or ["/"]
+    places = [check_plain_namespace(namespace) for namespace in namespaces]
 
     def decide(load: Callable[[Sequence[Path]], System]) -> list[Finding]:
         system = load(one_robot)

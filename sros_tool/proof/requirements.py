@@ -284,11 +284,11 @@ def _no_fleet() -> None:
 
 
 def read_requirements(
-    path: Path, fleet: FleetSource = _no_fleet, namespaces: Sequence[str] = ("/",)
+    path: Path, fleet: FleetSource = _no_fleet, namespaces: Sequence[str] = ()
 ) -> tuple[Requirement, ...]:
     """Return the requirements in a TOML file, in their order, for the robots of a fleet.
 
-    With ``namespaces``, each requirement is returned once for each namespace.
+    With ``namespaces``, each requirement is returned once for each namespace; else for ``/``.
 
     Raises:
         DocumentError: the file cannot be read, or a part of it is not valid; the error has file and
@@ -300,7 +300,7 @@ def read_requirements(
 
 
 def read_all_requirements(
-    paths: Iterable[Path], fleet: FleetSource = _no_fleet, namespaces: Sequence[str] = ("/",)
+    paths: Iterable[Path], fleet: FleetSource = _no_fleet, namespaces: Sequence[str] = ()
 ) -> tuple[Requirement, ...]:
     """Return the requirements in several TOML files, for each of the ``namespaces``.
 
@@ -316,7 +316,7 @@ def parse_requirements(
     data: bytes,
     file: str,
     fleet: FleetSource = _no_fleet,
-    namespaces: Sequence[str] = ("/",),
+    namespaces: Sequence[str] = (),
 ) -> tuple[Requirement, ...]:
     """Return the requirements in a TOML document, for each of the ``namespaces``.
 
@@ -330,13 +330,13 @@ def parse_requirements(
         replace(table, namespace=namespace)
         for unfilled in unfilled_tables
         for table in _filled_tables(unfilled, fleet)
-        for namespace in dict.fromkeys(namespaces)
+        for namespace in dict.fromkeys(namespaces or ("/",))
     )
     requirements = []
     pairs_left = _MOST_PAIRS
     for table in filled:
         requirement = _READERS[table.kind](table)
-        if table.namespace == "/":
+        if not namespaces:
             moved = _READERS[table.kind](replace(table, namespace=ELSEWHERE))
             requirement = replace(requirement, elsewhere=moved)
         requirements.append(requirement)

@@ -105,6 +105,11 @@ def test_what_no_longer_moves_with_the_namespace_is_weakened(case: str) -> None:
     (found,) = dropped_requirements(before, after)
     assert (found.change, found.only_elsewhere) == ("weakened", True)
     assert dropped_requirements(before, before) == dropped_requirements(before, wider) == ()
+    in_root = (
+        parse_requirements(ONLY.replace('"/a"', names).encode(), "r.toml", namespaces=["/"])
+        for names in ELSEWHERE[case]
+    )
+    assert dropped_requirements(*in_root) == ()
 
 
 def test_an_exception_of_some_namespaces_is_weakened() -> None:
