@@ -811,7 +811,7 @@ class _Round:
                     place = enclave_folder(name)
                     data = opened.read_inside(f"{place}/{CRL_FILE}")
                     newest = newest_list(data, opened.read_inside(f"{place}/{IDENTITY_CA_FILE}"))
-                    lists += [newest] if newest else []
+                    lists += [newest] if newest is not None else []
         if not lists:
             return None
         text = max(lists, key=list_number).public_bytes(Encoding.PEM).decode()
@@ -924,7 +924,7 @@ def _trust_digest(folder: Folder, path: str) -> str:
     with suppress(SrosError, OSError):
         data = folder.read_inside(path) if file == CRL_FILE else b""
         signed = newest_list(data, folder.read_inside(f"{place}/{IDENTITY_CA_FILE}"))
-        if signed and len(read_lists(data, "here")) == 1:
+        if signed is not None and len(read_lists(data, "here")) == 1:
             revoked = sorted(_revoked(data.decode()))
             return hashlib.sha256(
                 f"{signed.issuer.public_bytes()!r} {revoked}".encode()

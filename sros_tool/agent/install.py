@@ -471,9 +471,11 @@ def _list_alone(folder: Folder, name: str, files: Mapping[str, bytes], now: date
         same_cas = _content(folder, f"{place}/{IDENTITY_CA_FILE}") == authorities
         path, sent = f"{place}/{CRL_FILE}", files.get(CRL_FILE, b"")
         newest = newest_list(sent, authorities)
-        expiry = next_update(newest) if newest else None
+        expiry = next_update(newest) if newest is not None else None
         fits = same_cas and _had_certificate(folder, name) and _content(folder, path) != sent
-        valid = newest and last_update(newest) <= now and (expiry is None or now < expiry)
+        valid = (
+            newest is not None and last_update(newest) <= now and (expiry is None or now < expiry)
+        )
         if fits and valid:
             change.write[path] = sent
     return change

@@ -312,7 +312,8 @@ def may_sign_lists(authority: x509.Certificate) -> bool:
 def newest_list(data: bytes, authorities: bytes) -> x509.CertificateRevocationList | None:
     """Return the newest revocation list in ``data``, of those that one of ``authorities`` signed.
 
-    The list number decides; None if there is none, or a file cannot be read.
+    The list number decides; None if there is none, or a file cannot be read.  A list that revokes
+    nothing is false: compare with None.
     """
     try:
         signers = load_certificates(authorities, "the identity CAs")

@@ -415,6 +415,9 @@ def test_a_revocation_list_that_is_replaced_by_one_that_revokes_less_is_sent(
             assert r1.message().crl == before, "also after further releases"
     r1.round(moment() + timedelta(days=40))
     assert r1.message().crl is None
+    r1.release = FetchError(FetchProblem.ROLLED_BACK, "x", "")
+    r1.round(moment() + timedelta(days=40))
+    assert r1.message().crl == other.decode(), "also a list that revokes nothing has a number"
 
 
 def test_a_disk_of_yesterday_goes_on(home: Home, r1: Robot, tmp_path: Path) -> None:

@@ -161,14 +161,17 @@ REFUSED: dict[str, tuple[Callable[[Home], Release], str]] = {
 }
 
 
-def list_of_nobody(home: Home) -> bytes:
-    """Return a list that revokes nobody, as a keystore from before the revocation signs it."""
+def list_of_nobody(home: Home, later: int = 0) -> bytes:
+    """Return a list that revokes nobody, as a keystore from before the revocation signs it.
+
+    Its number is by ``later`` higher than that of the list that has the revocation.
+    """
     present = load_crl(home.revoked.files[f"{A}/crl.pem"], "of /r1/a")
     return sign_crl(
         read_certificate(home.root / ca_certificate("identity")),
         load_key((home.root / ca_key("identity")).read_bytes(), "CA"),
         (),
-        number=present.number,
+        number=present.number + later,
         this_update=present.this_update,
         next_update=present.next_update,
     )
@@ -276,6 +279,9 @@ def test_a_bad_enclave_keeps_nothing_from_the_others(
     if spoil in (spoil_key, other_key):  # its files are there, and can have the list
         assert (robot / A / "crl.pem").read_bytes() == home.revoked.files[f"{A}/crl.pem"]
         assert (robot / A / "cert.pem").read_bytes() == home.first.files[f"{A}/cert.pem"]
+        nobody = list_of_nobody(home, later=1)
+        install(robot, home.release({**home.revoked.files, f"{A}/crl.pem": nobody}))
+        assert (robot / A / "crl.pem").read_bytes() == nobody
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs files of another user")
