@@ -51,7 +51,8 @@ _crl_option = click.option(
     "--crl",
     "crl_file",
     type=PATH,
-    help="Revocation list (PEM) that the CA service signed, for a keystore with a CA service.",
+    help="Revocation list (PEM) that the CA service signed, for a keystore with a CA service; with "
+    "`sros crl`, also a list that a keystore from a backup has lost, such as a robot's crl.pem.",
 )
 
 
@@ -273,6 +274,9 @@ def crl(
 
     DDS refuses every participant once the list has expired, so the exit status is 1 if it expires
     within 30 days, or within a third of its validity, if that is shorter.
+
+    With --refresh --crl FILE, a keystore that was restored from a backup revokes again what a list
+    of the time after the backup revokes, such as crl.pem of a robot.
 
     Example:
       $ sros crl keystore

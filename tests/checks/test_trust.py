@@ -120,7 +120,7 @@ def test_a_keystore_from_before_a_revocation(keystore: Path, tmp_path: Path) -> 
 
     assert accepting() == [f"{nodes} newer revocation {of}"]
     said = sros("check", restored, robot).out
-    assert "`sros revoke KEYSTORE ENCLAVE`" in said and "distribute_key" not in said
+    assert "`sros crl KEYSTORE --refresh --crl FILE`" in said and "distribute_key" not in said
     sros("revoke", restored, "/lost").ok()
     assert accepting() == [
         f"{nodes} revocation {of}",

@@ -35,6 +35,7 @@ from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.lifecycle.rotation import RotationStage
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
+from sros_tool.pki.crl import load_crl
 from sros_tool.policy.document import read_policy
 from tests.support.harness import copy_of, policy_text, publish, snapshot, sros
 
@@ -89,15 +90,26 @@ def test_a_list_with_a_later_number_does_not_lose_a_revocation(fleet: Path, tmp_
     distribute(OpenedKeystore(fleet), ["/base"], robot, now=NOW)
     for name in ("/arm/camera", "/arm/gripper"):
         revoke(backup, [name], now=NOW)
+    crl, before = robot / "enclaves/base/crl.pem", snapshot(robot)
     for lacking in (2, 1):
-        before = snapshot(robot)
-        with pytest.raises(
-            KeystoreError, match=rf"crl.pem' revokes {lacking} certificates? that the"
-        ):
+        with pytest.raises(KeystoreError, match=rf"{crl}' revokes {lacking} certificates? that"):
             distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True)
         assert snapshot(robot) == before
         if lacking == 2:
             revoke(backup, ["/armada"], now=NOW)
+    for _ in range(2):  # the first one takes the list over
+        refresh_crl(backup, now=NOW, crl=crl.read_bytes())
+    assert distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True).changes
+    lost = load_crl(before["enclaves/base/crl.pem"][1], "lost").revoked
+    assert all(load_crl(crl.read_bytes(), "new").revokes(entry.serial) for entry in lost)
+
+
+def test_a_list_of_another_ca_is_not_taken_over(fleet: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    create_keystore(other, template=load_template("production"), now=NOW)
+    refresh_crl(other, now=NOW)
+    with pytest.raises(KeystoreError, match="no identity CA of the keystore signed"):
+        refresh_crl(fleet, now=NOW, crl=(other / "public/identity_ca.crl.pem").read_bytes())
 
 
 def test_an_expired_certificate_may_leave_the_list(fleet: Path, tmp_path: Path) -> None:

@@ -71,12 +71,13 @@ PEERS_ACCEPT = FindingKind(
 )
 _REVOKE_AGAIN = (
     "This keystore was perhaps restored from a backup: before its next export, revoke again what "
-    "the other list revokes, with `sros revoke KEYSTORE ENCLAVE`."
+    "the other list revokes, with `sros crl KEYSTORE --refresh --crl FILE`. FILE is the other "
+    "crl.pem."
 )
 _REVOKE_FIRST = (
     "The keystore was perhaps restored from a backup: the export's own list revokes certificates "
     "that the keystore's does not. Unless they expired, first revoke them there again, with `sros "
-    f"revoke KEYSTORE ENCLAVE`. {PEERS_ACCEPT.remedy}"
+    f"crl KEYSTORE --refresh --crl FILE`. FILE is the export's crl.pem. {PEERS_ACCEPT.remedy}"
 )
 PEERS_PROTECTION = FindingKind(
     "keystore.peers-protection",

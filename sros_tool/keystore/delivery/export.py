@@ -81,7 +81,6 @@ from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes, Words
 from sros_tool.wording import counted, first_few
 from sros_tool.xml import read_bytes
 
-_ARCHIVE_SUFFIXES = SUFFIXES
 _ANSWER_AGAIN = (
     "Sign the request.pem in the enclave's folder with `sros sign_request --renew`, and send the "
     "answer to the robot."
@@ -158,7 +157,7 @@ def distribute(
     """
     files = exported_files(keystore, names, now, keyless=keyless)
     notes = (*_token_notes(files), *unrecorded_notes(keystore, load_fleet(keystore), names))
-    if target.name.endswith(_ARCHIVE_SUFFIXES):
+    if _is_archive(target):
         changes = _write_archive(keystore, target, files, now=now, force=force, dry_run=dry_run)
         return Export(target, tuple(names), changes, notes)
     changes = _write_folder(keystore, target, files, now=now, force=force, dry_run=dry_run)
@@ -560,7 +559,6 @@ def _check_trust(
 
     ``present`` returns the content of a file in ``target``, by its path; b"" if there is none.
     """
-    backup = "The keystore may come from a backup: "
     if later := _later_authorities(keystore, present, files):
         path, authority = next(iter(later.items()))
         role = _ROLES_OF_FILES[path.rpartition("/")[2]]
@@ -568,21 +566,27 @@ def _check_trust(
             f"'{target / path}' has a later {role} CA than the keystore's",
             f"It trusts {authority_text(authority)}, which the keystore does not know: the robot "
             "would trust the earlier CA again, and what was revoked since. Nothing was changed.",
-            f"{backup}docs/howto/keystore_is_lost.md says how to go on. If the keystore's CA is "
-            f"right, first {_removal_of(target, later)}",
+            "The keystore may come from a backup: docs/howto/keystore_is_lost.md says how to go "
+            f"on. If the keystore's CA is right, first {_removal_of(target, later)}",
         )
     if lost := _lost_revocations(keystore, present, files, now):
         path, (what, why) = next(iter(lost.items()))
+        file = "FILE" if _is_archive(target) else quote(str(target / path))
         raise KeystoreError(
             f"'{target / path}' {what}",
-            f"{why}: what is revoked would be trusted again. Nothing was changed.",
-            f"{backup}docs/howto/keystore_is_lost.md says how it takes over the list. If the "
-            f"keystore's list is right, first {_removal_of(target, lost)}",
+            f"{why}: revoked enclaves would be trusted again. Nothing was changed.",
+            "The keystore may come from a backup: docs/howto/keystore_is_lost.md says what to do, "
+            f"and `sros crl {quote(str(keystore.root))} --refresh --crl {file}` revokes the same "
+            f"again. If the keystore's list is right, first {_removal_of(target, lost)}",
         )
 
 
+def _is_archive(target: Path) -> bool:
+    return target.name.endswith(SUFFIXES)
+
+
 def _removal_of(target: Path, paths: Iterable[str]) -> str:
-    if target.name.endswith(_ARCHIVE_SUFFIXES):
+    if _is_archive(target):
         return f"remove the archive: `rm {quote(str(target))}`."
     files = " ".join(quote(str(target / path)) for path in paths)
     return f"remove the other: `rm {files}`."
@@ -651,7 +655,7 @@ def _lost_revocations(
                     lost[place] = (
                         f"revokes {counted(len(lacking), 'certificate')} that the keystore's "
                         "revocation list lacks",
-                        f"The first one has the serial number {min(lacking):x}",
+                        f"One has the serial number {min(lacking):x}, and may not have expired",
                     )
     return lost
 

@@ -13,9 +13,11 @@ from shlex import quote
 from typing import Unpack
 
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
+from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.known_keys import revoked_serials
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
+    IDENTITY,
     KEY_URI_FILE,
     OPTIONAL_FILES,
     REQUEST,
@@ -27,10 +29,11 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import RESTORED, Entry, certificate_entry
 from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import Forgotten
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import issued_by, key_digest
-from sros_tool.pki.crl import REASONS, SUPERSEDED
+from sros_tool.pki.crl import REASONS, SUPERSEDED, load_crl, signed_by
 from sros_tool.validity import iso
 from sros_tool.wording import counted, first_few
 
@@ -308,12 +311,29 @@ def refresh_crl(
     *,
     crl: bytes = b"",
     **options: Unpack[ChangeOptions],
-) -> Revocation:
+) -> Changed:
     """Sign the revocation list again, so that it is valid for longer.
 
     Its entries are kept, except certificates that expired before the current list was signed.  If
-    a CA service is the identity CA, its new list ``crl`` (PEM) replaces the current list.
+    a CA service is the identity CA, its new list ``crl`` (PEM) replaces the current list; else
+    ``crl`` is a list that a keystore from a backup has lost, whose entries are revoked again.
+
+    Raises:
+        KeystoreError: no identity CA of the keystore signed ``crl``; or as `revoke`.
     """
+    keystore = OpenedKeystore(root)
+    keyring = options.get("keyring", IN_KEYSTORE)
+    if crl and not keyring.ca_service(root, IDENTITY, keystore.template):
+        lost, forgotten = load_crl(crl, "that was given"), Forgotten(keystore, options["now"])
+        if not any(signed_by(lost.list, ca) for ca in keystore.authority(IDENTITY)):
+            raise KeystoreError(
+                "no identity CA of the keystore signed the revocation list that was given",
+                "Whoever wrote it could have any certificate revoked. Nothing was changed.",
+                "Give a list of this keystore, such as crl.pem of a robot.",
+            )
+        if forgotten.add(crl):
+            return restore_revocations(root, forgotten, **options)
+        crl = b""  # the keystore has all of it
     change = KeystoreChange(root, **options)
     change.crl = crl
     with change:

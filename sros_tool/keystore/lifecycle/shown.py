@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from sros_tool.keystore.comparison import SettingChange
     from sros_tool.keystore.lifecycle.change import Changed
     from sros_tool.keystore.lifecycle.create import Creation
-    from sros_tool.keystore.lifecycle.revoke import Revocation
     from sros_tool.keystore.lifecycle.rotation import (
         AuthorityStatus,
         RotationStage,
@@ -425,7 +424,7 @@ class KeystoreLists(NamedTuple):
 
 def shown_lists(
     keystore: OpenedKeystore,
-    refreshed_by: Revocation | None,
+    refreshed_by: Changed | None,
     enclaves: Mapping[str, str],
     *,
     expires_soon: bool,

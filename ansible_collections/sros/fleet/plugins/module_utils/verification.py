@@ -98,18 +98,18 @@ def check_lists(before: Files, after: Files, spare: str) -> list[str]:
             raise RefusedError(
                 f"The revocation list for {name} is older than the one of this robot, which has the"
                 f" number {present.number}; the keystore has {number}. Revoked enclaves would be"
-                " trusted again. The keystore may come from a backup: copy crl.pem of"
-                f" {name} on this robot to public/identity_ca.crl.pem there, run `sros revoke` for"
-                " each enclave that `sros crl` then shows (`sros renew --new-key --revoke-old` if"
-                " it shows superseded), and deliver again. If the older list is"
-                " right, set allow_older_lists (sros_allow_older_lists)."
+                f" trusted again. The keystore may come from a backup: copy crl.pem of {name} on"
+                " this robot to the keystore machine, run `sros crl KEYSTORE --refresh --crl FILE`"
+                " with this copy, and deliver again. If the older list is right, set"
+                " allow_older_lists (sros_allow_older_lists)."
             )
         lost = present.serials - new.serials
         if lost and present.authority == new.authority:
             remarks[present] = (
                 f"The current revocation list has {len(lost)} serial numbers that the new one"
                 f" lacks, such as {min(lost)}. This is right if these certificates have expired,"
-                " but not if the keystore comes from a backup."
+                " but not if the keystore comes from a backup: then take the list over from another"
+                " robot, with `sros crl KEYSTORE --refresh --crl FILE`."
             )
     return list(remarks.values())
 
