@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import subprocess
 from collections.abc import Iterator
 from hashlib import sha256
 from pathlib import Path
@@ -64,6 +66,31 @@ def test_the_folder_of_a_robot_gets_no_enclave_of_another_one(made: Path, tmp_pa
     refused = sros("distribute_key", made / "ks", "--robot", "a_arm", tmp_path, "--force")
     assert "is the folder of robot a, and /a_arm belongs to a_arm" in refused.err
     sros("distribute_key", made / "ks", "--robot", "a", tmp_path, "--force").ok()
+
+
+def test_enclaves_of_another_robot_in_the_folder_are_named(tmp_path: Path) -> None:
+    """They stay, and the command that removes them removes no enclave below them."""
+    root, folder = tmp_path / "ks", tmp_path / "robot"
+    sros("create_keystore", root).ok()
+    (tmp_path / "fleet.toml").write_text(
+        '[robots]\nhall = {namespace="/hall"}\ncart = {namespace="/hall/cart"}\n'
+    )
+    (tmp_path / "policy.xml").write_text(policy_text({"{namespace}": publish("x")}))
+    words = ("-p", tmp_path / "policy.xml", "--fleet", tmp_path / "fleet.toml")
+    sros("generate_artifacts", "-k", root, *words).ok()
+    alone = sros("distribute_key", root, "--robot", "hall", folder)
+    assert "another-robot" not in alone.ok().err
+    before = snapshot(folder / "enclaves/hall")
+    for _ in range(2):
+        said = sros("distribute_key", root, "--robot", "cart", folder, "--force").ok().err
+        assert f"[export.of-another-robot]: '{folder}' also has /hall of robot hall" in said
+        assert before.items() <= snapshot(folder / "enclaves/hall").items()
+    command = re.search("`(rm .*?)`", said)
+    assert command
+    subprocess.run(command[1], shell=True, check=True)
+    assert list_enclaves(folder) == ("/hall/cart",)
+    said = sros("distribute_key", root, "--robot", "cart", folder, "--force").ok().err
+    assert "another-robot" not in said
 
 
 def test_no_enclave_belongs_to_two_robots(made: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tomllib
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -81,6 +82,7 @@ from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes, Words
 from sros_tool.wording import counted, first_few
 from sros_tool.xml import read_bytes
 
+_SHOWN = 5
 _ANSWER_AGAIN = (
     "Sign the request.pem in the enclave's folder with `sros sign_request --renew`, and send the "
     "answer to the robot."
@@ -161,7 +163,7 @@ def distribute(
         changes = _write_archive(keystore, target, files, now=now, force=force, dry_run=dry_run)
         return Export(target, tuple(names), changes, notes)
     changes = _write_folder(keystore, target, files, now=now, force=force, dry_run=dry_run)
-    notes += (*_readable_key_notes(target, names), *_notes(keystore, target))
+    notes += (*_readable_key_notes(target, names), *_notes(keystore, target, names))
     return Export(target, tuple(names), changes, notes)
 
 
@@ -192,16 +194,42 @@ def _readable_key_notes(target: Path, names: Sequence[str]) -> Iterator[Note]:
                 )
 
 
-def _notes(keystore: OpenedKeystore, target: Path) -> Iterator[Note]:
-    """Yield a note for each enclave in ``target`` that the keystore does not have now."""
-    for name in search_enclaves(target)[0]:
+def _notes(keystore: OpenedKeystore, target: Path, names: Sequence[str]) -> Iterator[Note]:
+    """Yield notes on enclaves in ``target`` that the keystore lacks, or of other robots."""
+    present, fleet = search_enclaves(target)[0], load_fleet(keystore)
+    owners = {name: fleet and robot_of(fleet, name) for name in (*names, *present)}
+    exported = {robot.name for name in names if (robot := owners[name])}
+    of_others: dict[str, list[str]] = defaultdict(list)
+    for name in present:
+        owner = owners[name]
         if not keystore.has_enclave(name):
             yield Note(
                 "export.not-in-keystore",
                 f"'{target}' also has enclave {name}, which keystore '{keystore.root}' does not "
-                "have; if it was revoked, remove it from the robot, too: rm -r "
-                f"{quote(str(enclave_path(target, name)))}",
+                "have; if it was revoked, remove it from the robot, too: "
+                f"{_enclave_removal(target, [name], present)}",
             )
+        elif owner and exported and owner.name not in exported:
+            of_others[owner.name].append(name)
+    for robot, enclaves in of_others.items():
+        yield Note(
+            "export.of-another-robot",
+            f"'{target}' also has {first_few(enclaves, _SHOWN)} of robot {robot}: whoever has the "
+            f"folder can act as {robot}. If they are not meant to be there, remove them: "
+            f"`{_enclave_removal(target, enclaves, present)}`. If they were on another robot, give "
+            f"{robot} new keys: `sros renew {quote(str(keystore.root))} --robot {quote(robot)} "
+            "--new-key --revoke-old`.",
+        )
+
+
+def _enclave_removal(target: Path, names: Sequence[str], present: Sequence[str]) -> str:
+    """Return the command that removes enclaves from a folder, and no other enclave below them."""
+    nested = any(
+        other.startswith(f"{name}/") for name in names for other in {*present}.difference(names)
+    )
+    folders = (quote(str(enclave_path(target, name))) for name in names)
+    # Only files have a dot in their names.
+    return "rm " + " ".join(f"{folder}/*.*" if nested else f"-r {folder}" for folder in folders)
 
 
 @dataclass(frozen=True, slots=True)
