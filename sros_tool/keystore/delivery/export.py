@@ -197,8 +197,8 @@ def _readable_key_notes(target: Path, names: Sequence[str]) -> Iterator[Note]:
 def _notes(keystore: OpenedKeystore, target: Path, names: Sequence[str]) -> Iterator[Note]:
     """Yield notes on enclaves in ``target`` that the keystore lacks, or of other robots."""
     present, fleet = search_enclaves(target)[0], load_fleet(keystore)
-    owners = {name: fleet and robot_of(fleet, name) for name in (*names, *present)}
-    exported = {robot.name for name in names if (robot := owners[name])}
+    owners = {n: robot_of(fleet, n) if fleet else None for n in (*names, *present)}
+    exported = {owner.name for name in names if (owner := owners[name])}
     of_others: dict[str, list[str]] = defaultdict(list)
     for name in present:
         owner = owners[name]
