@@ -56,6 +56,7 @@ from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
     IDENTITY_CA_FILE,
     KEY_FILE,
+    PERMISSIONS,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
     REQUIRED_FILES,
@@ -97,7 +98,8 @@ class State(StrEnum):
     OFFLINE = "offline"
     """The robot has sent nothing for too long, whatever files it had then."""
     BROKEN = "broken"
-    """The file in the keystore is missing or cannot be read, so no export can be made."""
+    """The file in the keystore is missing, cannot be read, or is not as its CA signed it, so no
+    export can be made."""
     NEVER = "never"
     """The robot has sent no confirmation."""
     REFUSED = "refused"
@@ -127,7 +129,8 @@ FileKind = Annotated[str, Words((*_KINDS.values(), _ZENOH))]
 _AUTHORITIES = ("identity_ca", "permissions_ca")
 _EXPIRING = ("certificate", "permissions", "crl")
 """Kinds of files for which the ledger has the expiry of a robot's file."""
-_ISSUED = {"identity": ("certificate",), "permissions": ("permissions", "governance")}
+_SIGNED = ("permissions", "governance")
+_ISSUED = {"identity": ("certificate",), "permissions": _SIGNED}
 """The kinds of files that the CA of each role issues."""
 _LONGEST_SILENCE = timedelta(days=1)
 """Age of the last message from which a robot that fetches is offline, by default."""
@@ -175,7 +178,8 @@ class ConfirmedFile:
     Zenoh file (the ledger does not record earlier Zenoh files), or a file of another enclave of the
     robot; no file (``missing``); a file that
     the keystore did not issue (``unknown``); a ``revoked`` file; a file of ``another`` robot, or of
-    no robot. ``broken``: the file in the keystore is missing or cannot be read."""
+    no robot. ``broken``: the file in the keystore is missing, cannot be read, or is not as its CA
+    signed it."""
     since: str = ""
     """When the keystore issued the robot's file, in UTC; null if the ledger does not record it."""
     enclave: str = ""
@@ -607,8 +611,9 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
 class _Difference(NamedTuple):
     """A confirmed file that differs from the keystore.
 
-    ``confirmed`` is the SHA-256 of the robot's file, "" if the robot has none; ``certificates`` are
-    the SHA-256 of the certificates in the robot's file, ``present`` in the keystore's.
+    ``confirmed`` is the SHA-256 of the robot's file, "" if the robot has none, ``kept`` that of the
+    keystore's; ``certificates`` are the SHA-256 of the certificates in the robot's file,
+    ``present`` in the keystore's.
     ``exported`` says whether an export has a
     file at this path; None: the file in the keystore cannot be read.  ``is_own`` says whether the
     path belongs to an enclave of the robot.
@@ -620,6 +625,7 @@ class _Difference(NamedTuple):
     exported: bool | None
     is_own: bool
     present: tuple[str, ...] = ()
+    kept: str = ""
 
 
 class _ComparedRobot(NamedTuple):
@@ -728,12 +734,12 @@ def _compare(
                 certificates = file.certificates
             else:
                 certificates = confirmed.certificates.get(path, ())
-                at_keystore, present = (True, file.certificates) if file else (None, ())
-                different.append(
-                    _Difference(
-                        path, sha256, certificates, at_keystore, is_own=True, present=present
+                difference = _Difference(path, sha256, certificates, None, is_own=True)
+                if file:
+                    difference = difference._replace(
+                        exported=True, present=file.certificates, kept=file.sha256
                     )
-                )
+                different.append(difference)
             if kind in authorities:
                 authorities[kind].add(certificates)
             elif kind in expiring:
@@ -882,6 +888,9 @@ class _KeystoreRecords:
         )
         for robot in compared_robots:
             wanted_digests.update(*robot.expiring.values())
+            wanted_digests.update(
+                file.kept for file in robot.different if _kind_of(file.path) in _SIGNED
+            )
             if robot.different:
                 wanted_digests.update((stages.sealing_ca, stages.identity_ca))
         wanted_digests.discard("")  # of a file that the robot does not have
@@ -1146,12 +1155,26 @@ class _KeystoreRecords:
             surplus=difference.exported is False,
         )
 
+    def _is_edited(self, difference: _Difference, kind: str) -> bool:
+        """Return whether the keystore's file is not as it was issued or signed."""
+        if not difference.exported:
+            return False
+        if kind in (*_AUTHORITIES, "certificate"):
+            return not difference.present
+        if kind not in _SIGNED or difference.kept in self._issued:
+            return False
+        with suppress(SrosError):
+            data = self._keystore.read(difference.path, "document")
+            authorities = self._keystore.authority(PERMISSIONS)
+            return bool(self._keystore.files.signed(data).problem_for(authorities))
+        return True
+
     def _identify(self, difference: _Difference, kind: str, name: str) -> tuple[State, str, str]:
         """Return the state of a file, when the file was issued ("": unknown), and its enclave.
 
         The enclave is "" unless the file belongs to another enclave than ``name``.
         """
-        if difference.exported is None:
+        if difference.exported is None or self._is_edited(difference, kind):
             return State.BROKEN, "", ""
         if not difference.confirmed:
             return State.MISSING, "", ""

@@ -354,7 +354,10 @@ def test_files_that_the_keystore_never_issued(field: Field) -> None:
         file.write("\n")
     field.confirm("r1")
     assert field.pending("r1") == {"permissions": ("unknown", "deliver")}
-    (field.root / ENCLAVES / "r2/base/permissions.p7s").unlink()
+    kept = field.root / ENCLAVES / "r2/base/permissions.p7s"
+    kept.write_bytes(kept.read_bytes().replace(b"<publish>", b"<subscribe>"))
+    assert field.pending("r2") == {"permissions": ("broken", "deliver")}
+    kept.unlink()
     assert field.pending("r2") == {"permissions": ("broken", "deliver")}
     crl = f"{ENCLAVES}/r1/base/crl.pem"
     (field.folder / "r1" / crl).write_text("of a keystore that was lost")
