@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from sros_tool.demo.doctor import Diagnosis, SecurityProvider
     from sros_tool.distributions import Distribution
     from sros_tool.fleet.robots import Fleet
+    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.prometheus import Metric
     from sros_tool.proof.system import System
     from sros_tool.runtime.processes import MappedLibrary, RunningProcesses
@@ -502,6 +503,7 @@ def _circumstances(
     from sros_tool.keystore.layout import is_keystore
 
     fleet, read = None, []
+    opened: dict[Path, OpenedKeystore] = {}
     if fleet_file:
         from sros_tool.fleet.fleet_file import read_fleet
 
@@ -510,8 +512,9 @@ def _circumstances(
         from sros_tool.keystore.fleet import load_fleet
         from sros_tool.keystore.reader import OpenedKeystore
 
+        opened[paths[0]] = OpenedKeystore(paths[0])
         with suppress(SrosError):  # what is wrong with it is a finding
-            fleet = load_fleet(OpenedKeystore(paths[0]))
+            fleet = load_fleet(opened[paths[0]])
     for policy in policies:
         from sros_tool.fleet.expansion import FleetPolicy
         from sros_tool.policy.document import read_policy
@@ -523,7 +526,7 @@ def _circumstances(
             read.append(expanded.policy())
             fleet = fleet.with_enclaves(expanded.patterns)
     zone, wanted = local_zone(os.environ), domain_of(domain)
-    return Circumstances(moment_of(moment), zone, wanted, tuple(read), fleet=fleet)
+    return Circumstances(moment_of(moment), zone, wanted, tuple(read), fleet=fleet, opened=opened)
 
 
 def _stated_differences(paths: Sequence[Path], circumstances: Circumstances) -> Iterator[Finding]:
@@ -1001,7 +1004,6 @@ def metrics(
     """
     from sros_tool.checks.formats import keystore_metrics
     from sros_tool.checks.keystores.keystore import keystore_findings
-    from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.prometheus import KeystoreMetrics, render_metrics
 
     if output:
@@ -1014,7 +1016,7 @@ def metrics(
     known = advisories_of(advisories)
     circumstances = _circumstances(None, None, policies, fleet_file, (root,))
     with progress("examining"):
-        keystore = OpenedKeystore(root)
+        keystore = circumstances.keystore(root)
         findings = keystore_findings(keystore, circumstances)
         moment = circumstances.now
         gauges = keystore_metrics(keystore, findings, now=moment, each_enclave=not earliest)

@@ -52,6 +52,7 @@ from sros_tool.runtime.environment import COMPOSE, CONTAINER_FORMS, KUBERNETES, 
 from sros_tool.runtime.units import Job
 from sros_tool.terminal import echo, echo_document, echo_lines
 from sros_tool.values import FileChange
+from sros_tool.wording import first_few
 
 if TYPE_CHECKING:
     from sros_tool.enclave_environment import EnclaveEnvironment
@@ -588,7 +589,7 @@ def units(
     if passphrase:
         notes = [*notes, *passphrase_file_notes(Path(passphrase))]
     if Job.RENEW in jobs:
-        notes = [*notes, *_late_renewal_notes(root)]
+        notes = [*notes, *_late_renewal_notes(OpenedKeystore(root))]
     for job in jobs:
         files |= job_units(
             Job(job),
@@ -617,24 +618,48 @@ def units(
     print_notes(list(dict.fromkeys(notes)))
 
 
-def _late_renewal_notes(root: Path) -> Iterator[Note]:
+def _late_renewal_notes(keystore: OpenedKeystore) -> Iterator[Note]:
     """Yield a note if files expire so fast that the daily job may renew them too late."""
-    from sros_tool.validity import duration_text, elapsed, soon_limit
+    from sros_tool.validity import elapsed, soon_limit
 
-    template = OpenedKeystore(root).template
-    for what, validity in (
-        ("certificates", template.certificate_validity),
-        ("permissions", template.permissions_validity),
-    ):
+    for what, validity in _validities(keystore):
         # A day, the delay of the timer, and the delivery.
-        if isinstance(validity, timedelta) and soon_limit(validity) < timedelta(days=2):
+        if soon_limit(validity) < timedelta(days=2):
             text = (
-                f"{what} are valid for {duration_text(validity)}, and count as expiring soon only "
+                f"{what} are valid for {elapsed(validity)}, and count as expiring soon only "
                 f"in the last {elapsed(soon_limit(validity))}: the daily job renew may come "
                 "too late. Choose a validity of 6 days or more, or run the job more often "
                 "(`systemctl edit sros-renew.timer`: [Timer], OnCalendar=hourly)"
             )
             yield Note("units.renewal-late", text)
+
+
+def _validities(keystore: OpenedKeystore) -> Iterator[tuple[str, timedelta]]:
+    """Yield the validities that the settings choose, and the shortest one of files to be renewed.
+
+    A CA service, or the end of a CA, can make it shorter than the settings choose.
+    """
+    from sros_tool.keystore.expiry import survey
+
+    template = keystore.template
+    least = timedelta.max
+    for what, validity in (
+        ("certificates", template.certificate_validity),
+        ("permissions", template.permissions_validity),
+    ):
+        if isinstance(validity, timedelta):
+            least = min(least, validity)
+            yield what, validity
+    lifetimes, _ = survey(keystore) if keystore.names else ((), ())
+    validities = {
+        lifetime.name: min(lifetime.certificate.lifetime(), lifetime.permissions.lifetime())
+        for lifetime in lifetimes
+        if template.longest_validity(lifetime.name) is None
+    }
+    shortest = min(validities.values(), default=least)
+    if shortest < least:
+        names = [name for name, validity in validities.items() if validity == shortest]
+        yield f"files of {first_few(names, 3)}", shortest
 
 
 def _inbox(root: Path) -> tuple[str, ...]:

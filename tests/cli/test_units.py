@@ -101,10 +101,19 @@ def test_a_validity_that_is_too_short_for_the_daily_job(
 ) -> None:
     sros("create_keystore", tmp_path / "ks", "--permissions-validity", validity).ok()
     said = sros("units", tmp_path / "ks", "--job", "renew", tmp_path / "units").ok().err
+    days = validity[0]
     late = (
-        f"permissions are valid for {validity}, and count as expiring soon only in the last {limit}"
+        f"permissions are valid for {days} d, and count as expiring soon only in the last {limit}"
     )
     assert said.count("may come too late") == bool(limit) == (late in said)
+
+
+def test_files_with_a_shorter_validity_than_the_settings_choose(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--ca-validity", "4d").ok()
+    sros("create_enclave", root, "/a").ok()
+    said = sros("units", root, "--job", "renew", tmp_path / "units").ok().err
+    assert "files of /a are valid for 4 d, and count as expiring soon only in the last 1 d" in said
 
 
 def test_messages_are_collected_and_releases_published(made: Path, tmp_path: Path) -> None:
