@@ -12,6 +12,7 @@ import pytest
 
 from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
 from ansible_collections.sros.fleet.plugins.module_utils.verification import (
+    check_authorities,
     check_lists,
     clock_remark,
     same_trust,
@@ -29,6 +30,12 @@ from tests.support.harness import copy_of
 pytestmark = pytest.mark.skipif(not shutil.which("openssl"), reason="the program openssl is needed")
 
 NONE = ["no-such-program"]
+STAGES = ("ks", "revoked", "refreshed", "distribute", "reissue", "retire")
+OF_IDENTITY = (
+    "refreshed",
+    *(f"identity {stage}" for stage in ("distribute", "reissue", "revoked", "retire")),
+)
+"""What a robot gets in turn: in a rotation of both CAs, and of the identity CA."""
 
 
 @pytest.fixture(scope="module")
@@ -57,9 +64,17 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     for which, name in (("restored", "/d"), ("restored twice", "/b")):
         revoke(folder / "restored", [name], now=now)
         export(which, "/a", keystore="restored")
+    copy_of(folder / "ks", folder / "identity")
     for each in ("distribute", "reissue", "retire"):
         rotate_ca(folder / "ks", now=now)
         export(each, "/a", "/b")
+    later = now + timedelta(hours=1)
+    for each in ("distribute", "reissue", "revoked", "retire"):
+        if each == "revoked":
+            revoke(folder / "identity", ["/b"], now=later)
+        else:
+            rotate_ca(folder / "identity", roles=("identity",), now=later)
+        export(f"identity {each}", "/a", keystore="identity", at=later)
     return made
 
 
@@ -167,12 +182,13 @@ def test_no_older_list_takes_the_place_of_a_newer_one(
 ) -> None:
     """A home that was restored from a backup would let revoked enclaves be trusted again."""
     files = {what: files_of(folder) for what, folder in exports.items()}
-    stages = ["ks", "revoked", "refreshed", "distribute", "reissue", "retire"]
-    for before, after in [*pairwise(stages), ("revoked", "revoked")]:
+    for before, after in [*pairwise(STAGES), *pairwise(OF_IDENTITY), ("revoked", "revoked")]:
         assert check_lists(files[before], files[after], str(tmp_path)) == [], (before, after)
     for before, after, number in (
         ("revoked", "ks", "none"),
         ("reissue", "distribute", "the number"),
+        ("identity revoked", "identity reissue", "the number"),
+        ("identity revoked", "refreshed", "the number 2"),  # the list of the CA that is replaced
         ("revoked", "restored", "the number 1"),  # another list of the same number
         ("restored twice", "restored", "the number 1"),
     ):
@@ -183,6 +199,18 @@ def test_no_older_list_takes_the_place_of_a_newer_one(
     monkeypatch.setenv("PATH", "/nonexistent")
     with pytest.raises(RefusedError, match="lacks openssl"):
         check_lists(files["revoked"], files["ks"], str(tmp_path))
+
+
+def test_no_earlier_ca_takes_the_place_of_a_later_one(
+    exports: dict[str, Path], tmp_path: Path
+) -> None:
+    """Also if only one of both CAs was replaced after the backup of a home."""
+    files = {what: files_of(folder) for what, folder in exports.items()}
+    direct = ("refreshed", OF_IDENTITY[-1])
+    for before, after in [*pairwise(STAGES), *pairwise(OF_IDENTITY), direct]:
+        check_authorities(files[before], files[after], str(tmp_path))
+    with pytest.raises(RefusedError, match=r"a later CA in identity_ca.cert.pem of /a than"):
+        check_authorities(files[OF_IDENTITY[-1]], files["refreshed"], str(tmp_path))
 
 
 def test_processes_trust_the_same_after_a_list_was_only_signed_again(

@@ -5,14 +5,16 @@ And whether their revocation lists are older than those that the robot has: aske
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import json
 import os
 import re
 import shutil
+import ssl
 import subprocess
 import time
-from typing import Callable, NamedTuple
+from typing import Callable, Iterable, NamedTuple
 
 from ansible_collections.sros.fleet.plugins.module_utils.exports import (
     AUTHORITY_FILES,
@@ -23,6 +25,7 @@ from ansible_collections.sros.fleet.plugins.module_utils.exports import (
     TRUST_FILES,
     Files,
     RefusedError,
+    authorities,
     enclaves_in,
     folder_of,
 )
@@ -38,6 +41,7 @@ _CERTIFICATE, _LIST = (
     re.compile(rb"-----BEGIN %b-----[A-Za-z0-9+/=\s]+-----END %b-----\n?" % (label, label))
     for label in (b"CERTIFICATE", b"X509 CRL")
 )
+_TRUST = AUTHORITY_FILES[0]
 _MOST_LISTS = 8
 _NUMBER = re.compile(r"X509v3 CRL Number: (?:critical)?\s+(\w+)")
 _SERIAL = re.compile(r"^ {4}Serial Number: (\w+)", re.MULTILINE)
@@ -87,31 +91,84 @@ def check_lists(before: Files, after: Files, spare: str) -> list[str]:
     Raises:
         RefusedError: a new list is older, or missing; revoked enclaves would be trusted again.
     """
-    newest, remarks = _newest_list(after, spare), {}
+    lists, remarks = _newest_lists(after, spare), {}
     for name in sorted(set(enclaves_in(before)) & set(enclaves_in(after))):
-        present = newest(before, name)
-        new = newest(after, name) if present else None
-        if not present or new == present:
-            continue
-        if not new or new.number <= present.number:
-            number = f"the number {new.number}" if new else "none"
-            raise RefusedError(
-                f"The revocation list for {name} is older than the one of this robot, which has the"
-                f" number {present.number}; the keystore has {number}. Revoked enclaves would be"
-                f" trusted again. The keystore may come from a backup: copy crl.pem of {name} on"
-                " this robot to the keystore machine, run `sros crl KEYSTORE --refresh --crl FILE`"
-                " with this copy, and deliver again. If the older list is right, set"
-                " allow_older_lists (sros_allow_older_lists)."
-            )
-        lost = present.serials - new.serials
-        if lost and present.authority == new.authority:
-            remarks[present] = (
-                f"The current revocation list has {len(lost)} serial numbers that the new one"
-                f" lacks, such as {min(lost)}. This is right if these certificates have expired,"
-                " but not if the keystore comes from a backup: then take the list over from another"
-                " robot, with `sros crl KEYSTORE --refresh --crl FILE`."
-            )
+        found = lists(after, name)
+        for authority, present in lists(before, name).items():
+            if remark := _remark_on_lost(name, present, found.get(authority)):
+                remarks[present] = remark
     return list(remarks.values())
+
+
+def _remark_on_lost(name: str, present: _List, new: _List | None) -> str:
+    """Return a remark on what a new list of the same CA lacks, or ""."""
+    if new and new.text == present.text:
+        return ""
+    if not new or new.number <= present.number:
+        number = f"the number {new.number}" if new else "none"
+        raise RefusedError(
+            f"The revocation list for {name} is older than the one of this robot, which has the"
+            f" number {present.number}; the keystore has {number}. Revoked enclaves would be"
+            f" trusted again. The keystore may come from a backup: copy {present.file} of {name} on"
+            " this robot to the keystore machine, run `sros crl KEYSTORE --refresh --crl FILE`"
+            " with this copy, and deliver again. If the older list is right, set"
+            " allow_older_lists (sros_allow_older_lists)."
+        )
+    lost = present.serials - new.serials
+    if not lost:
+        return ""
+    return (
+        f"The current revocation list has {len(lost)} serial numbers that the new one"
+        f" lacks, such as {min(lost)}. This is right if these certificates have expired,"
+        " but not if the keystore comes from a backup: then take the list over from another"
+        " robot, with `sros crl KEYSTORE --refresh --crl FILE`."
+    )
+
+
+def check_authorities(before: Files, after: Files, spare: str) -> None:
+    """Raise `RefusedError` if an enclave would trust only earlier CAs of a role than now.
+
+    In a rotation, each stage has a CA that the stage before had, and a CA is later than the CA that
+    it replaces.  The arguments are those of `check_lists`.
+    """
+    if not authorities(before) & authorities(after):
+        return  # another keystore, which is refused otherwise
+    for name in sorted(set(enclaves_in(before)) & set(enclaves_in(after))):
+        for file in AUTHORITY_FILES:
+            path = folder_of(name) + "/" + file
+            present, new = (
+                {b"".join(block.split()): block for block in _CERTIFICATE.findall(content)}
+                for content in (before.get(path, b""), after[path])
+            )
+            if set(present) & set(new):
+                continue
+            latest = [_latest_start(blocks.values(), spare) for blocks in (present, new)]
+            if latest[0] > latest[1]:
+                raise RefusedError(
+                    f"This robot has a later CA in {file} of {name} than the keystore. It would"
+                    " trust the earlier CA again, and what was revoked since. Nothing was changed."
+                    " The keystore may come from a backup: docs/howto/keystore_is_lost.md of sros"
+                    " says how to go on. If the keystore's CA is right, set replace_authorities"
+                    " (sros_replace_authorities)."
+                )
+
+
+def _latest_start(authorities: Iterable[bytes], spare: str) -> float:
+    """Return when the validity of the last CA (PEM) began, in seconds since 1970; 0 for none."""
+    openssl, path = shutil.which("openssl"), os.path.join(spare, "ca.pem")
+    moments = [0.0]
+    for authority in list(authorities)[:_MOST_LISTS]:
+        if not openssl:
+            raise RefusedError(
+                "CAs cannot be compared: this robot lacks openssl. Install the package openssl on"
+                " it."
+            )
+        with open(path, "wb") as file:
+            file.write(authority)
+        done = _run([openssl, "x509", "-in", path, "-noout", "-startdate"])
+        with contextlib.suppress(ValueError):  # a damaged certificate, which nobody trusts
+            moments.append(ssl.cert_time_to_seconds(done.stdout.decode().strip().partition("=")[2]))
+    return max(moments)
 
 
 def same_trust(before: Files, after: Files, spare: str) -> set[str]:
@@ -120,48 +177,62 @@ def same_trust(before: Files, after: Files, spare: str) -> set[str]:
     Of a revocation list that a CA of the new files signed, only what it revokes counts.  The
     arguments are those of `check_lists`.
     """
-    newest, same = _newest_list(after, spare), set()
+    lists, same = _newest_lists(after, spare), set()
     for name in set(enclaves_in(before)) & set(enclaves_in(after)):
         paths = [f"{folder_of(name)}/{file}" for file in TRUST_FILES]
         different = [path for path in paths if before.get(path) != after.get(path)]
         if different == [f"{folder_of(name)}/crl.pem"] and shutil.which("openssl"):
             contents = [files.get(different[0], b"") for files in (before, after)]
-            present, new = (newest(files, name) for files in (before, after))
+            present, new = (
+                {authority: found.serials for authority, found in lists(files, name).items()}
+                for files in (before, after)
+            )
             alone = all(len(_LIST.findall(content)) == 1 for content in contents)
-            if alone and present and new and present.serials == new.serials:
+            if alone and present and present == new:
                 different = []
         if not different:
             same.add(name)
     return same
 
 
-def _newest_list(after: Files, spare: str) -> Callable[[Files, str], _List | None]:
-    """Return a function for the newest list of an enclave that a CA of the new files signed."""
+def _newest_lists(after: Files, spare: str) -> Callable[[Files, str], dict[bytes, _List]]:
+    """Return a function for the newest list of an enclave by each CA of the new files (PEM).
+
+    In a rotation, the list of the second CA is in the file of the CAs.
+    """
     asked: dict[tuple, _List | None] = {}
 
-    def newest(files: Files, name: str) -> _List | None:
-        path, trust = (f"{folder_of(name)}/{file}" for file in ("crl.pem", AUTHORITY_FILES[0]))
-        known = []
-        for block in _LIST.findall(files.get(path, b""))[:_MOST_LISTS]:
-            for authority in _CERTIFICATE.findall(after.get(trust, b""))[:_MOST_LISTS]:
-                if (block, authority) not in asked:
-                    asked[block, authority] = _read_list(block, authority, spare)
-                known.append(asked[block, authority])
-        return max(filter(None, known), default=None)
+    def newest(files: Files, name: str) -> dict[bytes, _List]:
+        found: dict[bytes, _List] = {}
+        for authority in _CERTIFICATE.findall(_content(after, name, _TRUST))[:_MOST_LISTS]:
+            known = []
+            for file in ("crl.pem", _TRUST):
+                for block in _LIST.findall(_content(files, name, file))[:_MOST_LISTS]:
+                    if (block, authority) not in asked:
+                        asked[block, authority] = _read_list(block, authority, file, spare)
+                    known.append(asked[block, authority])
+            last = max(filter(None, known), default=None)
+            if last:
+                found[authority] = last
+        return found
 
     return newest
 
 
+def _content(files: Files, name: str, file: str) -> bytes:
+    return files.get(folder_of(name) + "/" + file, b"")
+
+
 class _List(NamedTuple):
-    """A revocation list and its CA, both in PEM, and its number and the serial numbers on it."""
+    """A revocation list: its number, its PEM, its serial numbers, and the file that has it."""
 
     number: int
     text: bytes
-    authority: bytes
     serials: frozenset
+    file: str
 
 
-def _read_list(block: bytes, authority: bytes, spare: str) -> _List | None:
+def _read_list(block: bytes, authority: bytes, name: str, spare: str) -> _List | None:
     """Return a revocation list (PEM) if a CA (PEM) signed it, else None."""
     openssl = shutil.which("openssl")
     if not openssl:
@@ -180,7 +251,7 @@ def _read_list(block: bytes, authority: bytes, spare: str) -> _List | None:
     text = _run([*command, "-text"]).stdout.decode(errors="replace")
     number = _NUMBER.search(text)
     serials = frozenset(_SERIAL.findall(text))
-    return _List(int(number.group(1), 0) if number else 0, block, authority, serials)
+    return _List(int(number.group(1), 0) if number else 0, block, serials, name)
 
 
 def _by_sros(folder: str, enclaves: list[str], program: list[str]) -> dict:

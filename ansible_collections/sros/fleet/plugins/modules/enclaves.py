@@ -56,7 +56,8 @@ options:
     type: str
   replace_authorities:
     description:
-      - Also install enclaves of another keystore, which share no CA with the current ones.
+      - Also install enclaves of another keystore, which share no CA with the current ones, and
+        enclaves that trust only an earlier CA than the current ones.
     type: bool
     default: false
   allow_older_lists:
@@ -169,6 +170,7 @@ from ansible_collections.sros.fleet.plugins.module_utils.exports import (
 )
 from ansible_collections.sros.fleet.plugins.module_utils.places import Place
 from ansible_collections.sros.fleet.plugins.module_utils.verification import (
+    check_authorities,
     check_lists,
     clock_remark,
     same_trust,
@@ -225,6 +227,8 @@ def _run(module: AnsibleModule, now: float) -> dict:
         after = _after(before, sent)
         # The folder of this user alone.
         with tempfile.TemporaryDirectory(dir=module.tmpdir) as spare:
+            if not asked["replace_authorities"]:
+                check_authorities(before, after, spare)
             remarks = [] if asked["allow_older_lists"] else check_lists(before, after, spare)
             same = same_trust(before, after, spare)
         result = _install(place, before, after, asked, now, same=same, check=module.check_mode)
