@@ -61,9 +61,10 @@ from sros_tool.pki.certificates import (
     load_certificates,
     load_request,
     make_request,
+    pem,
     validity_of,
 )
-from sros_tool.pki.crl import last_update, list_number, newest_list, next_update, read_lists
+from sros_tool.pki.crl import last_update, newest_list, newest_revocations, next_update, read_lists
 from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem, load_key
 from sros_tool.validity import iso
 from sros_tool.wording import enumerated
@@ -71,6 +72,9 @@ from sros_tool.wording import enumerated
 _OPTIONAL = (*OPTIONAL_FILES, *ZENOH_FILES)
 _OF_ENCLAVE = (*sorted(RELEASE_FILES), *KEY_FILES, REQUEST, SEAL)
 """The files that are removed together with their enclave."""
+_LISTS = (CRL_FILE, IDENTITY_CA_FILE)
+"""The files with revocation lists: in a rotation, that of the second CA is in the file of the CAs.
+"""
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -138,7 +142,8 @@ def install_release(
     _check_release(folder, present, release, robot, installed, pinned)
     enclaves = release.enclaves()
     with Folder(folder) as opened:
-        _check_lists(opened, enclaves)
+        for name, files in enclaves.items():
+            _check_lists(name, files, _present_lists(opened, name))
         changes: dict[str, _Change] = {}
         kept: dict[str, str] = {}
         for name, files in sorted(enclaves.items()):
@@ -260,34 +265,39 @@ def _pinned(release: Release, pinned: frozenset[str]) -> Iterator[x509.Certifica
                     yield authority
 
 
-def _check_lists(folder: Folder, enclaves: Mapping[str, Mapping[str, bytes]]) -> None:
+def _check_lists(name: str, files: Mapping[str, bytes], present: Mapping[str, bytes]) -> None:
     """Raise `KeystoreError` if a revocation list in the release is older than the list here.
 
+    ``files`` are the files of an enclave in the release, ``present`` those here that have lists.
     The owner of the folder can write anything into it, so only lists count that are signed by a CA
     which the release trusts.
     """
-    for name, files in enclaves.items():
-        authorities = files.get(IDENTITY_CA_FILE, b"")
-        path = f"{enclave_folder(name)}/{CRL_FILE}"
-        try:
-            present = newest_list(folder.read_inside(path), authorities)
-        except (SrosError, OSError):
-            continue  # nothing that a process could load
-        sent = newest_list(files.get(CRL_FILE, b""), authorities)
-        if present is None or sent == present:
-            continue
-        number = list_number(present)
-        if sent is None or list_number(sent) <= number:
-            has = "none" if sent is None else f"the number {list_number(sent)}"
+    lists = [[source.get(file, b"") for file in _LISTS] for source in (present, files)]
+    authorities: Sequence[x509.Certificate] = ()
+    with suppress(SrosError):  # a damaged file keeps its enclave from changing
+        authorities = load_certificates(files.get(IDENTITY_CA_FILE, b""), IDENTITY_CA_FILE)
+    for authority in authorities:
+        listed, new = (newest_revocations(pem(authority), *of_source) for of_source in lists)
+        if listed != new and listed.number >= new.number:
+            has = "none" if new.number < 0 else f"the number {new.number}"
             raise KeystoreError(
                 f"the revocation list for {name} in the release is older than the list here",
-                f"The current list has the number {number}, the release has {has}: revoked "
+                f"The current list has the number {listed.number}, the release has {has}: revoked "
                 "enclaves would be trusted again. Either the server has an old copy, or the "
                 "keystore comes from a backup. Nothing was changed.",
                 "Look at what the server serves, and publish there again. Only if the keystore "
                 "comes from a backup, first run `sros fleet collect KEYSTORE INBOX`, which takes "
                 "the list from the message of this robot.",
             )
+
+
+def _present_lists(folder: Folder, name: str) -> dict[str, bytes]:
+    """Return the files of an enclave that may have revocation lists, as far as it has them."""
+    present: dict[str, bytes] = {}
+    for file in _LISTS:
+        with suppress(SrosError, OSError):  # else nothing that a process could load
+            present[file] = folder.read_inside(f"{enclave_folder(name)}/{file}")
+    return present
 
 
 def release_time(release: Release) -> datetime | None:

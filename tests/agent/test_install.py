@@ -395,6 +395,22 @@ def test_a_pinned_ca_that_was_replaced_is_not_trusted_again(
     assert f"`sros rotate_ca KEYSTORE{options} --finish" in done.kept["/r1/a"]
 
 
+def test_the_list_of_the_second_ca_is_not_replaced_by_an_older_one(
+    home: Home, robot: Path, tmp_path: Path
+) -> None:
+    """In a rotation, it is in the file of the CAs."""
+    root, backup = (copy_of(home.root, tmp_path / name) for name in ("home", "backup"))
+    for _ in range(2):
+        rotate_ca(root, roles=["identity"], now=moment())
+    sros("revoke", root, "/r1/b").ok()
+    names = ("/r1/a", "/r1/c")
+    install_release(robot, release_of(files_of(root, names), 4, home.authority), "r1", now=moment())
+    before = content(robot)
+    with pytest.raises(KeystoreError, match="is older than the list here"):
+        install_release(robot, release_of(files_of(backup), 5, home.authority), "r1", now=moment())
+    assert content(robot) == before
+
+
 def older_a(home: Home) -> dict[str, bytes]:
     """Return the files of /r1/a as first delivered, with the current revocation list."""
     return {path: data for path, data in home.first.files.items() if in_one_of(path, ("/r1/a",))}

@@ -209,8 +209,9 @@ def test_no_earlier_ca_takes_the_place_of_a_later_one(
     direct = ("refreshed", OF_IDENTITY[-1])
     for before, after in [*pairwise(STAGES), *pairwise(OF_IDENTITY), direct]:
         check_authorities(files[before], files[after], str(tmp_path))
-    with pytest.raises(RefusedError, match=r"a later CA in identity_ca.cert.pem of /a than"):
-        check_authorities(files[OF_IDENTITY[-1]], files["refreshed"], str(tmp_path))
+    for backup in ("refreshed", "identity distribute", "identity reissue"):
+        with pytest.raises(RefusedError, match=r"a later CA in identity_ca.cert.pem of /a than"):
+            check_authorities(files[OF_IDENTITY[-1]], files[backup], str(tmp_path))
 
 
 def test_processes_trust_the_same_after_a_list_was_only_signed_again(

@@ -14,7 +14,7 @@ import shutil
 import ssl
 import subprocess
 import time
-from typing import Callable, Iterable, NamedTuple
+from typing import Callable, NamedTuple
 
 from ansible_collections.sros.fleet.plugins.module_utils.exports import (
     AUTHORITY_FILES,
@@ -42,7 +42,7 @@ _CERTIFICATE, _LIST = (
     for label in (b"CERTIFICATE", b"X509 CRL")
 )
 _TRUST = AUTHORITY_FILES[0]
-_MOST_LISTS = 8
+_MOST = 8
 _NUMBER = re.compile(r"X509v3 CRL Number: (?:critical)?\s+(\w+)")
 _SERIAL = re.compile(r"^ {4}Serial Number: (\w+)", re.MULTILINE)
 
@@ -126,10 +126,10 @@ def _remark_on_lost(name: str, present: _List, new: _List | None) -> str:
 
 
 def check_authorities(before: Files, after: Files, spare: str) -> None:
-    """Raise `RefusedError` if an enclave would trust only earlier CAs of a role than now.
+    """Raise `RefusedError` if an enclave would trust again a CA that a later one has replaced.
 
-    In a rotation, each stage has a CA that the stage before had, and a CA is later than the CA that
-    it replaces.  The arguments are those of `check_lists`.
+    A CA is later than the CA that it replaces (`retired_authorities` of sros).  The arguments are
+    those of `check_lists`.
     """
     if not authorities(before) & authorities(after):
         return  # another keystore, which is refused otherwise
@@ -137,13 +137,14 @@ def check_authorities(before: Files, after: Files, spare: str) -> None:
         for file in AUTHORITY_FILES:
             path = folder_of(name) + "/" + file
             present, new = (
-                {b"".join(block.split()): block for block in _CERTIFICATE.findall(content)}
+                {b"".join(block.split()): block for block in _CERTIFICATE.findall(content)[:_MOST]}
                 for content in (before.get(path, b""), after[path])
             )
-            if set(present) & set(new):
+            added = [new[key] for key in set(new) - set(present)]
+            if not (added and present):
                 continue
-            latest = [_latest_start(blocks.values(), spare) for blocks in (present, new)]
-            if latest[0] > latest[1]:
+            newest = max(_start(block, spare) for block in present.values())
+            if any(_start(block, spare) < newest for block in added):
                 raise RefusedError(
                     f"This robot has a later CA in {file} of {name} than the keystore. It would"
                     " trust the earlier CA again, and what was revoked since. Nothing was changed."
@@ -153,22 +154,19 @@ def check_authorities(before: Files, after: Files, spare: str) -> None:
                 )
 
 
-def _latest_start(authorities: Iterable[bytes], spare: str) -> float:
-    """Return when the validity of the last CA (PEM) began, in seconds since 1970; 0 for none."""
+def _start(authority: bytes, spare: str) -> float:
+    """Return when the validity of a CA (PEM) began, in seconds since 1970; 0 if it is damaged."""
     openssl, path = shutil.which("openssl"), os.path.join(spare, "ca.pem")
-    moments = [0.0]
-    for authority in list(authorities)[:_MOST_LISTS]:
-        if not openssl:
-            raise RefusedError(
-                "CAs cannot be compared: this robot lacks openssl. Install the package openssl on"
-                " it."
-            )
-        with open(path, "wb") as file:
-            file.write(authority)
-        done = _run([openssl, "x509", "-in", path, "-noout", "-startdate"])
-        with contextlib.suppress(ValueError):  # a damaged certificate, which nobody trusts
-            moments.append(ssl.cert_time_to_seconds(done.stdout.decode().strip().partition("=")[2]))
-    return max(moments)
+    if not openssl:
+        raise RefusedError(
+            "CAs cannot be compared: this robot lacks openssl. Install the package openssl on it."
+        )
+    with open(path, "wb") as file:
+        file.write(authority)
+    done = _run([openssl, "x509", "-in", path, "-noout", "-startdate"])
+    with contextlib.suppress(ValueError):
+        return ssl.cert_time_to_seconds(done.stdout.decode().strip().partition("=")[2])
+    return 0.0
 
 
 def same_trust(before: Files, after: Files, spare: str) -> set[str]:
@@ -204,10 +202,10 @@ def _newest_lists(after: Files, spare: str) -> Callable[[Files, str], dict[bytes
 
     def newest(files: Files, name: str) -> dict[bytes, _List]:
         found: dict[bytes, _List] = {}
-        for authority in _CERTIFICATE.findall(_content(after, name, _TRUST))[:_MOST_LISTS]:
+        for authority in _CERTIFICATE.findall(_content(after, name, _TRUST))[:_MOST]:
             known = []
             for file in ("crl.pem", _TRUST):
-                for block in _LIST.findall(_content(files, name, file))[:_MOST_LISTS]:
+                for block in _LIST.findall(_content(files, name, file))[:_MOST]:
                     if (block, authority) not in asked:
                         asked[block, authority] = _read_list(block, authority, file, spare)
                     known.append(asked[block, authority])

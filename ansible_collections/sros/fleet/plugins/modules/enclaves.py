@@ -57,7 +57,7 @@ options:
   replace_authorities:
     description:
       - Also install enclaves of another keystore, which share no CA with the current ones, and
-        enclaves that trust only an earlier CA than the current ones.
+        enclaves that trust an earlier CA again.
     type: bool
     default: false
   allow_older_lists:
