@@ -159,6 +159,41 @@ def test_a_replaced_ca_does_not_replace_the_one_after_it(fleet: Path, tmp_path: 
     assert distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True).changes
 
 
+def test_no_ca_is_trusted_again_after_a_rotation_of_one_role(fleet: Path, tmp_path: Path) -> None:
+    """Nor with a backup that knows the later CA, but still trusts the earlier one."""
+    robot, backup = tmp_path / "robot", tmp_path / "backup"
+    for hours in range(3):
+        rotate_ca(fleet, roles=("identity",), now=NOW + timedelta(hours=hours))
+        distribute(OpenedKeystore(fleet), ["/base"], robot, now=NOW, force=hours > 0)
+        if hours == 1:
+            copy_of(fleet, backup)
+    with pytest.raises(KeystoreError, match="has a later identity CA than the keystore's"):
+        distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True)
+
+
+@pytest.mark.parametrize("kept", ["key.pem", "request.pem", "cert.pem"])
+def test_a_certificate_for_an_earlier_key_of_the_robot_is_not_exported(
+    kept: str, fleet: Path, tmp_path: Path
+) -> None:
+    """The robot has another key since the backup, in a file or on a token."""
+    robot, backup = tmp_path / "robot", copy_of(fleet, tmp_path / "backup")
+    made = create_request(robot, BORN)
+    sign_request(fleet, made.file.read_bytes(), now=NOW, renew=True)
+    place = robot / "enclaves/arm/eye"
+    distribute(OpenedKeystore(fleet), [BORN], robot, now=NOW, keyless=True)
+    if kept != "key.pem":
+        (place / "key.pem").unlink()
+        (place / "key.p11").write_text("pkcs11:token=robot;object=eye\n")
+    if kept == "cert.pem":
+        (place / "request.pem").unlink()
+    before = snapshot(robot)
+    with pytest.raises(KeystoreError, match="the certificate is not for the key in"):
+        distribute(OpenedKeystore(backup), [BORN], robot, now=NOW, keyless=True, force=True)
+    assert snapshot(robot) == before
+    renew(fleet, [BORN], now=NOW)
+    assert distribute(OpenedKeystore(fleet), [BORN], robot, now=NOW, keyless=True, force=True)
+
+
 # ── selection ──────────────────────────────────────────────────────────────────────────────
 
 

@@ -33,6 +33,7 @@ from sros_tool.keystore.known_keys import (
 )
 from sros_tool.keystore.layout import (
     AGENT,
+    CERTIFICATE_FILE,
     CRL_FILE,
     ENCLAVES,
     GOVERNANCE_FILE,
@@ -46,6 +47,7 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
     PRIVATE,
+    REQUEST,
     REQUIRED_FILES,
     ZENOH_FILES,
     check_readable,
@@ -70,12 +72,14 @@ from sros_tool.pki.certificates import (
     authority_text,
     digest,
     fingerprints,
+    load_certificate,
     load_certificates,
+    load_request,
     pem,
     validity_of,
 )
 from sros_tool.pki.crl import newest_revocations
-from sros_tool.pki.keys import holds_private_key
+from sros_tool.pki.keys import holds_private_key, load_any_key
 from sros_tool.pki.token import read_token_file
 from sros_tool.validity import iso
 from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes, Words
@@ -536,6 +540,7 @@ def _write_folder(
     check_same_authority(target, files)
     _check_robot(keystore, target, files)
     _check_trust(keystore, target, lambda path: _content(target / path), files, now)
+    _check_own_keys(target, files)
     stale = _stale_paths(target, files)
     different = {
         path: data
@@ -576,6 +581,44 @@ def _check_robot(keystore: OpenedKeystore, target: Path, files: Mapping[str, byt
             )
 
 
+def _check_own_keys(target: Path, files: Mapping[str, bytes]) -> None:
+    """Raise `KeystoreError` if a certificate is not for the key that stays in ``target``.
+
+    The key on a token is that of the signing request, or else of the present certificate.
+    """
+    for path, data in files.items():
+        folder, _, file = path.rpartition("/")
+        token_file = files.get(f"{folder}/{KEY_URI_FILE}", b"")
+        if (
+            file != CERTIFICATE_FILE
+            or f"{folder}/{KEY_FILE}" in files
+            or (token_file and token_file != _content(target / folder / KEY_URI_FILE))
+        ):
+            continue
+        key = _public_key(target / folder)
+        if key and key != load_certificate(data, path).public_key():
+            raise KeystoreError(
+                f"the certificate is not for the key in '{target / folder}'",
+                "No process would start with it. The keystore knows only an earlier key, perhaps "
+                "because it comes from a backup. Nothing was changed.",
+                f"{_ANSWER_AGAIN} If the keystore's certificate is right, remove the key first.",
+            )
+
+
+def _public_key(folder: Path) -> object:
+    """Return the public key of an enclave on a robot; None if it cannot be read."""
+    readers: Mapping[str, Callable[[bytes, str], object]] = {
+        KEY_FILE: lambda data, path: load_any_key(data, path).public_key(),
+        REQUEST: lambda data, path: load_request(data, path).public_key,
+        CERTIFICATE_FILE: lambda data, path: load_certificate(data, path).public_key(),
+    }
+    for file, read in readers.items():
+        if data := _content(folder / file):
+            with suppress(SrosError):
+                return read(data, str(folder / file))
+    return None
+
+
 def _check_trust(
     keystore: OpenedKeystore,
     target: Path,
@@ -592,8 +635,9 @@ def _check_trust(
         role = _ROLES_OF_FILES[path.rpartition("/")[2]]
         raise KeystoreError(
             f"'{target / path}' has a later {role} CA than the keystore's",
-            f"It trusts {authority_text(authority)}, which the keystore does not know: the robot "
-            "would trust the earlier CA again, and what was revoked since. Nothing was changed.",
+            f"It trusts {authority_text(authority)}, and the keystore is from before that: the "
+            "robot would trust the earlier CA again, and what was revoked since. Nothing was "
+            "changed.",
             "The keystore may come from a backup: docs/howto/keystore_is_lost.md says how to go "
             f"on. If the keystore's CA is right, first {_removal_of(target, later)}",
         )
@@ -625,10 +669,12 @@ def _later_authorities(
 ) -> Mapping[str, x509.Certificate]:
     """Map paths of CA files in ``present`` to a CA in them that replaced the keystore's.
 
-    That is a CA with another key, at least as late as the CAs in ``files``, that the ledger does
-    not have: the keystore is from before a rotation.
+    The keystore is from before a stage of a rotation.  If the ledger has both CAs, it says which
+    replaced which; a CA that the ledger does not have is the later one if it is not older than all
+    CAs in ``files``.
     """
-    recorded = {e.sha256 for e in keystore.ledger_with("what", "ca").entries if e.what == "ca"}
+    entries = [e for e in keystore.ledger_with("what", "ca").entries if e.what == "ca"]
+    place_in_ledger = {entry.sha256: place for place, entry in enumerate(entries)}
     later: dict[str, x509.Certificate] = {}
     for path, data in files.items():
         if path.rpartition("/")[2] not in _ROLES_OF_FILES or present(path) in (data, b""):
@@ -636,10 +682,19 @@ def _later_authorities(
         sent = load_certificates(data, path)
         newest = max(validity_of(authority).not_before for authority in sent)
         with suppress(SrosError):  # a damaged file trusts nobody
-            for authority in load_certificates(present(path), path):
+            trusted = load_certificates(present(path), path)
+            keys, kept = set(map(authority_key, trusted)), set(map(authority_key, sent))
+            added = [
+                place_in_ledger.get(digest(authority), len(entries))
+                for authority in sent
+                if authority_key(authority) not in keys
+            ]
+            for authority in trusted:
+                place = place_in_ledger.get(digest(authority))
                 if (
-                    authority_key(authority) not in map(authority_key, sent)
-                    and digest(authority) not in recorded
+                    any(place > other for other in added)
+                    if place is not None
+                    else authority_key(authority) not in kept
                     and validity_of(authority).not_before >= newest
                 ):
                     later[path] = authority
