@@ -16,7 +16,8 @@
 // else "unmatched"; "peer denied" if the peer may not open it.  The line that lacks when the process
 // ends is that of the case at which it crashed.
 //
-// With a domain as argument, it is the program of fastdds_probe.hpp.
+// With a domain as argument, it is the program of fastdds_probe.hpp; with a domain and a folder, a
+// participant of this enclave: it says joined, and logs, until standard input ends.
 
 #include "fastdds_probe.hpp"
 
@@ -221,10 +222,25 @@ std::string answer(const std::vector<std::string>& fields)
     return said;
 }
 
+int stay(std::uint32_t domain, const std::string& folder)
+{
+    fast::Log::SetVerbosity(fast::Log::Kind::Warning);
+    Party self(domain, folder, folder);
+    std::cout << (self.participant ? "joined" : "refused") << std::endl;
+    while (std::cin.get() != std::istream::traits_type::eof())
+    {
+    }
+    return self.participant ? 0 : 1;
+}
+
 int main(int count, char** arguments)
 {
-    fast::Log::ClearConsumers();  // it writes to standard output
     use_sockets();
+    if (count > 2)
+    {
+        return stay(static_cast<std::uint32_t>(std::stoul(arguments[1])), arguments[2]);
+    }
+    fast::Log::ClearConsumers();  // it writes to standard output
     if (count > 1)
     {
         return probing::probe(static_cast<std::uint32_t>(std::stoul(arguments[1])));
