@@ -55,7 +55,7 @@ def meet(program: Path, feign: Path, folder: Path) -> tuple[int, str]:
     said = folder / "said"
 
     def begin(who: str, **more: Any) -> subprocess.Popen[bytes]:
-        words = [program, "0", folder / who]
+        words = [str(program), "0", str(folder / who)]
         return subprocess.Popen(words, stdin=subprocess.PIPE, stderr=subprocess.STDOUT, **more)
 
     with said.open("w") as out, begin("node", stdout=out) as node:
