@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from ansible_collections.sros.fleet.plugins.module_utils.verification import verify
 from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.keystores.opened import Circumstances
@@ -384,6 +385,22 @@ def test_another_moment(days: int, text: str, arrived: Path) -> None:
     arrival = verify_arrival(arrived, now=NOW + timedelta(days=days))
     assert any(text in each.text for each in arrival.findings)
     assert not any(each.loadable for each in arrival.enclaves)
+
+
+def test_a_certificate_that_is_not_for_the_key_on_a_token(fleet: Path, tmp_path: Path) -> None:
+    """No token is opened; the request, which has its key, shows it."""
+    robot, place = tmp_path / "robot", tmp_path / "robot/enclaves/arm/eye"
+    distribute(OpenedKeystore(fleet), [BORN], robot, now=NOW, keyless=True)
+    (place / "key.p11").write_text("pkcs11:token=robot;object=eye\n")
+    for made_in in (fleet, tmp_path / "other"):
+        if made_in != fleet:
+            create_request(made_in, BORN)
+        shutil.copy(made_in / "enclaves/arm/eye/request.pem", place)
+        found = {finding.id for finding in verify_arrival(robot, now=NOW).findings}
+        assert ("enclave.token-key" in found) is (made_in != fleet)
+        for program in ("sros", "none"):
+            verified = verify(str(robot), [BORN], [program])
+            assert verified["ok"] is (made_in == fleet), verified
 
 
 def test_another_domain(arrived: Path) -> None:

@@ -29,6 +29,7 @@ from sros_tool.keystore.layout import (
     KEY_URI_FILE,
     LEDGER,
     OPTIONAL_FILES,
+    REQUEST,
     REQUIRED_FILES,
     enclave_path,
     is_enclave,
@@ -40,6 +41,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.reader import FilesReadOnce, OpenedEnclave, OpenedKeystore, open_enclave
+from sros_tool.pki.certificates import load_request
 from sros_tool.pki.token import Secrets, TokenUri, open_enclave_key
 from sros_tool.values import Words, shows
 from sros_tool.wording import first_few
@@ -209,10 +211,9 @@ def verify_arrival(
         for finding in keystore_findings(keystore, at, only_enclaves=only_enclaves)
         if not (finding.file in elsewhere and finding.id == _FILE_MISSING)
     ]
-    if secrets:
-        findings += [
-            finding for name in names for finding in _token_findings(keystore, name, now, secrets)
-        ]
+    findings += [
+        finding for name in names for finding in _token_findings(keystore, name, now, secrets)
+    ]
     shown = FindingFilter().choose(findings).shown
     return Arrival(
         path,
@@ -234,14 +235,31 @@ TOKEN_KEY = FindingKind(
 )
 
 
+_SIGN_AGAIN = (
+    "Have the request signed again on the keystore machine, with `sros sign_request --renew`, and "
+    "import the answer."
+)
+
+
 def _token_findings(
-    keystore: OpenedKeystore, name: str, now: datetime, secrets: Secrets
+    keystore: OpenedKeystore, name: str, now: datetime, secrets: Secrets | None
 ) -> Iterator[Finding]:
-    """Yield a finding unless the token has the key of an enclave's certificate."""
+    """Yield a finding unless the token has the key of an enclave's certificate.
+
+    Without ``secrets``, the token is not opened: the signing request says which key it has.
+    """
     state = keystore.enclave(name, now=now)
     if not state.token:
         return
     file = str(keystore.folder(name) / KEY_URI_FILE)
+    if not secrets:
+        request = keystore.folder(name) / REQUEST
+        with suppress(SrosError):
+            made = load_request(keystore.read(request, "request"), f"'{request}'")
+            if state.certificate and made.public_key != state.certificate.public_key():
+                text = f"cert.pem is not for the key that {REQUEST} was made with"
+                yield TOKEN_KEY.found(name, text, file, remedy=_SIGN_AGAIN)
+        return
     try:
         key = open_enclave_key(state.token, secrets)
         if state.certificate and not key.signs_for(state.certificate.public_key()):

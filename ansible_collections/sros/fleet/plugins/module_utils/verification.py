@@ -21,6 +21,7 @@ from ansible_collections.sros.fleet.plugins.module_utils.exports import (
     CERTIFICATE_FILE,
     KEY_FILE,
     KEY_URI_FILE,
+    REQUEST_FILE,
     SIGNED_FILES,
     TRUST_FILES,
     Files,
@@ -62,15 +63,17 @@ def verify(folder: str, enclaves: list[str], program: list[str]) -> dict:
     Raises:
         RefusedError: neither program is there, or it could not be asked.
     """
-    if shutil.which(program[0]):
-        return _by_sros(folder, enclaves, program)
     openssl = shutil.which("openssl")
+    if shutil.which(program[0]):
+        answer = _by_sros(folder, enclaves, program)
+        answer["problems"] += _on_tokens(openssl, folder, enclaves) if openssl else []
+        return {**answer, "ok": not answer["problems"]}
     if not openssl:
         raise RefusedError(
             "The enclaves cannot be verified: this robot has neither sros nor openssl. Install the"
             " package openssl on it."
         )
-    problems: list[str] = []
+    problems = _on_tokens(openssl, folder, enclaves)
     for name in enclaves:
         found = _by_openssl(openssl, os.path.join(folder, folder_of(name)), name)
         problems += [f"{name}: {problem}" for problem in found]
@@ -289,7 +292,7 @@ def _by_openssl(openssl: str, folder: str, name: str) -> list[str]:
     shown = _run([openssl, "x509", "-in", at[CERTIFICATE_FILE], "-noout", "-pubkey"])
     own = _run([openssl, "pkey", "-in", at[KEY_FILE], "-pubout"])
     if not os.path.lexists(at[KEY_FILE]) and os.path.exists(os.path.join(folder, KEY_URI_FILE)):
-        pass  # on a token, which only sros verify --tokens asks
+        pass  # on a token: see _on_tokens
     elif own.returncode:
         problems.append(f"key.pem: {_why(own)}")
     elif shown.stdout.split() != own.stdout.split():
@@ -323,6 +326,29 @@ def _by_openssl(openssl: str, folder: str, name: str) -> list[str]:
             problems.append(f"{file}: {_why(done)}")
         elif file == "permissions.p7s":
             problems += [f"{file}: {problem}" for problem in _permissions(done.stdout, name)]
+    return problems
+
+
+def _on_tokens(openssl: str, folder: str, enclaves: list[str]) -> list[str]:
+    """Return what is wrong with enclaves whose keys are on tokens.
+
+    Only `sros verify --tokens` asks the token; the signing request says which key it has.
+    """
+    problems = []
+    for name in enclaves:
+        place = os.path.join(folder, folder_of(name))
+        at = [os.path.join(place, file) for file in (KEY_URI_FILE, REQUEST_FILE, CERTIFICATE_FILE)]
+        if not all(map(os.path.exists, at)) or os.path.lexists(os.path.join(place, KEY_FILE)):
+            continue
+        keys = [
+            _run([openssl, kind, "-in", path, "-noout", "-pubkey"]).stdout.split()
+            for kind, path in (("req", at[1]), ("x509", at[2]))
+        ]
+        if keys[0] != keys[1]:
+            problems.append(
+                f"{name}: cert.pem: it is not for the key that {REQUEST_FILE} was made with. Have"
+                " the request signed again, with the play sros.fleet.requests"
+            )
     return problems
 
 
