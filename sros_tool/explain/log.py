@@ -24,6 +24,7 @@ from sros_tool.explain.answer import Answer, Evaluator, Part, Question, ask, wit
 from sros_tool.explain.asking import (
     AskingContext,
     fleet_of,
+    is_enclave,
     not_in_policy_error,
     planned_enclave,
     policy_to_ask,
@@ -288,8 +289,8 @@ def explain_log_of(
     """Explain the security messages of a log, and examine the enclaves that it names.
 
     ``name`` is the enclave, or its folder, whose processes wrote the log; "" if the log names the
-    enclave itself.  With ``policy_file`` there is no keystore, and only denials are compared: with
-    what the policy gives.
+    enclave itself, or ``keystore`` is the folder of the enclave alone.  With ``policy_file`` there
+    is no keystore, and only denials are compared: with what the policy gives.
 
     Raises:
         UsageError: ``name`` is an enclave, and there is no keystore.
@@ -297,6 +298,8 @@ def explain_log_of(
     """
     named: LoadedEnclave | None = None
     policy: AskedPolicy | None = None
+    if keystore and not name and is_enclave(keystore.root) and not is_keystore(keystore.root):
+        keystore, name = None, str(keystore.root)
     if policy_file:
         _, stated = policy_to_ask(policy_file, fleet_of(asking.fleet_file, None))
         policy = AskedPolicy(str(policy_file), stated, name)

@@ -591,6 +591,8 @@ def test_a_remedy_names_the_keystore_and_the_enclave_that_the_user_named(
     (tmp_path / "robot.log").write_text(f"{started}[SECURITY Error] Bad thing -> Function set\n")
     of_log = sros("explain", "--log", tmp_path / "robot.log").out
     assert "`sros explain KEYSTORE /a/b join`" in of_log
+    of_folder = sros("explain", f"{keystore}/enclaves{ENCLAVE}", "--log", tmp_path / "denied.log")
+    assert f"`sros explain KEYSTORE {ENCLAVE} publish /x`" in of_folder.out
     line = f"filesystem error: status: Permission denied [{keystore}/enclaves/a/governance.p7s]"
     (tmp_path / "user.log").write_text(f"RuntimeError: {line}\n")
     unreadable = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "user.log").out
