@@ -298,8 +298,9 @@ def explain_log_of(
     """
     named: LoadedEnclave | None = None
     policy: AskedPolicy | None = None
-    if keystore and not name and is_enclave(keystore.root) and not is_keystore(keystore.root):
-        keystore, name = None, str(keystore.root)
+    folder = keystore.root if keystore and not name else None
+    if folder and is_enclave(folder) and not is_keystore(folder):
+        keystore, name = None, str(folder)
     if policy_file:
         _, stated = policy_to_ask(policy_file, fleet_of(asking.fleet_file, None))
         policy = AskedPolicy(str(policy_file), stated, name)
