@@ -28,6 +28,7 @@ from sros_tool.keystore.layout import SEAL, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, create_permission
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
+from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import (
@@ -460,6 +461,21 @@ def test_an_older_answer_needs_force(home: Path, robot: Path) -> None:
     assert snapshot(robot) == before
     import_answer(robot, old, now=LATER, force=True)
     assert not (robot / FOLDER / "crl.pem").exists()
+
+
+def test_an_answer_with_a_replaced_ca_needs_force(home: Path, robot: Path, tmp_path: Path) -> None:
+    """Also if the numbers of a restored keystore went on, and the other CA is the same."""
+    import_answer(robot, sign(home, robot).archive, now=NOW)
+    backup = copy_of(home, tmp_path / "backup")
+    rotate_ca(home, roles=("identity",), now=LATER, finish=True)
+    import_answer(robot, sign(home, robot, LATER, renew=True).archive, now=LATER)
+    for _ in range(9):
+        refresh_crl(backup, now=LATER)
+    before, old = snapshot(robot), sign(backup, robot, LATER, renew=True).archive
+    with pytest.raises(KeystoreError, match="goes back to an earlier identity CA"):
+        import_answer(robot, old, now=LATER)
+    assert snapshot(robot) == before
+    import_answer(robot, old, now=LATER, force=True)
 
 
 def test_an_answer_of_another_keystore_needs_force(home: Path, robot: Path, tmp_path: Path) -> None:

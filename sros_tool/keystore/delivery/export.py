@@ -24,7 +24,7 @@ from sros_tool.fleet.robots import robot_of
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import enclave_of
 from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT, SUFFIXES, file_mode, pack, unpack
-from sros_tool.keystore.delivery.robot import check_same_authority
+from sros_tool.keystore.delivery.robot import check_same_authority, public_key_of
 from sros_tool.keystore.fleet import load_fleet, unrecorded_notes
 from sros_tool.keystore.known_keys import (
     known_authorities,
@@ -47,12 +47,12 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
     PRIVATE,
-    REQUEST,
     REQUIRED_FILES,
     ZENOH_FILES,
     check_readable,
     enclave_folder,
     enclave_path,
+    has_key,
     key_on_robot,
     search_enclaves,
 )
@@ -74,12 +74,11 @@ from sros_tool.pki.certificates import (
     fingerprints,
     load_certificate,
     load_certificates,
-    load_request,
     pem,
     validity_of,
 )
 from sros_tool.pki.crl import newest_revocations
-from sros_tool.pki.keys import holds_private_key, load_any_key
+from sros_tool.pki.keys import holds_private_key
 from sros_tool.pki.token import read_token_file
 from sros_tool.validity import iso
 from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes, Words
@@ -584,7 +583,7 @@ def _check_robot(keystore: OpenedKeystore, target: Path, files: Mapping[str, byt
 def _check_own_keys(target: Path, files: Mapping[str, bytes]) -> None:
     """Raise `KeystoreError` if a certificate is not for the key that stays in ``target``.
 
-    The key on a token is that of the signing request, or else of the present certificate.
+    The key on a token is that of the signing request.
     """
     for path, data in files.items():
         folder, _, file = path.rpartition("/")
@@ -595,7 +594,9 @@ def _check_own_keys(target: Path, files: Mapping[str, bytes]) -> None:
             or (token_file and token_file != _content(target / folder / KEY_URI_FILE))
         ):
             continue
-        key = _public_key(target / folder)
+        key: object = None
+        with suppress(SrosError):  # the key is not in the folder, or damaged
+            key = public_key_of(target / folder, folder) if has_key(target / folder) else None
         if key and key != load_certificate(data, path).public_key():
             raise KeystoreError(
                 f"the certificate is not for the key in '{target / folder}'",
@@ -603,20 +604,6 @@ def _check_own_keys(target: Path, files: Mapping[str, bytes]) -> None:
                 "because it comes from a backup. Nothing was changed.",
                 f"{_ANSWER_AGAIN} If the keystore's certificate is right, remove the key first.",
             )
-
-
-def _public_key(folder: Path) -> object:
-    """Return the public key of an enclave on a robot; None if it cannot be read."""
-    readers: Mapping[str, Callable[[bytes, str], object]] = {
-        KEY_FILE: lambda data, path: load_any_key(data, path).public_key(),
-        REQUEST: lambda data, path: load_request(data, path).public_key,
-        CERTIFICATE_FILE: lambda data, path: load_certificate(data, path).public_key(),
-    }
-    for file, read in readers.items():
-        if data := _content(folder / file):
-            with suppress(SrosError):
-                return read(data, str(folder / file))
-    return None
 
 
 def _check_trust(

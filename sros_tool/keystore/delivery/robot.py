@@ -18,6 +18,7 @@ from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosE
 from sros_tool.files import write_new_file
 from sros_tool.keystore.confirmation import OF_ANOTHER_KEY
 from sros_tool.keystore.delivery.archive import listed_digests, unpack
+from sros_tool.keystore.delivery.release import retired_authorities
 from sros_tool.keystore.issuing.acceptance import refuse_stopping
 from sros_tool.keystore.issuing.authority import Authority
 from sros_tool.keystore.issuing.keyring import no_secrets
@@ -26,10 +27,13 @@ from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     ENCLAVES,
+    IDENTITY,
     IDENTITY_CA_FILE,
     KEY_FILE,
     KEY_URI_FILE,
     OPTIONAL_FILES,
+    PERMISSIONS,
+    PERMISSIONS_CA_FILE,
     PRIVATE,
     PUBLIC,
     REQUEST,
@@ -62,6 +66,7 @@ from sros_tool.keystore.zenoh_files import open_zenoh
 from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
+    authority_text,
     common_name_of,
     digest,
     fingerprints,
@@ -455,7 +460,7 @@ def import_answer(
         )
     ran = any((place / file).exists() for file in ZENOH_SIGNED)
     with Transaction(folder, dry_run=dry_run) as transaction:
-        key = _public_key(place, name)
+        key = public_key_of(place, name)
         state = check_answer(answer, key, now=now)
         assert state.certificate and state.identity_ca and state.permissions_ca
         until = state.valid_until()
@@ -493,7 +498,7 @@ def import_answer(
     )
 
 
-def _public_key(place: Path, name: str) -> PublicKey:
+def public_key_of(place: Path, name: str) -> PublicKey:
     """Return the public key of an enclave, from its key file or its signing request.
 
     A key on a token has no file, but it signed the request.
@@ -579,6 +584,17 @@ def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certifica
                 f"Its certificate is valid from {iso(new.not_before)}, the installed one from "
                 f"{iso(old.not_before)}.",
                 remedy,
+            )
+    for role, file in ((IDENTITY, IDENTITY_CA_FILE), (PERMISSIONS, PERMISSIONS_CA_FILE)):
+        trusted = _certificates(place / file) if (place / file).exists() else ()
+        sent_cas = load_certificates(answer.file(file) or b"", file)
+        if retired := retired_authorities(trusted, sent_cas):
+            raise KeystoreError(
+                f"the answer for enclave {answer.name} goes back to an earlier {role} CA",
+                f"A later CA here replaced {authority_text(retired[0])}: the keystore comes from a "
+                "backup. With the earlier CA, what was revoked since would be trusted again.",
+                "Replace the CA again on the keystore machine: docs/howto/keystore_is_lost.md says "
+                "how. Or add --force to go back to the earlier CA.",
             )
     path = place / "crl.pem"
     if path.exists():
