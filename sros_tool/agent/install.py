@@ -30,6 +30,7 @@ from sros_tool.keystore.confirmation import KEY_NOT_HERE, OF_OTHER_CA, OLDER_THA
 from sros_tool.keystore.delivery.release import (
     RELEASE_FILES,
     Release,
+    older_list,
     retired_authorities,
     seal_problem,
 )
@@ -42,6 +43,7 @@ from sros_tool.keystore.layout import (
     KEY_FILE,
     KEY_FILES,
     KEY_URI_FILE,
+    LIST_FILES,
     OPTIONAL_FILES,
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
@@ -61,10 +63,9 @@ from sros_tool.pki.certificates import (
     load_certificates,
     load_request,
     make_request,
-    pem,
     validity_of,
 )
-from sros_tool.pki.crl import last_update, newest_list, newest_revocations, next_update, read_lists
+from sros_tool.pki.crl import last_update, newest_list, next_update, read_lists
 from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem, load_key
 from sros_tool.validity import iso
 from sros_tool.wording import enumerated
@@ -72,9 +73,6 @@ from sros_tool.wording import enumerated
 _OPTIONAL = (*OPTIONAL_FILES, *ZENOH_FILES)
 _OF_ENCLAVE = (*sorted(RELEASE_FILES), *KEY_FILES, REQUEST, SEAL)
 """The files that are removed together with their enclave."""
-_LISTS = (CRL_FILE, IDENTITY_CA_FILE)
-"""The files with revocation lists: in a rotation, that of the second CA is in the file of the CAs.
-"""
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -272,29 +270,24 @@ def _check_lists(name: str, files: Mapping[str, bytes], present: Mapping[str, by
     The owner of the folder can write anything into it, so only lists count that are signed by a CA
     which the release trusts.
     """
-    lists = [[source.get(file, b"") for file in _LISTS] for source in (present, files)]
-    authorities: Sequence[x509.Certificate] = ()
-    with suppress(SrosError):  # a damaged file keeps its enclave from changing
-        authorities = load_certificates(files.get(IDENTITY_CA_FILE, b""), IDENTITY_CA_FILE)
-    for authority in authorities:
-        listed, new = (newest_revocations(pem(authority), *of_source) for of_source in lists)
-        if listed != new and listed.number >= new.number:
-            has = "none" if new.number < 0 else f"the number {new.number}"
-            raise KeystoreError(
-                f"the revocation list for {name} in the release is older than the list here",
-                f"The current list has the number {listed.number}, the release has {has}: revoked "
-                "enclaves would be trusted again. Either the server has an old copy, or the "
-                "keystore comes from a backup. Nothing was changed.",
-                "Look at what the server serves, and publish there again. Only if the keystore "
-                "comes from a backup, first run `sros fleet collect KEYSTORE INBOX`, which takes "
-                "the list from the message of this robot.",
-            )
+    if older := older_list(present, files):
+        here, new = older
+        has = "none" if new.number < 0 else f"the number {new.number}"
+        raise KeystoreError(
+            f"the revocation list for {name} in the release is older than the list here",
+            f"The current list has the number {here.number}, the release has {has}: revoked "
+            "enclaves would be trusted again. Either the server has an old copy, or the "
+            "keystore comes from a backup. Nothing was changed.",
+            "Look at what the server serves, and publish there again. Only if the keystore "
+            "comes from a backup, first run `sros fleet collect KEYSTORE INBOX`, which takes "
+            "the list from the message of this robot.",
+        )
 
 
 def _present_lists(folder: Folder, name: str) -> dict[str, bytes]:
     """Return the files of an enclave that may have revocation lists, as far as it has them."""
     present: dict[str, bytes] = {}
-    for file in _LISTS:
+    for file in LIST_FILES:
         with suppress(SrosError, OSError):  # else nothing that a process could load
             present[file] = folder.read_inside(f"{enclave_folder(name)}/{file}")
     return present

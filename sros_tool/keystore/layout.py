@@ -90,6 +90,9 @@ KEY_FILES = (KEY_FILE, KEY_URI_FILE)
 
 CRL_FILE = "crl.pem"
 OPTIONAL_FILES = (CRL_FILE,)
+LIST_FILES = (CRL_FILE, IDENTITY_CA_FILE)
+"""The files with revocation lists: in a rotation, that of the second CA is in the file of the CAs.
+"""
 
 SESSION_FILE, ROUTER_FILE = "session.json5", "router.json5"
 """The Zenoh configurations for the processes of an enclave, and for the router's enclave."""

@@ -478,6 +478,21 @@ def test_an_answer_with_a_replaced_ca_needs_force(home: Path, robot: Path, tmp_p
     import_answer(robot, old, now=LATER, force=True)
 
 
+def test_an_answer_with_another_list_of_the_same_number_needs_force(
+    home: Path, robot: Path, tmp_path: Path
+) -> None:
+    create_enclaves(home, ["/stolen"], now=NOW)
+    backup = copy_of(home, tmp_path / "backup")
+    revoke(home, ["/stolen"], now=NOW)
+    import_answer(robot, sign(home, robot).archive, now=NOW)
+    refresh_crl(backup, now=NOW)
+    renew(backup, ["/stolen"], now=NOW)
+    before, other = snapshot(robot), sign(backup, robot, LATER).archive
+    with pytest.raises(KeystoreError, match="has an older revocation list"):
+        import_answer(robot, other, now=LATER)
+    assert snapshot(robot) == before
+
+
 def test_an_answer_of_another_keystore_needs_force(home: Path, robot: Path, tmp_path: Path) -> None:
     import_answer(robot, sign(home, robot).archive, now=NOW)
     create_keystore(tmp_path / "evil", template=load_template("production"), now=NOW)

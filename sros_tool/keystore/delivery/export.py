@@ -42,6 +42,7 @@ from sros_tool.keystore.layout import (
     KEY_FILE,
     KEY_FILES,
     KEY_URI_FILE,
+    LIST_FILES,
     OPTIONAL_FILES,
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
@@ -705,8 +706,7 @@ def _lost_revocations(
         folder, _, file = path.rpartition("/")
         if file != IDENTITY_CA_FILE:
             continue
-        # In a rotation, the list of the second CA is in the file of the CAs.
-        paths = (f"{folder}/{CRL_FILE}", path)
+        paths = [f"{folder}/{name}" for name in LIST_FILES]
         for authority in load_certificates(authorities, path):
             signer = pem(authority)
             sent = newest_revocations(signer, *(files.get(path, b"") for path in paths))

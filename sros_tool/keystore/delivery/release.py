@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -27,7 +28,9 @@ from sros_tool.fleet.robots import name_problem
 from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT, listed_digests, pack, unpack
 from sros_tool.keystore.layout import (
     ENCLAVES,
+    IDENTITY_CA_FILE,
     KEY_FILE,
+    LIST_FILES,
     OPTIONAL_FILES,
     RELEASE_SEAL,
     REQUIRED_FILES,
@@ -35,7 +38,8 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import authority_key, validity_of
+from sros_tool.pki.certificates import authority_key, load_certificates, pem, validity_of
+from sros_tool.pki.crl import Revocations, newest_revocations
 
 if TYPE_CHECKING:
     from sros_tool.keystore.issuing.authority import Authority
@@ -171,6 +175,26 @@ def retired_authorities(
         and validity_of(authority).not_before < newest
         and authority_key(authority) not in keys
     ]
+
+
+def older_list(
+    present: Mapping[str, bytes], sent: Mapping[str, bytes]
+) -> tuple[Revocations, Revocations] | None:
+    """Return two lists of a CA, in the ``present`` and the ``sent`` files, if the latter is older.
+
+    Both map the files of an enclave to their content.  Only lists count that a CA in ``sent``
+    signed; in a rotation, the list of the second CA is in the file of the CAs.  A list with the
+    number of another one that revokes something else is older, too.
+    """
+    with suppress(SrosError):  # damaged files change no enclave
+        for authority in load_certificates(sent.get(IDENTITY_CA_FILE, b""), IDENTITY_CA_FILE):
+            here, new = (
+                newest_revocations(pem(authority), *(files.get(file, b"") for file in LIST_FILES))
+                for files in (present, sent)
+            )
+            if here != new and here.number >= new.number:
+                return here, new
+    return None
 
 
 def _text(robot: str, number: int, files: Mapping[str, bytes]) -> bytes:

@@ -18,7 +18,7 @@ from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosE
 from sros_tool.files import write_new_file
 from sros_tool.keystore.confirmation import OF_ANOTHER_KEY
 from sros_tool.keystore.delivery.archive import listed_digests, unpack
-from sros_tool.keystore.delivery.release import retired_authorities
+from sros_tool.keystore.delivery.release import older_list, retired_authorities
 from sros_tool.keystore.issuing.acceptance import refuse_stopping
 from sros_tool.keystore.issuing.authority import Authority
 from sros_tool.keystore.issuing.keyring import no_secrets
@@ -31,6 +31,7 @@ from sros_tool.keystore.layout import (
     IDENTITY_CA_FILE,
     KEY_FILE,
     KEY_URI_FILE,
+    LIST_FILES,
     OPTIONAL_FILES,
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
@@ -596,17 +597,16 @@ def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certifica
                 "Replace the CA again on the keystore machine: docs/howto/keystore_is_lost.md says "
                 "how. Or add --force to go back to the earlier CA.",
             )
-    path = place / "crl.pem"
-    if path.exists():
-        present = load_crl(read_bytes(path, "revocation list"), f"'{path}'").number
-        sent = answer.file("crl.pem")
-        if sent is None or load_crl(sent, "of the answer").number < present:
-            raise KeystoreError(
-                f"the answer for enclave {answer.name} has an older revocation list",
-                f"The list '{path}' has the number {present}; with an older list, revoked enclaves "
-                "would be trusted again.",
-                remedy,
-            )
+    files = {path.rpartition("/")[2]: data for path, data in answer.files.items()}
+    present = {f: read_bytes(place / f, "file") for f in LIST_FILES if (place / f).exists()}
+    if older := older_list(present, files):
+        here, _ = older
+        raise KeystoreError(
+            f"the answer for enclave {answer.name} has an older revocation list",
+            f"The list in '{place}' has the number {here.number}; with an older list, revoked "
+            "enclaves would be trusted again.",
+            remedy,
+        )
 
 
 def _check_number(path: Path, answer: RequestAnswer, remedy: str) -> bool:
