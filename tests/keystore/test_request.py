@@ -491,6 +491,13 @@ def test_an_answer_with_another_list_of_the_same_number_needs_force(
     with pytest.raises(KeystoreError, match="has an older revocation list"):
         import_answer(robot, other, now=LATER)
     assert snapshot(robot) == before
+    refresh_crl(backup, now=LATER)
+    later = sign(backup, robot, LATER, renew=True).archive
+    (note,) = import_answer(robot, later, now=LATER).notes
+    assert (note.id, "revokes 1 certificate that the new one lacks" in note.text) == (
+        "import.list-lacks",
+        True,
+    )
 
 
 def test_an_answer_of_another_keystore_needs_force(home: Path, robot: Path, tmp_path: Path) -> None:

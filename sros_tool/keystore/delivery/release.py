@@ -16,7 +16,7 @@ give it to another robot, nor bring back an earlier one.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -182,9 +182,28 @@ def older_list(
 ) -> tuple[Revocations, Revocations] | None:
     """Return two lists of a CA, in the ``present`` and the ``sent`` files, if the latter is older.
 
-    Both map the files of an enclave to their content.  Only lists count that a CA in ``sent``
-    signed; in a rotation, the list of the second CA is in the file of the CAs.  A list with the
-    number of another one that revokes something else is older, too.
+    Both map the files of an enclave to their content.  A list with the number of another one that
+    revokes something else is older, too.
+    """
+    for here, new in _lists(present, sent):
+        if here != new and here.number >= new.number:
+            return here, new
+    return None
+
+
+def lost_serials(present: Mapping[str, bytes], sent: Mapping[str, bytes]) -> frozenset[int]:
+    """Return the serial numbers on lists in the ``present`` files that those ``sent`` lack."""
+    return frozenset[int]().union(
+        *(here.serials - new.serials for here, new in _lists(present, sent))
+    )
+
+
+def _lists(
+    present: Mapping[str, bytes], sent: Mapping[str, bytes]
+) -> Iterator[tuple[Revocations, Revocations]]:
+    """Yield the lists of each CA that the ``sent`` files trust, in both files.
+
+    In a rotation, the list of the second CA is in the file of the CAs.
     """
     with suppress(SrosError):  # damaged files change no enclave
         for authority in load_certificates(sent.get(IDENTITY_CA_FILE, b""), IDENTITY_CA_FILE):
@@ -192,9 +211,7 @@ def older_list(
                 newest_revocations(pem(authority), *(files.get(file, b"") for file in LIST_FILES))
                 for files in (present, sent)
             )
-            if here != new and here.number >= new.number:
-                return here, new
-    return None
+            yield here, new
 
 
 def _text(robot: str, number: int, files: Mapping[str, bytes]) -> bytes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -18,7 +18,11 @@ from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosE
 from sros_tool.files import write_new_file
 from sros_tool.keystore.confirmation import OF_ANOTHER_KEY
 from sros_tool.keystore.delivery.archive import listed_digests, unpack
-from sros_tool.keystore.delivery.release import older_list, retired_authorities
+from sros_tool.keystore.delivery.release import (
+    lost_serials,
+    older_list,
+    retired_authorities,
+)
 from sros_tool.keystore.issuing.acceptance import refuse_stopping
 from sros_tool.keystore.issuing.authority import Authority
 from sros_tool.keystore.issuing.keyring import no_secrets
@@ -90,6 +94,7 @@ from sros_tool.pki.token import (
 )
 from sros_tool.validity import iso
 from sros_tool.values import DryRun, FileChanges, Notes, Words
+from sros_tool.wording import counted
 from sros_tool.xml import read_bytes
 
 
@@ -480,7 +485,10 @@ def import_answer(
         for file in _OPTIONAL:
             if answer.file(file) is None and (place / file).exists():
                 transaction.remove(f"{enclave_folder(name)}/{file}")
-        notes = refuse_stopping(transaction, now, allowed=allow_refusal, remedy=lambda: _AGAIN)
+        notes = (
+            *_lost_revocation_notes(place, answer),
+            *refuse_stopping(transaction, now, allowed=allow_refusal, remedy=lambda: _AGAIN),
+        )
         transaction.commit()
     changes = transaction.changes
     other_rules = ran and any(Path(change.path).name in ZENOH_SIGNED for change in changes)
@@ -597,9 +605,7 @@ def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certifica
                 "Replace the CA again on the keystore machine: docs/howto/keystore_is_lost.md says "
                 "how. Or add --force to go back to the earlier CA.",
             )
-    files = {path.rpartition("/")[2]: data for path, data in answer.files.items()}
-    present = {f: read_bytes(place / f, "file") for f in LIST_FILES if (place / f).exists()}
-    if older := older_list(present, files):
+    if older := older_list(*_lists_here_and_sent(place, answer)):
         here, _ = older
         raise KeystoreError(
             f"the answer for enclave {answer.name} has an older revocation list",
@@ -607,6 +613,26 @@ def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certifica
             "enclaves would be trusted again.",
             remedy,
         )
+
+
+def _lists_here_and_sent(
+    place: Path, answer: RequestAnswer
+) -> tuple[dict[str, bytes], dict[str, bytes]]:
+    """Return the files that may have revocation lists, installed and in the answer."""
+    present = {f: read_bytes(place / f, "file") for f in LIST_FILES if (place / f).exists()}
+    return present, {f: data for f in LIST_FILES if (data := answer.file(f)) is not None}
+
+
+def _lost_revocation_notes(place: Path, answer: RequestAnswer) -> Iterator[Note]:
+    """Yield a note if the answer's revocation list lacks something, which may have expired."""
+    if lost := lost_serials(*_lists_here_and_sent(place, answer)):
+        text = (
+            f"the revocation list until now revokes {counted(len(lost), 'certificate')} that the "
+            f"new one lacks, such as {min(lost):x}. This is right if they have expired, but not if "
+            "the keystore comes from a backup: then take the list over from another robot, with "
+            "`sros crl KEYSTORE --refresh --crl FILE`, and have the request signed again."
+        )
+        yield Note("import.list-lacks", text)
 
 
 def _check_number(path: Path, answer: RequestAnswer, remedy: str) -> bool:
