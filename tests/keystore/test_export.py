@@ -105,6 +105,15 @@ def test_a_list_with_a_later_number_does_not_lose_a_revocation(fleet: Path, tmp_
     assert all(load_crl(crl.read_bytes(), "new").revokes(entry.serial) for entry in lost)
 
 
+def test_a_new_enclave_gets_no_older_list_than_its_neighbor(fleet: Path, tmp_path: Path) -> None:
+    robot, backup = tmp_path / "robot", copy_of(fleet, tmp_path / "backup")
+    revoke(fleet, ["/armada"], now=NOW)
+    distribute(OpenedKeystore(fleet), ["/base"], robot, now=NOW)
+    with pytest.raises(KeystoreError, match=r"base/crl.pem' is a newer revocation list"):
+        distribute(OpenedKeystore(backup), ["/arm/camera"], robot, now=NOW)
+    assert distribute(OpenedKeystore(fleet), ["/arm/camera"], robot, now=NOW).changes
+
+
 def test_a_list_of_another_ca_is_not_taken_over(fleet: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     create_keystore(other, template=load_template("production"), now=NOW)

@@ -6,7 +6,7 @@ import hashlib
 import os
 import tomllib
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -539,7 +539,7 @@ def _write_folder(
         )
     check_same_authority(target, files)
     _check_robot(keystore, target, files)
-    _check_trust(keystore, target, lambda path: _content(target / path), files, now)
+    _check_trust(keystore, target, _present_trust(target, files), files, now)
     _check_own_keys(target, files)
     stale = _stale_paths(target, files)
     different = {
@@ -610,13 +610,13 @@ def _check_own_keys(target: Path, files: Mapping[str, bytes]) -> None:
 def _check_trust(
     keystore: OpenedKeystore,
     target: Path,
-    present: Callable[[str], bytes],
+    present: Mapping[str, bytes],
     files: Mapping[str, bytes],
     now: datetime,
 ) -> None:
     """Raise `KeystoreError` if enclaves in ``target`` would trust again what they no longer trust.
 
-    ``present`` returns the content of a file in ``target``, by its path; b"" if there is none.
+    ``present`` maps paths in ``target`` to the content of files, at least of CAs and lists.
     """
     if later := _later_authorities(keystore, present, files):
         path, authority = next(iter(later.items()))
@@ -637,8 +637,20 @@ def _check_trust(
             f"{why}: revoked enclaves would be trusted again. Nothing was changed.",
             "The keystore may come from a backup: docs/howto/keystore_is_lost.md says what to do, "
             f"and `sros crl {quote(str(keystore.root))} --refresh --crl {file}` revokes the same "
-            f"again. If the keystore's list is right, first {_removal_of(target, lost)}",
+            f"again. If the keystore's list is right, export all enclaves of the folder, but first "
+            f"{_removal_of(target, lost)}",
         )
+
+
+def _present_trust(target: Path, files: Mapping[str, bytes]) -> dict[str, bytes]:
+    """Map paths in a folder, of all its enclaves and of ``files``, to CAs and revocation lists."""
+    folders = {path.rpartition("/")[0] for path in files}
+    if (target / ENCLAVES).is_dir():
+        folders.update(map(enclave_folder, search_enclaves(target)[0]))
+    paths = (
+        f"{at}/{file}" for at in sorted(folders) for file in (*LIST_FILES, PERMISSIONS_CA_FILE)
+    )
+    return {path: data for path in paths if (data := _content(target / path))}
 
 
 def _is_archive(target: Path) -> bool:
@@ -653,7 +665,7 @@ def _removal_of(target: Path, paths: Iterable[str]) -> str:
 
 
 def _later_authorities(
-    keystore: OpenedKeystore, present: Callable[[str], bytes], files: Mapping[str, bytes]
+    keystore: OpenedKeystore, present: Mapping[str, bytes], files: Mapping[str, bytes]
 ) -> Mapping[str, x509.Certificate]:
     """Map paths of CA files in ``present`` to a CA in them that replaced the keystore's.
 
@@ -665,12 +677,12 @@ def _later_authorities(
     place_in_ledger = {entry.sha256: place for place, entry in enumerate(entries)}
     later: dict[str, x509.Certificate] = {}
     for path, data in files.items():
-        if path.rpartition("/")[2] not in _ROLES_OF_FILES or present(path) in (data, b""):
+        if path.rpartition("/")[2] not in _ROLES_OF_FILES or present.get(path) in (data, None):
             continue
         sent = load_certificates(data, path)
         newest = max(validity_of(authority).not_before for authority in sent)
         with suppress(SrosError):  # a damaged file trusts nobody
-            trusted = load_certificates(present(path), path)
+            trusted = load_certificates(present[path], path)
             keys, kept = set(map(authority_key, trusted)), set(map(authority_key, sent))
             added = [
                 place_in_ledger.get(digest(authority), len(entries))
@@ -691,42 +703,50 @@ def _later_authorities(
 
 def _lost_revocations(
     keystore: OpenedKeystore,
-    present: Callable[[str], bytes],
+    present: Mapping[str, bytes],
     files: Mapping[str, bytes],
     now: datetime,
 ) -> Mapping[str, tuple[str, str]]:
     """Map paths in ``present`` to what shows that the keystore lacks their revocation list.
 
-    Only lists count that a CA in ``files`` signed.  The list of the same CA in ``files`` has to
-    have a number as high, and every certificate on it, but for those that the ledger knows to have
-    expired; and those of a CA service, which knows more certificates than the ledger.
+    Lists of all enclaves in the folder count: a new enclave there has none yet.  Only lists count
+    that a CA in ``files`` signed.  The list of the same CA in ``files`` has to have a number as
+    high, and every certificate on it, but for those that the ledger knows to have expired; and
+    those of a CA service, which knows more certificates than the ledger.
     """
+    places: dict[bytes, list[str]] = defaultdict(list)
+    for path, data in present.items():
+        if path.rpartition("/")[2] in LIST_FILES:
+            places[data].append(path)
+    sources = {
+        (data, files.get(f"{path.removesuffix(IDENTITY_CA_FILE)}{CRL_FILE}", b""))
+        for path, data in files.items()
+        if path.endswith(f"/{IDENTITY_CA_FILE}")
+    }
     lost: dict[str, tuple[str, str]] = {}
-    for path, authorities in files.items():
-        folder, _, file = path.rpartition("/")
-        if file != IDENTITY_CA_FILE:
-            continue
-        paths = [f"{folder}/{name}" for name in LIST_FILES]
-        for authority in load_certificates(authorities, path):
-            signer = pem(authority)
-            sent = newest_revocations(signer, *(files.get(path, b"") for path in paths))
-            for place in paths:
-                there = newest_revocations(signer, present(place))
+    for source in sources:
+        for authority in load_certificates(source[0], IDENTITY_CA_FILE):
+            sent = newest_revocations(pem(authority), *source)
+            for data, paths in places.items():
+                there = newest_revocations(pem(authority), data)
                 missing = there.serials - sent.serials
                 expiries = known_expiries(keystore, missing)
                 lacking = [s for s in missing if expiries.get(s, iso(now)) >= iso(now)]
                 if there.number > sent.number:
                     has = "none" if sent.number < 0 else f"the number {sent.number}"
-                    lost[place] = (
+                    shown = (
                         "is a newer revocation list than the keystore's",
                         f"It has the number {there.number}, the keystore has {has}",
                     )
                 elif lacking and not is_ca_service(keystore.template.identity_key):
-                    lost[place] = (
+                    shown = (
                         f"revokes {counted(len(lacking), 'certificate')} that the keystore's "
                         "revocation list lacks",
                         f"One has the serial number {min(lacking):x}, and may not have expired",
                     )
+                else:
+                    continue
+                lost |= dict.fromkeys(paths, shown)
     return lost
 
 
@@ -773,8 +793,7 @@ def _write_archive(
                 "Nothing was changed.",
                 "Add --force to replace it, or choose another name.",
             )
-        present = _unpacked(target)
-        _check_trust(keystore, target, lambda path: present.get(path, b""), files, now)
+        _check_trust(keystore, target, _unpacked(target), files, now)
     change = Change("replace" if target.exists() else "create", target.name)
     if not dry_run:
         with staged_file(target, data) as put_in_place:
