@@ -36,6 +36,7 @@ from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.lifecycle.rotation import RotationStage
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
+from sros_tool.keystore.transaction import KeystoreLock
 from sros_tool.pki.crl import load_crl
 from sros_tool.policy.document import read_policy
 from tests.support.harness import copy_of, policy_text, publish, snapshot, sros
@@ -103,6 +104,25 @@ def test_a_list_with_a_later_number_does_not_lose_a_revocation(fleet: Path, tmp_
     assert distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True).changes
     lost = load_crl(before["enclaves/base/crl.pem"][1], "lost").revoked
     assert all(load_crl(crl.read_bytes(), "new").revokes(entry.serial) for entry in lost)
+
+
+def test_what_another_export_wrote_meanwhile_is_compared(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot, backup = tmp_path / "robot", copy_of(fleet, tmp_path / "backup")
+    distribute(OpenedKeystore(fleet), ["/base"], robot, now=NOW)
+    revoke(fleet, ["/armada"], now=NOW)
+    revoke(backup, ["/arm/camera"], now=NOW)
+    acquire = KeystoreLock.acquire
+
+    def acquire_late(lock: KeystoreLock) -> None:
+        monkeypatch.undo()
+        distribute(OpenedKeystore(fleet), ["/base"], robot, now=NOW, force=True)
+        acquire(lock)
+
+    monkeypatch.setattr(KeystoreLock, "acquire", acquire_late)
+    with pytest.raises(KeystoreError, match="revokes 1 certificate that the keystore's"):
+        distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True)
 
 
 def test_a_new_enclave_gets_no_older_list_than_its_neighbor(fleet: Path, tmp_path: Path) -> None:

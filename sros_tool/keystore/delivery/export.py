@@ -537,24 +537,24 @@ def _write_folder(
             "It is a keystore with CAs, not an export.",
             "Choose another folder.",
         )
-    check_same_authority(target, files)
-    _check_robot(keystore, target, files)
-    _check_trust(keystore, target, _present_trust(target, files), files, now)
-    _check_own_keys(target, files)
-    stale = _stale_paths(target, files)
-    different = {
-        path: data
-        for path, data in files.items()
-        if not (target / path).is_file() or read_bytes(target / path, "file") != data
-    }
-    replaced = [path for path in (*different, *stale) if os.path.lexists(target / path)]
-    if replaced and not force:
-        raise KeystoreError(
-            f"'{target}' already has other versions of {', '.join(replaced)}",
-            "Nothing was changed.",
-            "Add --force to replace these files, or choose another folder.",
-        )
     with Transaction(target, new_keystore=True, dry_run=dry_run) as transaction:
+        check_same_authority(target, files)
+        _check_robot(keystore, target, files)
+        _check_trust(keystore, target, _present_trust(target, files), files, now)
+        _check_own_keys(target, files)
+        stale = _stale_paths(target, files)
+        different = {
+            path: data
+            for path, data in files.items()
+            if not (target / path).is_file() or read_bytes(target / path, "file") != data
+        }
+        replaced = [path for path in (*different, *stale) if os.path.lexists(target / path)]
+        if replaced and not force:
+            raise KeystoreError(
+                f"'{target}' already has other versions of {', '.join(replaced)}",
+                "Nothing was changed.",
+                "Add --force to replace these files, or choose another folder.",
+            )
         for path, data in different.items():
             transaction.write(path, data, private=file_mode(path) == 0o600)
         for path in stale:
