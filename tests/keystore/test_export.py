@@ -134,6 +134,20 @@ def test_a_new_enclave_gets_no_older_list_than_its_neighbor(fleet: Path, tmp_pat
     assert distribute(OpenedKeystore(fleet), ["/arm/camera"], robot, now=NOW).changes
 
 
+def test_the_list_of_the_second_ca_is_taken_over_at_once(fleet: Path, tmp_path: Path) -> None:
+    robot = tmp_path / "robot"
+    refresh_crl(fleet, now=NOW)
+    for _ in range(2):
+        rotate_ca(fleet, roles=("identity",), now=NOW)
+    backup = copy_of(fleet, tmp_path / "backup")
+    for _ in range(9):
+        refresh_crl(fleet, now=NOW)
+    distribute(OpenedKeystore(fleet), ["/base"], robot, now=NOW)
+    refresh_crl(backup, now=NOW, crl=(robot / "enclaves/base/identity_ca.cert.pem").read_bytes())
+    refresh_crl(backup, now=NOW, crl=(robot / "enclaves/base/crl.pem").read_bytes())
+    assert distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True).changes
+
+
 def test_a_list_of_another_ca_is_not_taken_over(fleet: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     create_keystore(other, template=load_template("production"), now=NOW)

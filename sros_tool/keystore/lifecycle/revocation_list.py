@@ -416,7 +416,7 @@ class RevocationListSigner:
         """Sign and stage the lists; return their first expiry (UTC) and the new ledger entries.
 
         ``revocations`` are the entries of new revocations; the enclaves ``names`` get the lists,
-        except the `recipients`, who have them.  The number of the list is at least ``least``.
+        except the `recipients`, who have them.  The numbers of the lists are at least ``least``.
         Each list has all serial numbers: the ledger does not say which of two CAs issued a
         certificate, and a serial number of the other CA does no harm.
 
@@ -437,7 +437,9 @@ class RevocationListSigner:
         signed = self._sign(self._authority, self.present, new_entries, expiries, least)
         self._transaction.write(CRL, signed.document)
         signed_lists = [signed]
-        if second := self._sign_second(new_entries, names, expiries, incomplete=incomplete):
+        if second := self._sign_second(
+            new_entries, names, expiries, incomplete=incomplete, least=least
+        ):
             signed_lists.append(second)
         if self.recipients() is None:
             _link_everywhere(self._transaction, names)
@@ -554,6 +556,7 @@ class RevocationListSigner:
         expiries: Mapping[int, str],
         *,
         incomplete: bool,
+        least: int,
     ) -> SignedList | None:
         """Sign the list of the second identity CA, and stage it in the file of the identity CAs.
 
@@ -581,7 +584,8 @@ class RevocationListSigner:
                 self._handle_missing_key(other, error, new_entries, old, incomplete=incomplete)
             return None
         # The next stage replaces the current list with this one, so its number must be higher.
-        least = (self.present.number if self.present else 0) + 2 if coming else 0
+        if coming:
+            least = max(least, (self.present.number if self.present else 0) + 2)
         signed = self._sign(authority, old, () if coming else new_entries, expiries, least)
         bundle = b"".join(map(pem, certificates)) + signed.document
         roles = self._keystore.authority_files[file]
