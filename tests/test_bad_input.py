@@ -38,6 +38,7 @@ from tests.support.harness import (
     with_includes,
 )
 from tests.support.long_form import drawn, some, sometimes
+from tests.support.users import as_users_of_sros
 
 Words = list[object]
 Files = dict[str, tuple[int, bytes]]
@@ -964,7 +965,7 @@ def test_files_that_may_not_grow(line: str, size: int, keystore: Path, tmp_path:
     assert program(*words).status == 0
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="becomes another user; needs root")
+@as_users_of_sros
 @pytest.mark.parametrize(
     ("line", "mode"),
     some(

@@ -48,11 +48,10 @@ from sros_tool.xml import read_bytes
 from tests.conftest import MEMORY, POLICY
 from tests.support.children import run
 from tests.support.harness import copy_of, snapshot, sros
+from tests.support.users import as_root
 
 NOW = datetime.now(UTC)
 OWNER, STRANGER = 65533, 65532
-
-as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can act as several users")
 
 
 def give(path: Path, user: int) -> None:

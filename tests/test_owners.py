@@ -8,11 +8,10 @@ from pathlib import Path
 import pytest
 
 from sros_tool.owners import file_of_root, other_writers, replaceable_on_the_way
+from tests.support.users import as_root
 
 STRANGER = 65532
 US = frozenset({0, os.geteuid()})
-
-as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can act as several users")
 
 
 @pytest.fixture

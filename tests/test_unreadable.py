@@ -22,7 +22,8 @@ from sros_tool.keystore.lifecycle.renew import renew
 from tests.conftest import POLICY
 from tests.support.harness import Ended, copy_of, forked, snapshot, sros
 from tests.support.long_form import some
-from tests.test_hostile_folders import NOW, OWNER, as_root, give
+from tests.support.users import as_users_of_sros
+from tests.test_hostile_folders import NOW, OWNER, give
 
 PARTS = (
     "enclaves",
@@ -126,7 +127,7 @@ def closed(path: Path) -> Iterator[None]:
     path.chmod(stat.S_IMODE(before.st_mode))
 
 
-@as_root
+@as_users_of_sros
 @pytest.mark.parametrize("verb", some(WRITING, 2))
 def test_a_verb_that_writes_refuses_what_it_cannot_read(
     verb: str, place: Path, spare: Path
@@ -143,7 +144,7 @@ def test_a_verb_that_writes_refuses_what_it_cannot_read(
         assert snapshot(place) == before, part
 
 
-@as_root
+@as_users_of_sros
 def test_an_export_reads_the_enclaves_that_it_exports(place: Path) -> None:
     for part in PARTS:
         with closed(place / "ks" / part):
@@ -155,7 +156,7 @@ def test_an_export_reads_the_enclaves_that_it_exports(place: Path) -> None:
             assert each.status == 0 or f"ks/{part}" in each.err, (part, each)
 
 
-@as_root
+@as_users_of_sros
 @pytest.mark.parametrize("verb", some(READING, 3))
 def test_a_verb_that_reads_says_what_it_cannot_read(verb: str, place: Path, spare: Path) -> None:
     whole = sros(*words(verb, spare))
@@ -168,7 +169,7 @@ def test_a_verb_that_reads_says_what_it_cannot_read(verb: str, place: Path, spar
     assert "cannot be read" not in whole.out + whole.err
 
 
-@as_root
+@as_users_of_sros
 def test_a_process_runs_next_to_enclaves_of_other_users(place: Path, spare: Path) -> None:
     """On a robot, each enclave may belong to the user of its process."""
     for verb in ("env {k} /b", "explain {k} /b publish /old_b"):

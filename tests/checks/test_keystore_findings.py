@@ -27,13 +27,11 @@ from tests.checks.bench import SECRET, Bench, new_key
 from tests.checks.keystore_cases import CASES, STRANGER, also_trusted, give_away
 from tests.support.harness import copy_of, policy_text, publish, sros
 from tests.support.long_form import some
+from tests.support.users import as_root
 
 pytest_plugins = ["tests.checks.sound_keystore"]
 
 NOW = datetime.now(UTC)
-
-
-as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can act as several users")
 
 
 def ids(bench: Bench) -> set[str]:
