@@ -30,11 +30,10 @@ from sros_tool.keystore.confirmation import KEY_NOT_HERE, OF_OTHER_CA, OLDER_THA
 from sros_tool.keystore.delivery.release import (
     RELEASE_FILES,
     Release,
-    older_list,
-    retired_authorities,
     seal_problem,
 )
 from sros_tool.keystore.delivery.robot import evaluate_delivered
+from sros_tool.keystore.delivery.rollback import older_list, retired_authorities
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,

@@ -19,7 +19,7 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.delivery.export import distribute
-from sros_tool.keystore.delivery.release import retired_authorities
+from sros_tool.keystore.delivery.rollback import retired_authorities
 from sros_tool.keystore.issuing import keyring
 from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.known_keys import (

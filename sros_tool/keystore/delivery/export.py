@@ -15,8 +15,6 @@ from pathlib import Path
 from shlex import quote
 from typing import Annotated, NamedTuple
 
-from cryptography import x509
-
 from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.faults import Fault
 from sros_tool.files import staged_file
@@ -24,27 +22,29 @@ from sros_tool.fleet.robots import robot_of
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import enclave_of
 from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT, SUFFIXES, file_mode, pack, unpack
-from sros_tool.keystore.delivery.robot import check_same_authority, public_key_of
+from sros_tool.keystore.delivery.robot import check_same_authority
+from sros_tool.keystore.delivery.rollback import (
+    ANSWER_AGAIN,
+    ROLES_OF_FILES,
+    check_own_keys,
+    check_rollback,
+    trusted_in,
+)
 from sros_tool.keystore.fleet import load_fleet, unrecorded_notes
 from sros_tool.keystore.known_keys import (
     known_authorities,
-    known_expiries,
     unlisted_revocations,
 )
 from sros_tool.keystore.layout import (
     AGENT,
-    CERTIFICATE_FILE,
     CRL_FILE,
     ENCLAVES,
     GOVERNANCE_FILE,
-    IDENTITY,
     IDENTITY_CA_FILE,
     KEY_FILE,
     KEY_FILES,
     KEY_URI_FILE,
-    LIST_FILES,
     OPTIONAL_FILES,
-    PERMISSIONS,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
     PRIVATE,
@@ -53,7 +53,6 @@ from sros_tool.keystore.layout import (
     check_readable,
     enclave_folder,
     enclave_path,
-    has_key,
     key_on_robot,
     search_enclaves,
 )
@@ -64,33 +63,21 @@ from sros_tool.keystore.outcomes import (
 from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
 from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore
 from sros_tool.keystore.selection import missing_enclave_error
-from sros_tool.keystore.template import is_ca_service
 from sros_tool.keystore.transaction import Change, Transaction
 from sros_tool.keystore.zenoh_files import open_zenoh
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import (
-    authority_key,
-    authority_text,
-    digest,
     fingerprints,
-    load_certificate,
     load_certificates,
-    pem,
     validity_of,
 )
-from sros_tool.pki.crl import newest_revocations
 from sros_tool.pki.keys import holds_private_key
 from sros_tool.pki.token import read_token_file
-from sros_tool.validity import iso
 from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes, Words
-from sros_tool.wording import counted, first_few
+from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
 
 _SHOWN = 5
-_ANSWER_AGAIN = (
-    "Sign the request.pem in the enclave's folder with `sros sign_request --renew`, and send the "
-    "answer to the robot."
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +123,7 @@ def with_keys_here(
         raise KeystoreError(
             f"the keys of {', '.join(left_out)} are not in keystore '{keystore.root}'",
             "They were made on their robots and stay there.",
-            _ANSWER_AGAIN,
+            ANSWER_AGAIN,
         )
     return ExportSelection(tuple(chosen), tuple(left_out))
 
@@ -163,7 +150,7 @@ def distribute(
     """
     files = exported_files(keystore, names, now, keyless=keyless)
     notes = (*_token_notes(files), *unrecorded_notes(keystore, load_fleet(keystore), names))
-    if _is_archive(target):
+    if target.name.endswith(SUFFIXES):
         changes = _write_archive(keystore, target, files, now=now, force=force, dry_run=dry_run)
         return Export(target, tuple(names), changes, notes)
     changes = _write_folder(keystore, target, files, now=now, force=force, dry_run=dry_run)
@@ -278,7 +265,7 @@ def exported_files(
             raise KeystoreError(
                 f"the key of enclave {name} is not in keystore '{keystore.root}'",
                 "It was made on its robot and stays there, so an export could not run.",
-                _ANSWER_AGAIN,
+                ANSWER_AGAIN,
             )
         evaluation = _evaluate_enclave(keystore, name, now)
         if evaluation.problems:
@@ -400,7 +387,6 @@ def _files_of(
     return _read_files(keystore, name, _FILES)
 
 
-_ROLES_OF_FILES = {IDENTITY_CA_FILE: IDENTITY, PERMISSIONS_CA_FILE: PERMISSIONS}
 _FILES = (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES, *ZENOH_FILES)
 
 
@@ -420,7 +406,7 @@ def _read_files(
                 files[path] = opened.read_inside(path)
                 if file != KEY_FILE and holds_private_key(files[path]):
                     raise _ca_key_error(keystore.root / path)
-                if role := _ROLES_OF_FILES.get(file):
+                if role := ROLES_OF_FILES.get(file):
                     _check_authorities(keystore, role, keystore.root / path, files[path])
                 if file in (GOVERNANCE_FILE, PERMISSIONS_FILE):
                     _check_last(keystore, name, keystore.root / path, files[path])
@@ -505,10 +491,6 @@ def _ca_key_error(path: Path) -> KeystoreError:
     )
 
 
-def _content(path: Path) -> bytes:
-    return read_bytes(path, "file") if path.is_file() else b""
-
-
 def _real_path(path: Path) -> Path:
     # Unlike Path.resolve, realpath does not fail at a loop of links.
     return Path(os.path.realpath(path))
@@ -540,8 +522,8 @@ def _write_folder(
     with Transaction(target, new_keystore=True, dry_run=dry_run) as transaction:
         check_same_authority(target, files)
         _check_robot(keystore, target, files)
-        _check_trust(keystore, target, _present_trust(target, files), files, now)
-        _check_own_keys(target, files)
+        check_rollback(keystore, target, trusted_in(target, files), files, now)
+        check_own_keys(target, files)
         stale = _stale_paths(target, files)
         different = {
             path: data
@@ -581,180 +563,11 @@ def _check_robot(keystore: OpenedKeystore, target: Path, files: Mapping[str, byt
             )
 
 
-def _check_own_keys(target: Path, files: Mapping[str, bytes]) -> None:
-    """Raise `KeystoreError` if a certificate is not for the key that stays in ``target``.
-
-    The key on a token is that of the signing request.
-    """
-    for path, data in files.items():
-        folder, _, file = path.rpartition("/")
-        token_file = files.get(f"{folder}/{KEY_URI_FILE}", b"")
-        if (
-            file != CERTIFICATE_FILE
-            or f"{folder}/{KEY_FILE}" in files
-            or (token_file and token_file != _content(target / folder / KEY_URI_FILE))
-        ):
-            continue
-        key: object = None
-        with suppress(SrosError):  # the key is not in the folder, or damaged
-            key = public_key_of(target / folder, folder) if has_key(target / folder) else None
-        if key and key != load_certificate(data, path).public_key():
-            raise KeystoreError(
-                f"the certificate is not for the key in '{target / folder}'",
-                "No process would start with it. The keystore knows only an earlier key, perhaps "
-                "because it comes from a backup. Nothing was changed.",
-                f"{_ANSWER_AGAIN} If the keystore's certificate is right, remove the key first.",
-            )
-
-
-def _check_trust(
-    keystore: OpenedKeystore,
-    target: Path,
-    present: Mapping[str, bytes],
-    files: Mapping[str, bytes],
-    now: datetime,
-) -> None:
-    """Raise `KeystoreError` if enclaves in ``target`` would trust again what they no longer trust.
-
-    ``present`` maps paths in ``target`` to the content of files, at least of CAs and lists.
-    """
-    if later := _later_authorities(keystore, present, files):
-        path, authority = next(iter(later.items()))
-        role = _ROLES_OF_FILES[path.rpartition("/")[2]]
-        raise KeystoreError(
-            f"'{target / path}' has a later {role} CA than the keystore's",
-            f"It trusts {authority_text(authority)}, and the keystore is from before that: the "
-            "robot would trust the earlier CA again, and what was revoked since. Nothing was "
-            "changed.",
-            "The keystore may come from a backup: docs/howto/keystore_is_lost.md says how to go "
-            f"on. If the keystore's CA is right, first {_removal_of(target, later)}",
-        )
-    if lost := _lost_revocations(keystore, present, files, now):
-        path, (what, why) = next(iter(lost.items()))
-        file = "FILE" if _is_archive(target) else quote(str(target / path))
-        raise KeystoreError(
-            f"'{target / path}' {what}",
-            f"{why}: revoked enclaves would be trusted again. Nothing was changed.",
-            "The keystore may come from a backup: docs/howto/keystore_is_lost.md says what to do, "
-            f"and `sros crl {quote(str(keystore.root))} --refresh --crl {file}` revokes the same "
-            f"again. If the keystore's list is right, export all enclaves of the folder, but first "
-            f"{_removal_of(target, lost)}",
-        )
-
-
-def _present_trust(target: Path, files: Mapping[str, bytes]) -> dict[str, bytes]:
-    """Map paths in a folder, of all its enclaves and of ``files``, to CAs and revocation lists."""
-    folders = {path.rpartition("/")[0] for path in files}
-    if (target / ENCLAVES).is_dir():
-        folders.update(map(enclave_folder, search_enclaves(target)[0]))
-    paths = (
-        f"{at}/{file}" for at in sorted(folders) for file in (*LIST_FILES, PERMISSIONS_CA_FILE)
-    )
-    return {path: data for path in paths if (data := _content(target / path))}
-
-
-def _is_archive(target: Path) -> bool:
-    return target.name.endswith(SUFFIXES)
-
-
-def _removal_of(target: Path, paths: Iterable[str]) -> str:
-    if _is_archive(target):
-        return f"remove the archive: `rm {quote(str(target))}`."
-    files = " ".join(quote(str(target / path)) for path in paths)
-    return f"remove the other: `rm {files}`."
-
-
-def _later_authorities(
-    keystore: OpenedKeystore, present: Mapping[str, bytes], files: Mapping[str, bytes]
-) -> Mapping[str, x509.Certificate]:
-    """Map paths of CA files in ``present`` to a CA in them that replaced the keystore's.
-
-    The keystore is from before a stage of a rotation.  If the ledger has both CAs, it says which
-    replaced which; a CA that the ledger does not have is the later one if it is not older than all
-    CAs in ``files``.
-    """
-    entries = [e for e in keystore.ledger_with("what", "ca").entries if e.what == "ca"]
-    place_in_ledger = {entry.sha256: place for place, entry in enumerate(entries)}
-    later: dict[str, x509.Certificate] = {}
-    for path, data in files.items():
-        if path.rpartition("/")[2] not in _ROLES_OF_FILES or present.get(path) in (data, None):
-            continue
-        sent = load_certificates(data, path)
-        newest = max(validity_of(authority).not_before for authority in sent)
-        with suppress(SrosError):  # a damaged file trusts nobody
-            trusted = load_certificates(present[path], path)
-            keys, kept = set(map(authority_key, trusted)), set(map(authority_key, sent))
-            added = [
-                place_in_ledger.get(digest(authority), len(entries))
-                for authority in sent
-                if authority_key(authority) not in keys
-            ]
-            for authority in trusted:
-                place = place_in_ledger.get(digest(authority))
-                if (
-                    any(place > other for other in added)
-                    if place is not None
-                    else authority_key(authority) not in kept
-                    and validity_of(authority).not_before >= newest
-                ):
-                    later[path] = authority
-    return later
-
-
-def _lost_revocations(
-    keystore: OpenedKeystore,
-    present: Mapping[str, bytes],
-    files: Mapping[str, bytes],
-    now: datetime,
-) -> Mapping[str, tuple[str, str]]:
-    """Map paths in ``present`` to what shows that the keystore lacks their revocation list.
-
-    Lists of all enclaves in the folder count: a new enclave there has none yet.  Only lists count
-    that a CA in ``files`` signed.  The list of the same CA in ``files`` has to have a number as
-    high, and every certificate on it, but for those that the ledger knows to have expired; and
-    those of a CA service, which knows more certificates than the ledger.
-    """
-    places: dict[bytes, list[str]] = defaultdict(list)
-    for path, data in present.items():
-        if path.rpartition("/")[2] in LIST_FILES:
-            places[data].append(path)
-    sources = {
-        (data, files.get(f"{path.removesuffix(IDENTITY_CA_FILE)}{CRL_FILE}", b""))
-        for path, data in files.items()
-        if path.endswith(f"/{IDENTITY_CA_FILE}")
-    }
-    lost: dict[str, tuple[str, str]] = {}
-    for source in sources:
-        for authority in load_certificates(source[0], IDENTITY_CA_FILE):
-            sent = newest_revocations(pem(authority), *source)
-            for data, paths in places.items():
-                there = newest_revocations(pem(authority), data)
-                missing = there.serials - sent.serials
-                expiries = known_expiries(keystore, missing)
-                lacking = [s for s in missing if expiries.get(s, iso(now)) >= iso(now)]
-                if there.number > sent.number:
-                    has = "none" if sent.number < 0 else f"the number {sent.number}"
-                    shown = (
-                        "is a newer revocation list than the keystore's",
-                        f"It has the number {there.number}, the keystore has {has}",
-                    )
-                elif lacking and not is_ca_service(keystore.template.identity_key):
-                    shown = (
-                        f"revokes {counted(len(lacking), 'certificate')} that the keystore's "
-                        "revocation list lacks",
-                        f"One has the serial number {min(lacking):x}, and may not have expired",
-                    )
-                else:
-                    continue
-                lost |= dict.fromkeys(paths, shown)
-    return lost
-
-
 def _stale_paths(target: Path, files: dict[str, bytes]) -> list[str]:
     """Return the paths in ``target`` of files that the enclaves no longer have.
 
     These are Zenoh files, keys, and revocation lists of other CAs, with which nothing starts
-    (`_check_trust` refuses to lose a list of the enclave's own CA).  An enclave that is exported
+    (`check_rollback` refuses to lose a list of the enclave's own CA).  An enclave that is exported
     without a key keeps the key in ``target``: no other copy exists.
     """
     folders = {path.rpartition("/")[0] for path in files}
@@ -793,7 +606,7 @@ def _write_archive(
                 "Nothing was changed.",
                 "Add --force to replace it, or choose another name.",
             )
-        _check_trust(keystore, target, _unpacked(target), files, now)
+        check_rollback(keystore, target, _unpacked(target), files, now)
     change = Change("replace" if target.exists() else "create", target.name)
     if not dry_run:
         with staged_file(target, data) as put_in_place:

@@ -48,10 +48,10 @@ from sros_tool.keystore.delivery.release import (
     check_tuf,
     pack_release,
     read_release,
-    retired_authorities,
     seal_problem,
     seal_releases,
 )
+from sros_tool.keystore.delivery.rollback import retired_authorities
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, recorded_fleet
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import (

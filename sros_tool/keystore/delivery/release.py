@@ -16,8 +16,7 @@ give it to another robot, nor bring back an earlier one.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -28,9 +27,7 @@ from sros_tool.fleet.robots import name_problem
 from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT, listed_digests, pack, unpack
 from sros_tool.keystore.layout import (
     ENCLAVES,
-    IDENTITY_CA_FILE,
     KEY_FILE,
-    LIST_FILES,
     OPTIONAL_FILES,
     RELEASE_SEAL,
     REQUIRED_FILES,
@@ -38,8 +35,6 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import authority_key, load_certificates, pem, validity_of
-from sros_tool.pki.crl import Revocations, newest_revocations
 
 if TYPE_CHECKING:
     from sros_tool.keystore.issuing.authority import Authority
@@ -160,58 +155,6 @@ def seal_problem(release: Release, authorities: Iterable[x509.Certificate]) -> s
     if signed.text != _text(release.robot, release.number, release.files):
         return "robot, number or files differ from the signed list"
     return signed.problem_for(authorities)
-
-
-def retired_authorities(
-    trusted: Sequence[x509.Certificate], sent: Iterable[x509.Certificate]
-) -> list[x509.Certificate]:
-    """Return the CAs in ``sent`` that a later CA in ``trusted`` replaced, told by key and date."""
-    keys = {authority_key(authority) for authority in trusted}
-    newest = max((validity_of(authority).not_before for authority in trusted), default=None)
-    return [
-        authority
-        for authority in sent
-        if newest
-        and validity_of(authority).not_before < newest
-        and authority_key(authority) not in keys
-    ]
-
-
-def older_list(
-    present: Mapping[str, bytes], sent: Mapping[str, bytes]
-) -> tuple[Revocations, Revocations] | None:
-    """Return two lists of a CA, in the ``present`` and the ``sent`` files, if the latter is older.
-
-    Both map the files of an enclave to their content.  A list with the number of another one that
-    revokes something else is older, too.
-    """
-    for here, new in _lists(present, sent):
-        if here != new and here.number >= new.number:
-            return here, new
-    return None
-
-
-def lost_serials(present: Mapping[str, bytes], sent: Mapping[str, bytes]) -> frozenset[int]:
-    """Return the serial numbers on lists in the ``present`` files that those ``sent`` lack."""
-    return frozenset[int]().union(
-        *(here.serials - new.serials for here, new in _lists(present, sent))
-    )
-
-
-def _lists(
-    present: Mapping[str, bytes], sent: Mapping[str, bytes]
-) -> Iterator[tuple[Revocations, Revocations]]:
-    """Yield the lists of each CA that the ``sent`` files trust, in both files.
-
-    In a rotation, the list of the second CA is in the file of the CAs.
-    """
-    with suppress(SrosError):  # damaged files change no enclave
-        for authority in load_certificates(sent.get(IDENTITY_CA_FILE, b""), IDENTITY_CA_FILE):
-            here, new = (
-                newest_revocations(pem(authority), *(files.get(file, b"") for file in LIST_FILES))
-                for files in (present, sent)
-            )
-            yield here, new
 
 
 def _text(robot: str, number: int, files: Mapping[str, bytes]) -> bytes:

@@ -18,9 +18,10 @@ from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosE
 from sros_tool.files import write_new_file
 from sros_tool.keystore.confirmation import OF_ANOTHER_KEY
 from sros_tool.keystore.delivery.archive import listed_digests, unpack
-from sros_tool.keystore.delivery.release import (
+from sros_tool.keystore.delivery.rollback import (
     lost_serials,
     older_list,
+    public_key_of,
     retired_authorities,
 )
 from sros_tool.keystore.issuing.acceptance import refuse_stopping
@@ -505,21 +506,6 @@ def import_answer(
         first=not known,
         until=until,
     )
-
-
-def public_key_of(place: Path, name: str) -> PublicKey:
-    """Return the public key of an enclave, from its key file or its signing request.
-
-    A key on a token has no file, but it signed the request.
-
-    Raises:
-        SrosError: key and request are missing, or the file cannot be read.
-    """
-    path = place / KEY_FILE
-    if path.exists():
-        return load_key(read_bytes(path, "private key"), f"'{path}'").public_key()
-    request = load_request(read_bytes(place / REQUEST, "signing request"), f"of enclave {name}")
-    return request.public_key
 
 
 def _check_pinned(

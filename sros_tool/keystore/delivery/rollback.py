@@ -1,0 +1,301 @@
+"""Whether files would take a robot back to earlier CAs, revocation lists or keys: a rollback.
+
+Signatures and numbers do not show one: a keystore that was restored from a backup signs as before,
+and may have issued more since than the lost one.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from datetime import datetime
+from pathlib import Path
+from shlex import quote
+
+from cryptography import x509
+
+from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.keystore.delivery.archive import SUFFIXES
+from sros_tool.keystore.known_keys import known_expiries
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    CRL_FILE,
+    ENCLAVES,
+    IDENTITY,
+    IDENTITY_CA_FILE,
+    KEY_FILE,
+    KEY_URI_FILE,
+    LIST_FILES,
+    PERMISSIONS,
+    PERMISSIONS_CA_FILE,
+    REQUEST,
+    enclave_folder,
+    has_key,
+    search_enclaves,
+)
+from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.keystore.template import is_ca_service
+from sros_tool.pki.certificates import (
+    authority_key,
+    authority_text,
+    digest,
+    load_certificate,
+    load_certificates,
+    load_request,
+    pem,
+    validity_of,
+)
+from sros_tool.pki.crl import Revocations, newest_revocations
+from sros_tool.pki.keys import PublicKey, load_key
+from sros_tool.validity import iso
+from sros_tool.wording import counted
+from sros_tool.xml import read_bytes
+
+ANSWER_AGAIN = (
+    "Sign the request.pem in the enclave's folder with `sros sign_request --renew`, and send the "
+    "answer to the robot."
+)
+ROLES_OF_FILES = {IDENTITY_CA_FILE: IDENTITY, PERMISSIONS_CA_FILE: PERMISSIONS}
+
+
+# ── lists and CAs of one enclave ───────────────────────────────────────────────────────────
+
+
+def retired_authorities(
+    trusted: Sequence[x509.Certificate], sent: Iterable[x509.Certificate]
+) -> list[x509.Certificate]:
+    """Return the CAs in ``sent`` that a later CA in ``trusted`` replaced, told by key and date."""
+    keys = {authority_key(authority) for authority in trusted}
+    newest = max((validity_of(authority).not_before for authority in trusted), default=None)
+    return [
+        authority
+        for authority in sent
+        if newest
+        and validity_of(authority).not_before < newest
+        and authority_key(authority) not in keys
+    ]
+
+
+def older_list(
+    present: Mapping[str, bytes], sent: Mapping[str, bytes]
+) -> tuple[Revocations, Revocations] | None:
+    """Return two lists of a CA, in the ``present`` and the ``sent`` files, if the latter is older.
+
+    Both map the files of an enclave to their content.  A list with the number of another one that
+    revokes something else is older, too.
+    """
+    for here, new in _lists(present, sent):
+        if here != new and here.number >= new.number:
+            return here, new
+    return None
+
+
+def lost_serials(present: Mapping[str, bytes], sent: Mapping[str, bytes]) -> frozenset[int]:
+    """Return the serial numbers on lists in the ``present`` files that those ``sent`` lack."""
+    return frozenset[int]().union(
+        *(here.serials - new.serials for here, new in _lists(present, sent))
+    )
+
+
+def _lists(
+    present: Mapping[str, bytes], sent: Mapping[str, bytes]
+) -> Iterator[tuple[Revocations, Revocations]]:
+    """Yield the lists of each CA that the ``sent`` files trust, in both files.
+
+    In a rotation, the list of the second CA is in the file of the CAs.
+    """
+    with suppress(SrosError):  # damaged files change no enclave
+        for authority in load_certificates(sent.get(IDENTITY_CA_FILE, b""), IDENTITY_CA_FILE):
+            here, new = (
+                newest_revocations(pem(authority), *(files.get(file, b"") for file in LIST_FILES))
+                for files in (present, sent)
+            )
+            yield here, new
+
+
+# ── an export over what is there ───────────────────────────────────────────────────────────
+
+
+def check_rollback(
+    keystore: OpenedKeystore,
+    target: Path,
+    present: Mapping[str, bytes],
+    files: Mapping[str, bytes],
+    now: datetime,
+) -> None:
+    """Raise `KeystoreError` if enclaves in ``target`` would trust again what they no longer trust.
+
+    ``present`` maps paths in ``target`` to the content of files, at least of CAs and lists.
+    """
+    if later := _later_authorities(keystore, present, files):
+        path, authority = next(iter(later.items()))
+        role = ROLES_OF_FILES[path.rpartition("/")[2]]
+        raise KeystoreError(
+            f"'{target / path}' has a later {role} CA than the keystore's",
+            f"It trusts {authority_text(authority)}, and the keystore is from before that: the "
+            "robot would trust the earlier CA again, and what was revoked since. Nothing was "
+            "changed.",
+            "The keystore may come from a backup: docs/howto/keystore_is_lost.md says how to go "
+            f"on. If the keystore's CA is right, first {_removal_of(target, later)}",
+        )
+    if lost := _lost_revocations(keystore, present, files, now):
+        path, (what, why) = next(iter(lost.items()))
+        file = "FILE" if target.name.endswith(SUFFIXES) else quote(str(target / path))
+        raise KeystoreError(
+            f"'{target / path}' {what}",
+            f"{why}: revoked enclaves would be trusted again. Nothing was changed.",
+            "The keystore may come from a backup: docs/howto/keystore_is_lost.md says what to do, "
+            f"and `sros crl {quote(str(keystore.root))} --refresh --crl {file}` revokes the same "
+            f"again. If the keystore's list is right, export all enclaves of the folder, but first "
+            f"{_removal_of(target, lost)}",
+        )
+
+
+def trusted_in(target: Path, files: Mapping[str, bytes]) -> dict[str, bytes]:
+    """Map paths in a folder, of all its enclaves and of ``files``, to CAs and revocation lists."""
+    folders = {path.rpartition("/")[0] for path in files}
+    if (target / ENCLAVES).is_dir():
+        folders.update(map(enclave_folder, search_enclaves(target)[0]))
+    paths = (
+        f"{at}/{file}" for at in sorted(folders) for file in (*LIST_FILES, PERMISSIONS_CA_FILE)
+    )
+    return {path: data for path in paths if (data := _content(target / path))}
+
+
+def _removal_of(target: Path, paths: Iterable[str]) -> str:
+    if target.name.endswith(SUFFIXES):
+        return f"remove the archive: `rm {quote(str(target))}`."
+    files = " ".join(quote(str(target / path)) for path in paths)
+    return f"remove the other: `rm {files}`."
+
+
+def _later_authorities(
+    keystore: OpenedKeystore, present: Mapping[str, bytes], files: Mapping[str, bytes]
+) -> Mapping[str, x509.Certificate]:
+    """Map paths of CA files in ``present`` to a CA in them that replaced the keystore's.
+
+    The keystore is from before a stage of a rotation.  If the ledger has both CAs, it says which
+    replaced which; a CA that the ledger does not have is the later one if it is not older than all
+    CAs in ``files``.
+    """
+    entries = [e for e in keystore.ledger_with("what", "ca").entries if e.what == "ca"]
+    place_in_ledger = {entry.sha256: place for place, entry in enumerate(entries)}
+    later: dict[str, x509.Certificate] = {}
+    for path, data in files.items():
+        if path.rpartition("/")[2] not in ROLES_OF_FILES or present.get(path) in (data, None):
+            continue
+        sent = load_certificates(data, path)
+        newest = max(validity_of(authority).not_before for authority in sent)
+        with suppress(SrosError):  # a damaged file trusts nobody
+            trusted = load_certificates(present[path], path)
+            keys, kept = set(map(authority_key, trusted)), set(map(authority_key, sent))
+            added = [
+                place_in_ledger.get(digest(authority), len(entries))
+                for authority in sent
+                if authority_key(authority) not in keys
+            ]
+            for authority in trusted:
+                place = place_in_ledger.get(digest(authority))
+                if (
+                    any(place > other for other in added)
+                    if place is not None
+                    else authority_key(authority) not in kept
+                    and validity_of(authority).not_before >= newest
+                ):
+                    later[path] = authority
+    return later
+
+
+def _lost_revocations(
+    keystore: OpenedKeystore,
+    present: Mapping[str, bytes],
+    files: Mapping[str, bytes],
+    now: datetime,
+) -> Mapping[str, tuple[str, str]]:
+    """Map paths in ``present`` to what shows that the keystore lacks their revocation list.
+
+    Lists of all enclaves in the folder count: a new enclave there has none yet.  Only lists count
+    that a CA in ``files`` signed.  The list of the same CA in ``files`` has to have a number as
+    high, and every certificate on it, but for those that the ledger knows to have expired; and
+    those of a CA service, which knows more certificates than the ledger.
+    """
+    places: dict[bytes, list[str]] = defaultdict(list)
+    for path, data in present.items():
+        if path.rpartition("/")[2] in LIST_FILES:
+            places[data].append(path)
+    sources = dict.fromkeys(
+        (data, files.get(f"{path.removesuffix(IDENTITY_CA_FILE)}{CRL_FILE}", b""))
+        for path, data in files.items()
+        if path.endswith(f"/{IDENTITY_CA_FILE}")
+    )
+    lost: dict[str, tuple[str, str]] = {}
+    for source in sources:
+        for authority in load_certificates(source[0], IDENTITY_CA_FILE):
+            sent = newest_revocations(pem(authority), *source)
+            for data, paths in places.items():
+                there = newest_revocations(pem(authority), data)
+                missing = there.serials - sent.serials
+                expiries = known_expiries(keystore, missing)
+                lacking = [s for s in missing if expiries.get(s, iso(now)) >= iso(now)]
+                if there.number > sent.number:
+                    has = "none" if sent.number < 0 else f"the number {sent.number}"
+                    shown = (
+                        "is a newer revocation list than the keystore's",
+                        f"It has the number {there.number}, the keystore has {has}",
+                    )
+                elif lacking and not is_ca_service(keystore.template.identity_key):
+                    shown = (
+                        f"revokes {counted(len(lacking), 'certificate')} that the keystore's "
+                        "revocation list lacks",
+                        f"One has the serial number {min(lacking):x}, and may not have expired",
+                    )
+                else:
+                    continue
+                lost |= dict.fromkeys(paths, shown)
+    return lost
+
+
+def check_own_keys(target: Path, files: Mapping[str, bytes]) -> None:
+    """Raise `KeystoreError` if a certificate is not for the key that stays in ``target``.
+
+    The key on a token is that of the signing request.
+    """
+    for path, data in files.items():
+        folder, _, file = path.rpartition("/")
+        token_file = files.get(f"{folder}/{KEY_URI_FILE}", b"")
+        if (
+            file != CERTIFICATE_FILE
+            or f"{folder}/{KEY_FILE}" in files
+            or (token_file and token_file != _content(target / folder / KEY_URI_FILE))
+        ):
+            continue
+        key: object = None
+        with suppress(SrosError):  # the key is not in the folder, or damaged
+            key = public_key_of(target / folder, folder) if has_key(target / folder) else None
+        if key and key != load_certificate(data, path).public_key():
+            raise KeystoreError(
+                f"the certificate is not for the key in '{target / folder}'",
+                "No process would start with it. The keystore knows only an earlier key, perhaps "
+                "because it comes from a backup. Nothing was changed.",
+                f"{ANSWER_AGAIN} If the keystore's certificate is right, remove the key first.",
+            )
+
+
+def public_key_of(place: Path, name: str) -> PublicKey:
+    """Return the public key of an enclave, from its key file or its signing request.
+
+    A key on a token has no file, but it signed the request.
+
+    Raises:
+        SrosError: key and request are missing, or the file cannot be read.
+    """
+    path = place / KEY_FILE
+    if path.exists():
+        return load_key(read_bytes(path, "private key"), f"'{path}'").public_key()
+    request = load_request(read_bytes(place / REQUEST, "signing request"), f"of enclave {name}")
+    return request.public_key
+
+
+def _content(path: Path) -> bytes:
+    return read_bytes(path, "file") if path.is_file() else b""
