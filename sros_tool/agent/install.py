@@ -279,7 +279,8 @@ def _check_lists(name: str, files: Mapping[str, bytes], present: Mapping[str, by
             "keystore comes from a backup. Nothing was changed.",
             "Look at what the server serves, and publish there again. Only if the keystore "
             "comes from a backup, first run `sros fleet collect KEYSTORE INBOX`, which takes "
-            "the list from the message of this robot.",
+            "the list from the message of this robot; in a rotation, also `sros crl KEYSTORE "
+            f"--refresh --crl FILE`, with {IDENTITY_CA_FILE} of this robot as FILE.",
         )
 
 
