@@ -363,14 +363,11 @@ class ZenohEvaluator:
             enclave: the enclave.
             question: the right that is asked for.
             reach: also list the enclaves at the other end of the right.
-            brief: do not list unsigned files, and read as little as possible: the router's file in
-                place of the files of peers, which have the same rights; if the router drops the
-                message, only the beginning of the enclave's file.
+            brief: do not list unsigned files, and read the router's file in place of the files of
+                peers, which have the same rights.
         """
         if enclave not in self.names:
             raise missing_enclave_error(self.keystore, enclave, self.names)
-        if brief and (dropped := self._dropped_by_router(enclave, question)):
-            return dropped
         own_file = self._file(enclave, self._file_of(enclave))
         answer = ZenohAnswer(
             enclave,
@@ -425,34 +422,6 @@ class ZenohEvaluator:
         answer = self.answer(enclave, part, reach=False, brief=brief)
         needed = [c for c in answer.checks if part.word == "reply" or c.message != Message.REPLY]
         return bool(needed) and all(check.allowed for check in needed)
-
-    def _dropped_by_router(self, enclave: str, question: Question) -> ZenohAnswer | None:
-        """Return the answer if the router drops the message, whatever the enclave's files state.
-
-        Return None if the router does not drop it, or if the enclave's file does not begin as sros
-        writes it.
-        """
-        router = self._router_of(enclave)
-        path = enclave_path(self.root, enclave) / SESSION_FILE
-        if router.process is None or enclave in self.routers or not path.exists():
-            return None
-        try:
-            begun = self._rendered.configuration_without_rules(
-                self.keystore.read(path, "Zenoh configuration")
-            )
-        except SrosError:
-            return None
-        if begun is None or not _addresses_meet(
-            tuple(map(ZenohEndpoint, begun.connect)), router.endpoints
-        ):
-            return None
-        session = _unrestricted_process(enclave, begun.mode)
-        checks = tuple(self._link_checks(session, router.process, self._rights(enclave, question)))
-        dropping = _check_to_report((check for check in checks if not check.allowed), enclave)
-        if dropping is None or dropping.message not in _DATA:
-            return None
-        outcome, text = _Outcome.DROPPED, self._reason_text(dropping)
-        return ZenohAnswer(enclave, question, begun.mode, outcome, text, checks)
 
     def _reason_text(self, check: Check | None) -> str:
         """Return a clause that names the deciding check, its reason, and the file with its rule."""

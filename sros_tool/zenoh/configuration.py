@@ -403,14 +403,6 @@ class RenderedReader:
         except (ValueError, KeyError, IndexError, TypeError, RecursionError):
             return None
 
-    def configuration_without_rules(self, data: bytes) -> Configuration | None:
-        """Return a configuration without its rules, or None if sros did not write the file."""
-        try:
-            text, mark, _ = data.decode().partition(_CONTROL)
-            return self._parse_without_rules(text) if mark else None
-        except (ValueError, KeyError, IndexError, TypeError, RecursionError):
-            return None
-
     def _parse_without_rules(self, text: str) -> Configuration:
         """Return mode and endpoints of a configuration.
 

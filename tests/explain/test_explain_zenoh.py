@@ -186,7 +186,6 @@ def test_a_part_of_an_action_that_no_enclave_names_is_noted(tmp_path: Path) -> N
 
 
 def test_who_may_says_what_each_enclave_is_told(made: Path) -> None:
-    """What the router drops is decided without the enclave's own files, with the same answer."""
     evaluator = ZenohEvaluator(OpenedKeystore(made / "client"), moment=now(), domain=0)
     outcomes = set()
     for enclave, words in product(evaluator.names, ("publish /chatter", "call /add", "join")):
@@ -198,13 +197,14 @@ def test_who_may_says_what_each_enclave_is_told(made: Path) -> None:
     assert outcomes == {"allowed", "dropped"}
 
 
-def test_who_may_reads_the_identity_of_those_that_the_router_lets(keystore: Path) -> None:
+def test_who_may_reads_the_files_of_each_enclave(keystore: Path) -> None:
+    """An enclave that cannot start is refused, also if the router would drop its message."""
     (keystore / "enclaves/listener/cert.pem").write_text("no certificate")
     outcome = {}
     for right in ("subscribe", "publish"):
         asked = zenoh(keystore, "--who", right, "/chatter")
         outcome[right] = {e["enclave"]: e["outcome"] for e in asked["enclaves"]}["/listener"]
-    assert outcome == {"subscribe": "refused", "publish": "dropped"}
+    assert outcome == {"subscribe": "refused", "publish": "refused"}
     missing = keystore / "enclaves/wide/session.json5"
     missing.unlink()
     asked = zenoh(keystore, "--who", "publish", "/chatter")
