@@ -28,6 +28,7 @@ from sros_tool.policy.model import (
     ALLOW,
     DENY,
     RIGHTS,
+    Enclave,
     Level,
     Policy,
     Qualifier,
@@ -43,6 +44,7 @@ from sros_tool.policy.rights import (
     group_rights,
     order,
     policy_rights,
+    profile_rights,
 )
 from sros_tool.values import DryRun, FileChanges, Notes, shows
 from sros_tool.wording import first_few
@@ -55,7 +57,8 @@ _SHOWN = 3
 class Contradiction:
     """A right that the policy file allows and a merged policy denies, or the reverse.
 
-    The right may be denied in part.  The denial always decides.
+    Or a merged policy allows it to a node, and denies it to another node of the same enclave.  The
+    right may be denied in part.  The denial always decides.
     """
 
     denied: Right
@@ -125,6 +128,7 @@ class _Planner:
                                 entry = here.setdefault((group.kind, fqn), _Name(name, {}))
                                 entry.protect = entry.protect or group.protect
                                 entry.rights[right, qualifier] = None
+            self._contradictions += self._between_nodes(enclave)
         entries = {
             place: tuple(sorted(_entries(place_names), key=_entry_order))
             for place, place_names in sorted(names.items(), key=lambda item: _place_order(item[0]))
@@ -151,6 +155,27 @@ class _Planner:
             if not self._asked.cover(denied):  # otherwise both sides state this denial
                 self._contradictions.append(Contradiction(denied, right, False))
         return not (self._file.cover(right) or self._file.cover(denial))
+
+    def _between_nodes(self, enclave: Enclave) -> Iterator[Contradiction]:
+        """Yield the rights of nodes of an enclave that another of its nodes denies to all."""
+        nodes: dict[tuple[str, str], set[Right]] = {}
+        for profile in enclave.all_profiles():
+            of_node = nodes.setdefault((profile.ns, profile.node), set())
+            of_node.update(profile_rights(enclave.path, profile))
+        denials = {
+            node: sorted(right for right in rights if right.qualifier is DENY)
+            for node, rights in nodes.items()
+        }
+        if len(nodes) < 2 or not any(denials.values()):
+            return
+        rules = {node: Rules(rights) for node, rights in nodes.items()}
+        for node, denied_to in denials.items():
+            for denied in denied_to:
+                for other, stated in rules.items():
+                    if other == node or stated.cover(denied):
+                        continue
+                    for allowed in folded(stated.overlapping(denied._replace(qualifier=ALLOW))):
+                        yield Contradiction(denied, allowed, self._is_wanted(denied))
 
 
 @dataclass(slots=True)
@@ -191,7 +216,7 @@ def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
         shown = [right.describe() for right in dict.fromkeys(sorted(allowed, key=order))]
         shown_text = first_few(shown, _SHOWN)
         if new:
-            text = f"{denied} was added. It removes rights that the file allows: {shown_text}."
+            text = f"{denied} was added, and overrides rights of the enclave: {shown_text}."
             notes.append(Note("merge.newly-denied", text))
         else:
             text = f"{denied} stays, and overrides requested rights: {shown_text}."

@@ -11,7 +11,7 @@ the topics and services that it consists of (rcl, pull request 1170).
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from shlex import quote
 from typing import NamedTuple
@@ -24,7 +24,7 @@ from sros_tool.names import (
     expression_problem,
     is_expression,
 )
-from sros_tool.policy.model import Group, Policy, Profile
+from sros_tool.policy.model import DENY, Group, Policy, Profile
 from sros_tool.policy.patterns import matches
 from sros_tool.wording import enumerated
 
@@ -45,11 +45,16 @@ class Remapping(NamedTuple):
 
 
 class UsedRule(NamedTuple):
-    """A rule that changed a node or one of its groups (``kind``, "" for the node itself)."""
+    """A rule that changed a node (``kind`` is ""), or a name in one of the node's groups.
+
+    ``kind`` is that of the group; ``old`` and ``new`` are the name in full before and after.
+    """
 
     rule: Remapping
     node: str
     kind: str = ""
+    old: str = ""
+    new: str = ""
 
 
 def parse_remapping(text: str) -> Remapping:
@@ -89,7 +94,9 @@ def remapped_policies(
             a name that no policy has.
     """
     rules = [parse_remapping(text) for text in texts]
-    remapped = [remapped_policy(policy, rules) for policy in policies]
+    policies = tuple(policies)
+    moved = {use for policy in policies for use in remapped_policy(policy, rules)[1] if use.kind}
+    remapped = [remapped_policy(policy, rules, moved) for policy in policies]
     notes = []
     for rule in rules:
         uses = {use for _, of_policy in remapped for use in of_policy if use.rule == rule}
@@ -119,10 +126,13 @@ def remapped_policies(
     return [policy for policy, _ in remapped], notes
 
 
-def remapped_policy(policy: Policy, rules: Sequence[Remapping]) -> tuple[Policy, set[UsedRule]]:
+def remapped_policy(
+    policy: Policy, rules: Sequence[Remapping], moved_names: Collection[UsedRule] = ()
+) -> tuple[Policy, set[UsedRule]]:
     """Return a policy with remapped names, and the uses of the rules.
 
-    Where a wildcard matches the old name, the new name is added to the wildcard.
+    Where a wildcard matches the old name, the new name is added to the wildcard.  The names in
+    ``moved_names``, of any node, are also added to each DENY that matches the old one.
     """
     used: set[UsedRule] = set()
 
@@ -134,8 +144,11 @@ def remapped_policy(policy: Policy, rules: Sequence[Remapping]) -> tuple[Policy,
         ns = moved[0].new if moved else profile.ns
         used.update(UsedRule(rule, profile.node) for rule in renamed[:1] + moved[:1])
         of_names = [rule for rule in of_node if rule.old != _NAMESPACE]
-        groups = tuple(_remapped_group(group, of_names, ns, node, used) for group in profile.groups)
-        return replace(profile, ns=ns, node=node, groups=groups)
+        groups = []
+        for group in profile.groups:
+            groups.append(_remapped_group(group, of_names, ns, node, used))
+            groups += _denials_of_moved_names(group, groups[-1], moved_names, ns, node)
+        return replace(profile, ns=ns, node=node, groups=tuple(groups))
 
     enclaves = tuple(enclave.with_profiles(remapped) for enclave in policy.enclaves)
     return replace(policy, enclaves=enclaves), used
@@ -152,7 +165,10 @@ def _remapped_group(
     def new_names(name: str) -> Iterator[str]:
         full = expand(name, ns, node)
         fitting = [rule for old, rule in by_name.items() if matches(full, old)]
-        used.update(UsedRule(rule, node, group.kind) for rule in fitting)
+        used.update(
+            UsedRule(rule, node, group.kind, expand(rule.old, ns, node), expand(rule.new, ns, node))
+            for rule in fitting
+        )
         if not fitting or is_expression(full):
             yield name
         yield from (rule.new for rule in fitting)
@@ -165,3 +181,23 @@ def _remapped_group(
     names = tuple(name for name, _ in pairs)
     lines = tuple(line for _, line in pairs) if group.lines else ()
     return replace(group, names=names, lines=lines)
+
+
+def _denials_of_moved_names(
+    group: Group, remapped: Group, moved_names: Iterable[UsedRule], ns: str, node: str
+) -> Iterator[Group]:
+    """Yield a group of the names that a DENY of ``group`` also has to deny, if there are any."""
+    denials = tuple(right for right in group.rights if right[1] is DENY)
+    if not denials:
+        return
+    stated = [expand(name, ns, node) for name in group.names]
+    present = {expand(name, ns, node) for name in remapped.names}
+    lines: dict[str, int] = {}
+    for use in sorted(moved_names, key=lambda use: (use.old, use.new)):
+        if use.kind == group.kind and use.new not in present:
+            denying = [index for index, full in enumerate(stated) if matches(full, use.old)]
+            for index in denying[:1]:
+                lines.setdefault(use.new, group.source_of(index).line)
+    if lines:
+        names = tuple(lines)
+        yield replace(group, rights=denials, names=names, lines=tuple(lines.values()))

@@ -102,6 +102,37 @@ def test_a_policy_whose_names_are_remapped(rules: list[str], names: set[str] | N
         assert remappings[0] in {use.rule for use in used}
 
 
+@pytest.mark.parametrize(
+    ("denied", "rule", "names"),
+    [
+        ("/*x", "n:x:=/mux/x_of_n", {"/*x", "/mux/x_of_n"}),
+        ("x", "n:x:=~/speed", {"/x", "/n/speed"}),
+        ("/*z", "n:x:=/mux/x_of_n", {"/*z"}),
+        ("x", "x:=/other", {"/other"}),
+        ("/*x", "x:=/other", {"/*x", "/other"}),
+    ],
+)
+def test_a_new_name_of_one_node_stays_denied_to_the_others(
+    denied: str, rule: str, names: set[str]
+) -> None:
+    """Also where the rule is for one node: a DENY is a promise on what the name stands for."""
+    denying = group("topics", denied, publish="DENY", subscribe="ALLOW")
+    policies = [one(denying, node="m"), one(group("topics", "x", publish="ALLOW"))]
+    (of_m, of_n), _ = remapped_policies(policies, [rule])
+    rights = policy_rights(of_m)
+    assert {right.name for right in rights if right.right == "publish"} == names
+    assert all((right.qualifier is DENY) == (right.right == "publish") for right in rights)
+    assert {right.qualifier for right in policy_rights(of_n)} == {ALLOW}
+
+
+def test_names_that_are_exchanged_are_denied_as_before() -> None:
+    both = one(group("topics", "x", publish="DENY"), group("topics", "y", publish="ALLOW"))
+    (exchanged,), _ = remapped_policies([both], ["x:=y", "y:=x"])
+    assert {(str(right.qualifier), right.name) for right in policy_rights(exchanged)} == {
+        ("DENY", "/y"), ("ALLOW", "/x")
+    }  # fmt: skip
+
+
 def test_what_nodes_remap_otherwise_is_noted() -> None:
     """Only rcl_action 9.2.8 (Jazzy), or of Kilted and later, remaps the name of an action."""
     nodes = [one(group("actions", "plan", execute="ALLOW"), node=node) for node in ("n", "hand")]
@@ -197,6 +228,29 @@ def test_a_denial_stays_and_is_told(
     plan = plan_merge(before, asked)
     assert [f"{right.qualifier} {right.name}" for right in plan.added] == added
     assert [each.id for each in merge_notes(plan.contradictions)] == ([note] if note else [])
+
+
+def test_what_one_node_of_an_enclave_denies_to_another_is_told() -> None:
+    """In one process, each DENY applies to all nodes; those of its own node are meant."""
+    nodes = {
+        node: one(*groups, node=node)
+        for node, groups in (
+            ("detector", (ALL, DENIED)), ("docker", (ALLOWED,)), ("light", (ALL, DENIED)),
+        )
+    }  # fmt: skip
+
+    def composed(*names: str) -> Policy:
+        blocks = (block for name in names for block in nodes[name].enclaves[0].profiles)
+        return Policy((Enclave("/a", tuple(blocks)),))
+
+    empty = Policy(())
+    (note,) = merge_notes(plan_merge(empty, composed("detector", "docker")).contradictions)
+    assert note.id == "merge.newly-denied"
+    assert "DENY subscribe topic /cam/* was added, and overrides" in note.text
+    assert note.text.endswith(": subscribe topic /cam/a.")
+    assert not plan_merge(empty, composed("detector", "light")).contradictions
+    again = plan_merge(nodes["detector"], composed("detector", "docker")).contradictions
+    assert [note.id for note in merge_notes(again)] == ["merge.still-denied"]
 
 
 def test_a_denial_is_told_once_for_all_that_it_meets() -> None:
