@@ -459,7 +459,8 @@ def _log_hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
             fields = {name: value or "" for name, value in match.groupdict().items()}
             if domain := LINE_DOMAIN.search(line):
                 fields["domain"] = domain[1]
-            yield _Hit(number, text, process, enclaves.get(process, ""), meaning, fields)
+            enclave = enclaves.get(process) or fields.get("enclave", "")
+            yield _Hit(number, text, process, enclave, meaning, fields)
 
 
 def _rejoined_message(process: str, line: str, rest: str, following: str) -> str:
@@ -866,8 +867,10 @@ class _Examiner:
             elsewhere, remedy = self._other_folder_cause(denial, enclave)
             facts += elsewhere
             remedy = remedy or (
-                "The process loaded permissions of another policy, or earlier ones: sign this "
-                "policy, export the enclave, and restart the process."
+                "The process loaded permissions of another policy: an earlier one, an edited one, "
+                "or one that was merged with --remap, while the process lacks that remapping. "
+                "Ask for the robot's policy, and name it in place of this one. If this is the "
+                "robot's policy, sign it, export the enclave, and restart the process."
                 if self._policy
                 else "Restart the process: it loaded earlier permissions. If it runs from an "
                 "export, export the enclave again first."
@@ -985,6 +988,11 @@ class _Examiner:
         ]
         if commands:
             shows = "shows" if len(commands) == 1 else "show"
+            if denial.by_rule:
+                return (
+                    f"{' and '.join(commands)} {shows} the DENY, and where the policy has it: no "
+                    "ALLOW helps against it."
+                )
             return f"{' and '.join(commands)} {shows} what is missing in the policy.{advice}"
         folder = f"{root}/enclaves/{enclave.lstrip('/')}".rstrip("/")
         return (

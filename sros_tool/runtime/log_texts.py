@@ -226,7 +226,7 @@ _ROS_TEXTS = (
     _log_text(
         "not-started", _ROS,
         r"Unable to (?:run the command|print the environment): (?P<reason>a process cannot run in "
-        r"enclave .+)",
+        r"enclave (?P<enclave>/[\w/]*).+)",
         "sros did not start the process: {reason}",
         "Repair what the line names (if a file expired: `sros renew KEYSTORE ENCLAVE`, and export "
         "the enclave again), and start the process again.",

@@ -940,6 +940,28 @@ def test_a_log_of_a_robot_that_has_the_policy_in_a_namespace(
     assert "Write x in the policy, without a / at its beginning: the robot of the log has" in said
     assert "no rule allows publish rt/left/x" in said
     assert "the policy allows it to /a, which is /left/a in namespace /left\n" in said
+    assert (
+        "merged with --remap, while the process lacks that remapping. Ask for the robot's" in said
+    )
+
+
+def test_a_denial_by_a_rule_is_not_said_to_miss_something(tmp_path: Path) -> None:
+    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    policy.write_text(policy_text({"/a": publish("/x").replace("ALLOW", "DENY")}))
+    log.write_text("[SECURITY Error] rt/x topic denied by deny rule. -> check_create_datawriter\n")
+    said = sros("explain", policy, "/a", "--log", log).out
+    assert f"`sros explain {policy} /a publish /x` shows the DENY, and where the policy" in said
+    assert "is missing" not in said
+
+
+def test_a_refusal_of_sros_names_the_enclave_as_the_robot_has_it(tmp_path: Path) -> None:
+    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    policy.write_text(policy_text({"/a": publish("y")}))
+    log.write_text(
+        "Unable to run the command: a process cannot run in enclave /left/a. It expired\n"
+    )
+    said = sros("explain", policy, "/a", "--log", log).out
+    assert "`sros renew KEYSTORE /left/a`" in said
 
 
 def test_a_log_with_many_enclaves_does_not_put_the_whole_policy_into_each_namespace(
@@ -1130,7 +1152,7 @@ def test_an_expired_enclave_is_renewed(keystore: Path, tmp_path: Path) -> None:
     log = tmp_path / "robot.log"
     log.write_text(refused.err.partition(": it expired")[0])
     assert f"{renew}{ENCLAVE}`." in sros("explain", keystore, ENCLAVE, "--log", log).out
-    assert f"{renew}ENCLAVE`" in sros("explain", keystore, "--log", log).out
+    assert f"{renew}{ENCLAVE}`." in sros("explain", keystore, "--log", log).out
 
 
 def test_a_known_line_is_shown_without_time_and_source() -> None:
