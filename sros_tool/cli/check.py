@@ -125,7 +125,7 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
     type=PATH,
     multiple=True,
     metavar="FILE",
-    help="Compare the permissions of keystores with this policy.",
+    help="Compare the permissions of keystores with this policy.  Can be repeated.",
 )
 @fleet_option("The robots that the placeholders of policies stand for.")
 @click.option(

@@ -413,6 +413,16 @@ def test_a_node_that_was_observed_in_an_enclave_of_its_own(folder: Path) -> None
     assert "minimize.enclave-not-in-policy" in ended.err
 
 
+def test_a_right_that_was_never_used_is_what_the_comparison_fails_for(folder: Path) -> None:
+    """As the page on continuous integration says; `minimize_policy` itself does not fail."""
+    (folder / "own.xml").write_text(policy_text({"/n": publish("/x", "/y")}))
+    for used, status in ((("/x", "/y", "/z"), 0), (("/x",), 1)):
+        (folder / "seen.xml").write_text(policy_text({"/n": publish(*used)}))
+        observed = ("--observed", "seen.xml", "-o", "narrow.xml", "--force")
+        sros("minimize_policy", "own.xml", *observed).ok()
+        assert sros("diff_policy", "own.xml", "narrow.xml").status == status
+
+
 def test_minimize_with_permissions_and_several_observations(keystore: Path) -> None:
     policy = keystore.parent / "p.xml"
     policy.write_text(policy_text({"/a": publish("*"), "/b": publish("old_b", "more"), "/c": DENY}))
