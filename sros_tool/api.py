@@ -875,7 +875,7 @@ def check_requirements(
     from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.keystore.template import load_template
     from sros_tool.names import check_plain_namespace
-    from sros_tool.proof.findings import requirement_findings
+    from sros_tool.proof.findings import requirement_findings, robots_left_out
     from sros_tool.proof.requirements import read_all_requirements
     from sros_tool.proof.system import WORLDS, load_system
 
@@ -896,7 +896,7 @@ def check_requirements(
     )
     places = [check_plain_namespace(namespace) for namespace in namespaces] or ["/"]
     wanted = read_all_requirements(map(Path, files), system.fleet, places)
-    findings = requirement_findings(wanted, system)
+    findings = [*requirement_findings(wanted, system), *robots_left_out(system, places)]
     return tuple(
         finding for finding in findings if finding.severity > NOTE or finding.kind.prominent
     )

@@ -229,7 +229,11 @@ POLICIES: dict[str, tuple[str | Callable[[], str], str]] = {
     "slash at the end": (_topic("/a/"), "ends with"),
     "only a slash": (_topic("/"), "ends with"),
     "digit first": (_topic("/a/1b"), "starts with a digit"),
-    "element in a name": (_topic("a<b/>c"), "contains other elements"),
+    "element in a name": (_topic("a<b/>c"), "It contains <b>, and a name is text."),
+    "include in a name": (
+        _topic('<i:include xmlns:i="http://www.w3.org/2001/XInclude" href="a"/>'),
+        "It contains <include>, and a name is text.",
+    ),
     "attribute on a name": (
         _groups('<topics publish="ALLOW"><topic type="x">x</topic></topics>'),
         "'type'",

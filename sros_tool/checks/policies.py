@@ -659,7 +659,12 @@ def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             text = (
                 f"{statement.written} becomes {statement.name} in namespace {statement.profile.ns}"
             )
-            yield statement.found(RELATIVE_GLOBAL, text, f"Write /{statement.written}.")
+            remedy = f"Write /{statement.written}."
+            if statement.source.file != statement.profile.source.file:
+                remedy += (
+                    " If the profile includes common/node.xml, remove the include of this file."
+                )
+            yield statement.found(RELATIVE_GLOBAL, text, remedy)
 
 
 def _check_parameters_of_others(checked_policy: _CheckedPolicy) -> Iterator[Finding]:

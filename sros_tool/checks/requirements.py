@@ -74,6 +74,16 @@ OF_EXPORT = FindingKind(
     "Check the keystore that the export comes from.",
     prominent=True,
 )
+ROBOTS_LEFT_OUT = FindingKind(
+    "requirement.robots-left-out",
+    NOTE,
+    "requirements were not checked for some robots of the fleet",
+    "The requirements are those of the namespaces that were named, and these robots have others.",
+    "The fleet file.",
+    "Name their namespaces, too, with --namespace, or ignore this if the requirements are not for "
+    "these robots.",
+    prominent=True,
+)
 NOT_ON_ZENOH = FindingKind(
     "requirement.not-on-zenoh",
     NOTE,

@@ -385,7 +385,7 @@ def _requirements(
     if not files:
         return None
     from sros_tool.names import check_plain_namespace
-    from sros_tool.proof.findings import requirement_findings
+    from sros_tool.proof.findings import requirement_findings, robots_left_out
     from sros_tool.proof.requirements import dropped_findings, read_all_requirements
 
     one_robot = _paths_of_one_system(family, paths, "--requirements")
@@ -394,7 +394,7 @@ def _requirements(
     def decide(load: Callable[[Sequence[Path]], System]) -> list[Finding]:
         system = load(one_robot)
         wanted = read_all_requirements(files, system.fleet, places)
-        findings = requirement_findings(wanted, system)
+        findings = [*requirement_findings(wanted, system), *robots_left_out(system, places)]
         if earlier:
             before = read_all_requirements(earlier, system.fleet, places)
             findings += dropped_findings(before, wanted, str(files[0]))

@@ -695,11 +695,14 @@ class _Reader:
     def _name(self, element: etree._Element, place: IncludedFile, node: str) -> str:
         name = self._written_name(element)
         sampled = self._sample(name, element, place, several=True)
-        problem = expression_problem(sampled)
+        inner = next((child for child in element if isinstance(child.tag, str)), None)
+        problem = (
+            expression_problem(sampled)
+            if inner is None
+            else f"It contains <{etree.QName(inner).localname}>, and a name is text."
+        )
         if not problem and name.startswith("~") and not node:
             problem = "A name with ~ is private to a node, and the profile has an empty node name."
-        if not problem and any(isinstance(child.tag, str) for child in element):
-            problem = "It contains other elements."
         if problem:
             where, tag = self._place_text(element, place), tag_of(element)
             written = name.strip()

@@ -12,6 +12,7 @@ from sros_tool.checks.requirements import (
     NOT_CROSSING,
     NOT_ON_ZENOH,
     OF_EXPORT,
+    ROBOTS_LEFT_OUT,
     UNNAMED,
     VACUOUS,
     VIOLATED,
@@ -223,6 +224,28 @@ def requirement_findings(
         DocumentError: there are too many wildcards to decide a requirement.
     """
     return decided_findings(decide_all(requirements, system), system, before)
+
+
+def robots_left_out(system: System, namespaces: Sequence[str]) -> list[Finding]:
+    """Return a finding if requirements in ``namespaces`` are not for all robots of the fleet.
+
+    The namespace ``/`` is the place of requirements that may be for every robot.
+    """
+    fleet = system.fleet() if {*namespaces} - {"/"} else None
+    above = {place for namespace in namespaces for place in _with_those_above(namespace)}
+    robots = fleet.robots.values() if fleet else ()
+    others = sorted(robot.name for robot in robots if robot.namespace not in above)
+    if not others:
+        return []
+    text = f"of the robots, {first_few(others, _SHOWN)} are in no namespace that was named"
+    return [ROBOTS_LEFT_OUT.found(system.file, text, system.file)]
+
+
+def _with_those_above(namespace: str) -> Iterator[str]:
+    """Yield a namespace, and each one that it is in, except ``/``."""
+    while namespace.strip("/"):
+        yield namespace
+        namespace = namespace.rpartition("/")[0]
 
 
 def decided_findings(

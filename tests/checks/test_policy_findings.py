@@ -315,6 +315,16 @@ def test_includes(tmp_path: Path) -> None:
     assert missing == {"policy.malformed"}
 
 
+def test_an_old_common_part_can_be_left_out(tmp_path: Path) -> None:
+    """A profile of an earlier sros2 has one, and gets common/node.xml by the advised command."""
+    (tmp_path / "old.xml").write_text(f"<profile>{topics('publish', 'rosout')}</profile>")
+    include = '<xi:include href="old.xml" xpointer="xpointer(/profile/*)"/>'
+    for content, left_out in ((include, True), (topics("publish", "rosout"), False)):
+        found = findings(tmp_path, with_includes(policy(enclave(content, ns="/arm"))))
+        (finding,) = [each for each in found if each.id == "policy.relative-global-name"]
+        assert ("remove the include of this file" in finding.remedy) == left_out
+
+
 def test_a_broken_tag_is_found_at_its_line(tmp_path: Path) -> None:
     text = policy(enclave(topics("publish", "x"))).replace("</profile>", "</profil>")
     (found,) = findings(tmp_path, text)

@@ -65,6 +65,7 @@ CASES = {
     "requirement.unnamed",
     "requirement.not-on-zenoh",
     "requirement.of-export",
+    "requirement.robots-left-out",
 }
 """The kinds of findings that tests here bring about."""
 ONLY = ("check", "robot.xml", "--include", "requirement.*")
@@ -428,6 +429,21 @@ def test_a_template_mends_names_that_it_makes_unique(tmp_path: Path) -> None:
         sros("create_keystore", tmp_path / template, "--template", template).ok()
         made = sros("create_enclave", tmp_path / template, "/arm", "/left/arm").ok()
         assert ("Cyclone DDS 0.10 mistakes /arm" in made.err) == found[template]
+
+
+def test_a_robot_in_no_namespace_that_was_named_is_told(tmp_path: Path) -> None:
+    robots = policy_text({"/{robot}/mux": publish("cmd_vel")}).replace('ns="/"', 'ns="{namespace}"')
+    (tmp_path / "p.xml").write_text(robots)
+    (tmp_path / "fleet.toml").write_text(
+        '[robots]\nred = {}\nreddish = {}\nblue = { namespace = "/hall/blue" }\n'
+    )
+    (tmp_path / "r.toml").write_text('[[only]]\npublish = ["cmd_vel"]\nenclaves = ["/mux"]\n')
+    asked = ("check", "p.xml", "--fleet", "fleet.toml", "--requirements", "r.toml")
+    ended = sros(*asked, "--namespace", "/red", cwd=tmp_path)
+    assert "of the robots, blue, reddish are in no namespace that was named" in ended.out
+    every = ("/red/left", "/reddish", "/hall/blue")
+    named = [word for namespace in every for word in ("--namespace", namespace)]
+    assert "robots-left-out" not in sros(*asked, *named, cwd=tmp_path).out
 
 
 def test_requirements_of_a_package_in_two_namespaces(tmp_path: Path) -> None:
