@@ -147,7 +147,8 @@ def merge_policy(
     if remaps:
         from sros_tool.policy.remapping import remapped_policies
 
-        additions, notes = remapped_policies(additions, remaps)
+        present = read_policy(policy, may_be_empty=True)
+        additions, notes = remapped_policies(additions, remaps, present)
     if enclave is not None:
         check_enclave_name(enclave)
         additions = [policy_in_enclave(addition, enclave) for addition in additions]

@@ -26,11 +26,13 @@ from sros_tool.names import (
 )
 from sros_tool.policy.model import DENY, Group, Policy, Profile
 from sros_tool.policy.patterns import matches
+from sros_tool.policy.rights import Rules, placed_rights, policy_rights
 from sros_tool.wording import enumerated
 
 _RULE = re.compile(r"(?:([A-Za-z_]\w*):)?([^:=]+):=([^:=]+)")
 _NODE_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _NODE, _NAMESPACE = "__node", "__ns"
+_EMPTY = Policy(())
 
 
 class Remapping(NamedTuple):
@@ -85,9 +87,11 @@ def parse_remapping(text: str) -> Remapping:
 
 
 def remapped_policies(
-    policies: Iterable[Policy], texts: Iterable[str]
+    policies: Iterable[Policy], texts: Iterable[str], file: Policy = _EMPTY
 ) -> tuple[list[Policy], list[Note]]:
     """Return policies remapped by rules, and notes on what the nodes may do otherwise.
+
+    A note also names each DENY in ``file``, the policy to merge into, of an old name alone.
 
     Raises:
         UsageError: (or another error of `parse_remapping`) a text is not a rule, or its rule is for
@@ -123,7 +127,34 @@ def remapped_policies(
                 f"rcl_action 9.2.8: start earlier versions with `--ros-args {' '.join(parts)}`."
             )
             notes.append(Note("merge.remapped-action", text))
-    return [policy for policy, _ in remapped], notes
+    result = [policy for policy, _ in remapped]
+    return result, [*notes, *_notes_on_old_names(file, result, moved)]
+
+
+def _notes_on_old_names(
+    file: Policy, remapped: Iterable[Policy], moved_names: Iterable[UsedRule]
+) -> Iterator[Note]:
+    """Yield a note for each DENY in ``file`` of an old name whose new name no policy denies."""
+    denials = [
+        placed
+        for enclave in file.enclaves
+        for placed in placed_rights(enclave)
+        if placed.right.qualifier is DENY
+    ]
+    if not denials:
+        return
+    rules = Rules(right for policy in (file, *remapped) for right in policy_rights(policy))
+    for use in sorted(moved_names):
+        for denied in denials:
+            right = denied.right
+            is_old = right.kind == use.kind and matches(right.name, use.old)
+            if is_old and not rules.cover(right._replace(name=use.new)):
+                text = (
+                    f"{right} at {denied.source} stays as it is, and does not apply to {use.new}, "
+                    f"which {use.node} has in place of {use.old}. Add the new name there if it is "
+                    "meant, too."
+                )
+                yield Note("merge.old-name-denied", text)
 
 
 def remapped_policy(

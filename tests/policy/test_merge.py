@@ -125,6 +125,20 @@ def test_a_new_name_of_one_node_stays_denied_to_the_others(
     assert {right.qualifier for right in policy_rights(of_n)} == {ALLOW}
 
 
+def test_a_denial_of_an_old_name_in_the_file_is_told() -> None:
+    """What was merged before, such as another node of the same package, does not change."""
+    file = one(group("topics", "/*x", publish="DENY"), node="m")
+    camera = one(group("topics", "x", publish="ALLOW"))
+    _, notes = remapped_policies([camera], ["x:=/mux/speed"], file)
+    assert [note.id for note in notes] == ["merge.old-name-denied"]
+    assert "/a DENY publish topic /*x at" in notes[0].text
+    for others, rule in (
+        ([], "x:=/front/x"),
+        ([one(group("topics", "/mux/*", publish="DENY"), node="m")], "x:=/mux/speed"),
+    ):
+        assert remapped_policies([camera, *others], [rule], file)[1] == []
+
+
 def test_names_that_are_exchanged_are_denied_as_before() -> None:
     both = one(group("topics", "x", publish="DENY"), group("topics", "y", publish="ALLOW"))
     (exchanged,), _ = remapped_policies([both], ["x:=y", "y:=x"])
