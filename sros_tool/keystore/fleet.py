@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
@@ -42,8 +42,8 @@ _COMMENT = """\
 # belongs to which robot. To change them, edit that file and run `sros generate_artifacts --fleet`.
 """
 FLEET_REMEDY = (
-    "Write the copy again from the fleet file: `sros generate_artifacts -k KEYSTORE -p "
-    "POLICY_FILE --fleet FLEET_FILE`."
+    "Take revoked robots out of the fleet file, and write the copy again from it: `sros "
+    "generate_artifacts -k KEYSTORE -p POLICY_FILE --fleet FLEET_FILE`."
 )
 _SHOWN = 5
 
@@ -90,10 +90,13 @@ def enclaves_of_several_distributions(keystore: OpenedKeystore) -> dict[tuple[st
     return enclaves
 
 
-def checked_fleet(keystore: OpenedKeystore) -> Fleet | None:
+def checked_fleet(
+    keystore: OpenedKeystore, without_it: Callable[[], str] = str
+) -> Fleet | None:
     """Return the fleet as `load_fleet` does, after checking that nobody edited its file.
 
-    Verbs that issue or send files by the fleet use this.
+    Verbs that issue or send files by the fleet use this.  The error begins its remedy with
+    ``without_it``: sentences on how to go on without the fleet.
 
     Raises:
         KeystoreError: the fleet file is not the file that sros wrote last.
@@ -102,7 +105,7 @@ def checked_fleet(keystore: OpenedKeystore) -> Fleet | None:
         raise KeystoreError(
             f"'{keystore.root / FLEET}' {problem}",
             "It decides which enclaves belong to a robot, and which domains they may join.",
-            FLEET_REMEDY.replace("KEYSTORE", quote(str(keystore.root))),
+            without_it() + FLEET_REMEDY.replace("KEYSTORE", quote(str(keystore.root))),
         )
     return load_fleet(keystore)
 

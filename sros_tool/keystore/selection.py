@@ -9,6 +9,7 @@ import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from fnmatch import fnmatchcase
+from functools import partial
 from shlex import quote
 from typing import NamedTuple
 
@@ -110,13 +111,37 @@ def select_to_revoke(
         return tuple(names), ()  # the verb says what is wrong with a name
     chosen = dict.fromkeys(select_enclaves(keystore, names, patterns))
     unrecorded: dict[str, Unrecorded] = {}
-    if fleet := checked_fleet(keystore) if robots else None:
+    by_name = partial(_revocation_by_name, keystore, robots)
+    if fleet := checked_fleet(keystore, by_name) if robots else None:
         possible = _possible_enclaves(keystore, fleet, robots)
         unrecorded = unrecorded_enclaves(fleet, possible, set(robots))
     chosen |= dict.fromkeys(_robots_enclaves(keystore, robots, True, unrecorded))
     below = [name for enclaves in unrecorded.values() for name in enclaves.below]
     left = {name for enclaves in unrecorded.values() for name in enclaves.naming} - chosen.keys()
     return tuple(chosen), tuple(_unrecorded_notes(keystore, sorted(below), sorted(left)))
+
+
+def _revocation_by_name(keystore: OpenedKeystore, robots: Sequence[str]) -> str:
+    """Return sentences on how to revoke the enclaves of robots although the fleet was edited.
+
+    They name the enclaves that the edited file gives to the robots, and those with their names in
+    the paths: both only propose, because whoever edited the file may be the thief.
+    """
+    root, fleet = quote(str(keystore.root)), None
+    with suppress(SrosError):
+        fleet = load_fleet(keystore)
+    arguments = []
+    for name in robots:
+        names = {*_enclaves_named_after(keystore, name)}
+        if fleet and name in fleet.robots:
+            names.update(enclaves_of_robot(keystore, fleet, fleet.robots[name]))
+        if names:
+            arguments.append(arguments_for(keystore, sorted(names)))
+    command = f"sros revoke {root} {' '.join(arguments) or 'ENCLAVE...'}"
+    return (
+        f"To revoke now, name the enclaves: `{command}`; `sros list_enclaves {root}` shows "
+        f"whether the {'robot has' if len(robots) == 1 else 'robots have'} others. "
+    )
 
 
 def _possible_enclaves(

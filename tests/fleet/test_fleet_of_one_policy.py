@@ -377,6 +377,15 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
         ended = sros(*line.split(), cwd=folder)
         assert ended.status == 2, line
         assert "fleet.toml' is not the file that sros wrote at" in ended.err
+        assert "Take revoked robots out of the fleet file, and write" in ended.err, line
+    # The refusal to revoke says what to revoke now: by the edited file, and by the paths.
+    other_paths = 'enclaves = ["{namespace}/base"]\n[robots]\nr1 = {namespace = "/r2"}\n'
+    for edited, names in (("[robots]\n", "--match '/r1/*'"), ("no fleet", "--match '/r1/*'"),
+                          (other_paths, "/r1/base /r1/lift /r2/base")):  # fmt: skip
+        (folder / "ks/fleet.toml").write_text(edited)
+        ended = sros("revoke", "ks", "--robot", "r1", cwd=folder)
+        assert f"To revoke now, name the enclaves: `sros revoke ks {names}`;" in ended.err
+    sros("revoke", "ks", "--match", "/r1/*", "--dry-run", cwd=folder).ok()
     found = sros("check", "ks", "--include", "keystore.fleet-edited", cwd=folder)
     assert found.status == 1
     (folder / "fleet.toml").write_text(fleet_file())
