@@ -887,6 +887,20 @@ def test_a_folder_without_metadata_has_releases_that_the_keystore_does_not_know(
     publisher.robot("r5").refuses(FetchProblem.NOT_FOR_ROBOT)
 
 
+def test_a_restore_in_which_nothing_shows_what_was_revoked_says_since_when(
+    publisher: Home,
+) -> None:
+    """A robot that was stolen after the backup would be trusted without a word."""
+    shutil.rmtree(publisher.pub)
+    last = OpenedKeystore(publisher.root).ledger_file.last_time()
+    assert last
+    (note,) = publisher.publish(restored=True, new_folder=True).notes
+    assert note.id == "fleet.revocations-not-shown"
+    assert f"was revoked after {iso(last)}, the last entry of the ledger" in note.text
+    assert note.text.index("fleet collect ") < note.text.index("`sros revoke ")
+    assert not publisher.publish().notes
+
+
 def test_all_unknown_releases_in_a_folder_without_metadata_revoke(publisher: Home) -> None:
     """Also if the last one is of another copy of the keystore, which revoked nothing."""
     backup = copy_of(publisher.root, publisher.folder / "backup")

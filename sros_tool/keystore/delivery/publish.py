@@ -650,6 +650,8 @@ class _Run:
                 for path, content in chain.from_iterable(of.files.items() for of in unknown):
                     if path.endswith(f"/{CRL_FILE}"):
                         forgotten.add(content)
+            else:
+                self._notes.append(self._not_shown_note())
             self._restore(forgotten, keyring)
         if not (is_later and self._dry_run):  # which has not revoked again
             self._check_removed()
@@ -664,9 +666,7 @@ class _Run:
             return True
         entries = self.keystore.ledger_with("what", "release").entries
         last = max((entry.number for entry in entries if entry.what == "release"), default=0)
-        marked = self.keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
-        marks = [entry.what for entry in marked if entry.what in (RESTORED, "release")]
-        if marks and marks[-1] == RESTORED:
+        if self._learned_after_restore():
             return True
         for robot in recorded_fleet(self.keystore).robots:
             with suppress(SrosError):
@@ -676,6 +676,26 @@ class _Run:
                     if (sent.release or 0) > last or any(OF_SAME_NUMBER in e for e in problems):
                         return True
         return False
+
+    def _learned_after_restore(self) -> bool:
+        """Return whether the ledger has learned since its last release what the backup lacks."""
+        marked = self.keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
+        marks = [entry.what for entry in marked if entry.what in (RESTORED, "release")]
+        return marks[-1:] == [RESTORED]
+
+    def _not_shown_note(self) -> Note:
+        """Return a note on revocations that neither the keystore nor PUB has."""
+        where, since = quote(str(self.keystore.root)), "the backup"
+        last = self.keystore.ledger_file.last_time()
+        if last and not self._learned_after_restore():
+            since = f"{iso(last)}, the last entry of the ledger"
+        return Note(
+            "fleet.revocations-not-shown",
+            f"nothing in '{self._folder}' shows what was revoked after {since}: a robot that was "
+            f"stolen since gets releases, and is trusted. Unless you have done so, run `sros fleet "
+            f"collect {where} INBOX`, which revokes again what messages of robots show, revoke "
+            f"again what else was stolen (`sros revoke {where} --robot NAME`), and publish again.",
+        )
 
     def _not_restored_error(self) -> KeystoreError:
         where = f"{quote(str(self.keystore.root))} {quote(str(self._folder))}"
