@@ -90,9 +90,7 @@ def enclaves_of_several_distributions(keystore: OpenedKeystore) -> dict[tuple[st
     return enclaves
 
 
-def checked_fleet(
-    keystore: OpenedKeystore, without_it: Callable[[], str] = str
-) -> Fleet | None:
+def checked_fleet(keystore: OpenedKeystore, without_it: Callable[[], str] = str) -> Fleet | None:
     """Return the fleet as `load_fleet` does, after checking that nobody edited its file.
 
     Verbs that issue or send files by the fleet use this.  The error begins its remedy with

@@ -1016,41 +1016,52 @@ def test_restored_is_refused_where_nothing_shows_a_restore(publisher: Home) -> N
     assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
 
 
-@pytest.mark.parametrize("has_key", [False, True])
-@pytest.mark.parametrize("role", ROLES_OF_CAS)
+@pytest.mark.parametrize(
+    ("roles", "has_key"),
+    [(("identity",), False), (("permissions",), True), (ROLES_OF_CAS, False), (ROLES_OF_CAS, True)],
+)
 def test_a_restored_keystore_never_brings_back_a_ca_that_was_replaced(
-    publisher: Home, role: str, has_key: bool
+    publisher: Home, roles: tuple[str, ...], has_key: bool
 ) -> None:
-    """The CA may have been replaced because somebody has its key."""
+    """The CA may have been replaced because somebody has its key; one refusal names each CA."""
+    keys = {role: publisher.folder / f"later_{role}.key.pem" for role in roles}
 
-    def replace_ca(existing: bytes = b"") -> None:
+    def authorities() -> dict[str, bytes]:
+        files = read_release(archives(publisher)["r1"]).files
+        return {role: files[f"enclaves/r1/base/{role}_ca.cert.pem"] for role in roles}
+
+    def replace_cas(existing: dict[str, bytes]) -> None:
         publisher.now += LATER
         rotate_ca(
             publisher.root,
-            roles=[role],
+            roles=roles,
             now=publisher.now,
             finish=True,
-            new_keys=Keyring(places={role: f"file:{key}"} if existing else {}),
-            existing={role: existing} if existing else {},
+            new_keys=Keyring(places={role: f"file:{keys[role]}" for role in existing}),
+            existing=existing,
             allow_unconfirmed=True,
         )
 
     backup = copy_of(publisher.root, publisher.folder / "backup")
-    replace_ca()
+    replace_cas({})
     publisher.publish()
-    key = publisher.folder / "later.key.pem"
-    shutil.copy(publisher.root / ca_key(role), key)
+    for role, key in keys.items():
+        shutil.copy(publisher.root / ca_key(role), key)
     shutil.rmtree(publisher.root)
     backup.rename(publisher.root)
-    later = read_release(archives(publisher)["r1"]).files[f"enclaves/r1/base/{role}_ca.cert.pem"]
+    later = authorities()
     before = snapshot(publisher.folder)
-    with pytest.raises(KeystoreError, match=f"the {role} CA was replaced after the backup") as said:
+    names = " and ".join(f"the {role} CA" for role in roles)
+    with pytest.raises(KeystoreError, match=rf"{names} (was|were) replaced after") as said:
         publisher.publish(restored=True)
-    assert f"--{role} --finish" in said.value.remedy and snapshot(publisher.folder) == before
-    replace_ca(later if has_key else b"")
+    flags = f" --{roles[0]}" if len(roles) == 1 else ""
+    assert f"`sros rotate_ca {publisher.root}{flags} --finish" in said.value.remedy
+    assert " ".join(f"--{each}-ca FILE --{each}-key PLACE" for each in roles) in said.value.remedy
+    assert ("by hand" in said.value.remedy) is ("permissions" in roles)
+    assert snapshot(publisher.folder) == before
+    replace_cas(later if has_key else {})
     assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
-    now = read_release(archives(publisher)["r1"]).files[f"enclaves/r1/base/{role}_ca.cert.pem"]
-    assert (now == later) is has_key
+    assert (authorities() == later) is has_key
 
 
 @pytest.mark.parametrize("steps", [(0, 1), (1, 3)])

@@ -811,7 +811,7 @@ class _Run:
             KeystoreError: the keystore has a CA that a later one in the release ``last`` replaced,
                 or lacks the newest CA.
         """
-        where = quote(str(self.keystore.root))
+        replaced: dict[str, x509.Certificate] = {}
         for role, file in ((IDENTITY, IDENTITY_CA_FILE), (PERMISSIONS, PERMISSIONS_CA_FILE)):
             own = self.keystore.authority(role)
             published = [
@@ -823,24 +823,32 @@ class _Run:
             newest = max([*own, *published], key=lambda each: validity_of(each).not_before)
             lost = authority_key(newest) not in map(authority_key, own)
             if lost or retired_authorities(published, own):
-                flag = f" --{role}" * (len(self.keystore.authority_files) > 1)
-                by_hand = (
-                    " Otherwise, also bring the files of each robot by hand (`sros distribute_key "
-                    f"{where} --robot NAME FOLDER --force`), because robots accept releases only "
-                    "of the CA that they trust."
-                ) * (role == PERMISSIONS or not flag)
-                raise KeystoreError(
-                    f"the {role} CA was replaced after the backup of the keystore "
-                    f"'{self.keystore.root}'",
-                    f"The last release in '{self._folder}' trusts {authority_text(newest)}. "
-                    "Publishing would put robots back on the earlier CA, whose key somebody may "
-                    "have copied.",
-                    "Restore a backup from after the rotation. If there is none, repeat later "
-                    f"revocations, replace the CA again (`sros rotate_ca {where}{flag} --finish "
-                    f"--allow-unconfirmed`), and repeat this command. If you have the key of the "
-                    f"later CA, add --{role}-ca FILE --{role}-key PLACE to replace it by this CA "
-                    f"(docs/howto/keystore_is_lost.md).{by_hand}",
-                )
+                replaced[role] = newest
+        if not replaced:
+            return
+        where = quote(str(self.keystore.root))
+        separate = len(self.keystore.authority_files) > 1
+        roles = tuple(replaced) if separate else tuple(replaced)[:1]
+        flag = f" --{roles[0]}" if separate and len(roles) == 1 else ""
+        names = " and ".join(f"the {role} CA" for role in roles)
+        later_ones = " and ".join(authority_text(replaced[role]) for role in roles)
+        options = " ".join(f"--{role}-ca FILE --{role}-key PLACE" for role in roles)
+        by_hand = (
+            " Otherwise, also bring the files of each robot by hand (`sros distribute_key "
+            f"{where} --robot NAME FOLDER --force`), because robots accept releases only "
+            "of the CA that they trust."
+        ) * (PERMISSIONS in replaced)
+        raise KeystoreError(
+            f"{names} {'was' if len(roles) == 1 else 'were'} replaced after the backup of the "
+            f"keystore '{self.keystore.root}'",
+            f"The last release in '{self._folder}' trusts {later_ones}. Publishing would put "
+            "robots back on an earlier CA, whose key somebody may have copied.",
+            "Restore a backup from after the rotation. If there is none, repeat later "
+            f"revocations, repeat the rotation (`sros rotate_ca {where}{flag} --finish "
+            "--allow-unconfirmed`), and repeat this command. If you have the key of each later "
+            f"CA, add {options} to the rotation, which goes back to the later CA "
+            f"(docs/howto/keystore_is_lost.md).{by_hand}",
+        )
 
     def _restore(self, forgotten_lists: Forgotten, keyring: Keyring) -> None:
         """Record that the keystore was restored, and revoke again what ``forgotten_lists`` have.
