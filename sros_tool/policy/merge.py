@@ -13,6 +13,7 @@ from __future__ import annotations
 import codecs
 import re
 from bisect import bisect_left
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -45,6 +46,7 @@ from sros_tool.policy.rights import (
     order,
     policy_rights,
     profile_rights,
+    unfolded,
 )
 from sros_tool.values import DryRun, FileChanges, Notes, shows
 from sros_tool.wording import first_few
@@ -157,25 +159,30 @@ class _Planner:
         return not (self._file.cover(right) or self._file.cover(denial))
 
     def _between_nodes(self, enclave: Enclave) -> Iterator[Contradiction]:
-        """Yield the rights of nodes of an enclave that another of its nodes denies to all."""
-        nodes: dict[tuple[str, str], set[Right]] = {}
+        """Yield the rights of nodes of an enclave that another of its nodes denies to all.
+
+        A node may except names from its own rights, and so may several nodes alike.
+        """
+        of_nodes = defaultdict[tuple[str, str], set[Right]](set)
         for profile in enclave.all_profiles():
-            of_node = nodes.setdefault((profile.ns, profile.node), set())
-            of_node.update(profile_rights(enclave.path, profile))
-        denials = {
-            node: sorted(right for right in rights if right.qualifier is DENY)
-            for node, rights in nodes.items()
-        }
-        if len(nodes) < 2 or not any(denials.values()):
+            of_nodes[profile.ns, profile.node].update(profile_rights(enclave.path, profile))
+        stated = frozenset[Right]().union(*of_nodes.values())
+        denials = sorted(right for right in stated if right.qualifier is DENY)
+        if not denials:
             return
-        rules = {node: Rules(rights) for node, rights in nodes.items()}
-        for node, denied_to in denials.items():
-            for denied in denied_to:
-                for other, stated in rules.items():
-                    if other == node or stated.cover(denied):
-                        continue
-                    for allowed in folded(stated.overlapping(denied._replace(qualifier=ALLOW))):
-                        yield Contradiction(denied, allowed, self._is_wanted(denied))
+        stating = defaultdict[Right, list[Rules]](list)
+        for rights in of_nodes.values():
+            rules = Rules(rights)
+            for part in unfolded(rights):
+                stating[part].append(rules)
+        for denied in denials:
+            overridden = {
+                allowed
+                for allowed in self._asked.overlapping(denied._replace(qualifier=ALLOW))
+                if not all(rules.cover(denied) for rules in stating[allowed])
+            }
+            for allowed in folded(overridden):
+                yield Contradiction(denied, allowed, self._is_wanted(denied))
 
 
 @dataclass(slots=True)
