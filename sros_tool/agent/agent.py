@@ -213,7 +213,7 @@ class _Round:
         exposed = recent | dict.fromkeys(readable_keys, now)
         self._state = replace(self._state, exposed=exposed)
         installation, fetched = self._fetch_and_install(certain)
-        self._note_newer_enclaves()
+        self._note_unreleased_enclaves()
         repaired = self._state.repaired_at
         if repaired and abs(now - repaired) < _REPAIRED_FOR:
             self._problems.append(self._state.repaired)
@@ -410,19 +410,28 @@ class _Round:
                     newer.add(name)
         return frozenset(newer)
 
-    def _note_newer_enclaves(self) -> None:
-        """Report the enclaves that somebody brought after the accepted release."""
-        if not self._state.accepted:
+    def _note_unreleased_enclaves(self) -> None:
+        """Report the enclaves that are here, but not in the accepted release."""
+        accepted = self._state.accepted
+        if not accepted:
             return
         with suppress(SrosError):  # the next installation writes the seal again
-            released = self._released_files()
-            for name in sorted(self._newer_enclaves()):
-                if _certificate_path(name) not in released:
-                    self._problems.append(
-                        f"{name} is newer than release {self._state.accepted}, which does not have "
-                        "it. Publish it (`sros fleet publish KEYSTORE PUB`), or remove it here: "
-                        "the next release without it removes it, with its key."
-                    )
+            released, newer = self._released_files(), self._newer_enclaves()
+            here = sorted(self._enclaves())
+            unreleased = [name for name in here if _certificate_path(name) not in released]
+            for name in (name for name in unreleased if name in newer):
+                self._problems.append(
+                    f"{name} is newer than release {accepted}, which does not have "
+                    "it. Publish it (`sros fleet publish KEYSTORE PUB`), or remove it here: "
+                    "the next release without it removes it, with its key."
+                )
+            if older := [name for name in unreleased if name not in newer]:
+                self._problems.append(
+                    f"Release {accepted} of {self._settings.robot} does not have "
+                    f"{first_few(older, 3)}, which {'is' if len(older) == 1 else 'are'} here, "
+                    "perhaps from another robot: the next round that can fetch and install removes "
+                    "what is not in the release."
+                )
 
     def _note_repaired(self, release: int, paths: Sequence[str]) -> None:
         """Remember that files were replaced: every message of the next day says so."""

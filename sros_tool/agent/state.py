@@ -17,15 +17,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sros_tool.agent.settings import agent_folder, read_settings
+from sros_tool.checks.keystores.arrival import installed_sentences
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.files import staged_file
 from sros_tool.folders import Folder
+from sros_tool.keystore.confirmation import COULD_NOT_START
 from sros_tool.keystore.delivery.published import MOST_NUMBER
 from sros_tool.keystore.delivery.release import sealed_robot
-from sros_tool.keystore.layout import RELEASE_SEAL, enclave_names, enclave_path
-from sros_tool.keystore.reader import open_enclave
+from sros_tool.keystore.layout import RELEASE_SEAL, enclave_names
 from sros_tool.names import check_enclave_name
-from sros_tool.validity import iso, parse_iso
+from sros_tool.validity import parse_iso
 from sros_tool.values import DryRun, FileChanges, Notes, as_plain, parse_json
 from sros_tool.xml import read_bytes
 
@@ -265,13 +266,13 @@ class AgentStatus(NamedTuple):
     `sros agent run FOLDER --once --restarted` says that these restarts are done.
     """
     problems: Sequence[str]
-    """What the last round could not do, and what is wrong, as sentences."""
+    """What the last round could not do, and what is wrong with the files now, as sentences."""
     well: bool
     """Whether nothing is wrong or due, and source and inbox were reached recently."""
 
 
 def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStatus:
-    """Return what the agent of ``folder`` last did.
+    """Return what the agent of ``folder`` last did, and what is wrong with the files now.
 
     Source and inbox have to be reached within the time ``oldest``.
 
@@ -283,7 +284,7 @@ def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStat
         moment is not None and abs(now - moment) <= oldest for moment in (state.fetched, state.sent)
     )
     whole = 0 < state.release == state.accepted
-    problems = (*_outdated_sentences(folder), *state.problems, *_expired_since(folder, state, now))
+    problems = (*_outdated_sentences(folder), *state.problems, *_seen_now(folder, state, now))
     return AgentStatus(
         folder,
         settings.robot,
@@ -300,11 +301,13 @@ def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStat
     )
 
 
-def _expired_since(folder: Path, state: AgentState, now: datetime) -> Iterator[str]:
-    """Yield sentences on enclaves with a file that has expired since the last round."""
-    known = {problem.partition(" could not start")[0] for problem in state.problems}
-    for name in enclave_names(folder):
-        with suppress(SrosError, OSError):
-            until = open_enclave(enclave_path(folder, name), now=now).valid_until()
-            if until and until <= now and name not in known:
-                yield f"{name} has expired, at {iso(until)}: no process starts in it."
+def _seen_now(folder: Path, state: AgentState, now: datetime) -> Iterator[str]:
+    """Yield sentences on what is wrong with the files now, but not what the last round said."""
+    names = enclave_names(folder)
+    for name in sorted(state.files.keys() - {*names}):
+        yield f"{name} was here in the last round of the agent, and is missing now."
+    known = {*state.problems}
+    subjects = {text.partition(COULD_NOT_START)[0] for text in known if COULD_NOT_START in text}
+    for sentence in installed_sentences(folder, names, now):
+        if sentence not in known and sentence.partition(COULD_NOT_START)[0] not in subjects:
+            yield sentence

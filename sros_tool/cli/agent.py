@@ -353,7 +353,9 @@ def _due_lines(folder: Path, due_enclaves: Sequence[str], unseen: Sequence[str])
 )  # fmt: skip
 @json_option
 def _status(folder: Path, max_age: str, as_json: bool) -> int:
-    """Show the result of the agent's last round in FOLDER, and what is due.
+    """Show the result of the agent's last round in FOLDER, what is due, and what is wrong now.
+
+    The files are looked at now, as `sros verify` does; the processes are those of the last round.
 
     Example:
       $ sros agent status /etc/sros/keystore

@@ -216,7 +216,19 @@ def test_rounds_follow_what_home_publishes(home: Home, r1: Robot) -> None:
     assert not early.well, "when the source was reached is not known by such a clock"
     late = agent_status(r1.folder, now=end + timedelta(minutes=1), oldest=timedelta(days=9999))
     assert not late.well
-    assert sum("has expired, at" in problem for problem in late.problems) == len(NAMES)
+    assert sum("expired" in problem for problem in late.problems) == len(NAMES)
+    folder = r1.folder / "enclaves/r1/a"
+    key = (folder / "key.pem").read_bytes()
+    (folder / "key.pem").unlink()
+    (lacks,) = agent_status(r1.folder, now=moment(), oldest=timedelta(days=1)).problems
+    assert lacks.startswith("/r1/a could not start: key.pem")
+    (folder / "key.pem").write_bytes(key)
+    (folder / "key.pem").chmod(0o644)
+    (readable,) = agent_status(r1.folder, now=moment(), oldest=timedelta(days=1)).problems
+    assert "enclaves/r1/a/key.pem" in readable
+    shutil.rmtree(folder)
+    (gone,) = agent_status(r1.folder, now=moment(), oldest=timedelta(days=1)).problems
+    assert gone == "/r1/a was here in the last round of the agent, and is missing now."
 
 
 def test_a_server_that_refuses_one_certificate_of_the_robot(
@@ -248,6 +260,10 @@ def test_enclaves_that_the_release_does_not_have(home: Home, r1: Robot) -> None:
     """Those of another robot go in the next round; what was brought since the release stays."""
     r1.round()
     shutil.copytree(r1.folder / "enclaves/r1/a", r1.folder / "enclaves/r2/x")
+    r1.release = FetchError(FetchProblem.UNREACHABLE, "x", "")
+    (problem,) = (each for each in r1.round().problems if "Release 1 of r1" in each)
+    assert "does not have /r2/x, which is here, perhaps from another robot" in problem
+    r1.release = home.first
     since = r1.folder / "enclaves/r1/since/cert.pem"
     since.parent.mkdir()
     since.write_bytes(home.renewed.files["enclaves/r1/a/cert.pem"])
