@@ -64,7 +64,8 @@ _STREAM = Path("-")
 @click.option(
     "--keyless",
     is_flag=True,
-    help="Also export enclaves whose keys were made on their robots, without the keys.",
+    help="Also export enclaves whose keys were made on their robots, without the keys. Keys that "
+    "are in KEYSTORE are exported as always.",
 )
 @dry_run_option
 @json_option

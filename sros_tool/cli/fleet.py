@@ -623,7 +623,8 @@ def _status(
     a recent confirmation is offline. Robots with the same state share a line. A robot that reports
     a release which was never published is shown even if its files are current. The first line also
     counts the robots whose DDS has known vulnerabilities that a later release of the same major
-    version fixes, by the advisories of sros; --robot and --advisories list them.
+    version fixes, by the advisories of sros; --advisories FILE lists them, and so does --robot NAME
+    with --fail-on vulnerabilities.
 
     The revocation list is in force on a robot if the robot has the list, or an earlier list that
     revokes the same certificates, and confirms that no process has to restart for it. `sros agent`
@@ -704,7 +705,8 @@ def _status(
             _list_in_force(status),
         )
     else:
-        lines = _lines(compared, robots, findings=advisories is not None)
+        listed = advisories is not None or (bool(robots) and on_vulnerabilities)
+        lines = _lines(compared, robots, findings=listed)
         text = "".join(f"{visible_line(line)}\n" for line in lines)
     if output and not dry_run:
         echo(save(output, text.encode()), err=True)
@@ -737,7 +739,7 @@ def _lines(
 ) -> Iterator[str]:
     """Yield the counts, the table of robots with what to do, and findings on their DDS.
 
-    Unless ``findings`` is set or robots are named, the findings are only counted.
+    Unless ``findings`` is set, the findings are only counted.
     """
     status = compared_fleet.status
     counts = ", ".join(f"{number} {_state_text(state)}" for state, number in status.counts.items())
@@ -765,7 +767,7 @@ def _lines(
         yield "  ".join((*cells, row[4])).rstrip()
     for robot in status.robots if robots else ():
         yield from _details(robot)
-    if robots or findings:
+    if findings:
         yield from _dds_findings(compared_fleet)
     else:
         yield from _dds_count_lines(compared_fleet)
@@ -1113,13 +1115,14 @@ def _dds_count_lines(compared_fleet: ComparedFleet) -> Iterator[str]:
         robots = _robot_names(outdated, status.names, status.groups)
         yield (
             f"a later release fixes known vulnerabilities in the DDS of {robots}; "
-            f"`sros fleet status {quote(str(status.keystore))} --robot {outdated[0]}` lists them, "
-            "and --fail-on vulnerabilities makes the exit status 1"
+            f"`sros fleet status {quote(str(status.keystore))} --robot {outdated[0]} "
+            "--fail-on vulnerabilities` lists them, with the exit status 1"
         )
     elif list(_dds_findings(compared_fleet)):
         severities = Counter(finding.severity.word for finding in compared_fleet.findings)
         words = ", ".join(counted(number, word) for word, number in severities.items())
-        yield f"on the DDS of robots: {words}; see --robot NAME, or --json"
+        see = "--robot NAME --fail-on vulnerabilities"
+        yield f"on the DDS of robots: {words}; see {see}, or --json"
 
 
 def _expiry_clauses(robot: RobotStatus, moment: datetime) -> Iterator[str]:

@@ -90,7 +90,8 @@ def test_requests_of_a_fleet(keystore: Path, tmp_path: Path) -> None:
     assert (ended.status, "They were made on their robots" in ended.err) == (2, True)
     for name, robot in robots.items():
         pattern = name.replace("arm", "*")
-        sros("distribute_key", keystore, "--match", pattern, robot, "--keyless").ok()
+        said = sros("distribute_key", keystore, "--match", pattern, robot, "--keyless").ok().err
+        assert "export.keys-included" not in said, "none is in the keystore"
         kept = (robot / f"enclaves{name}/key.pem").read_bytes()
         sros("distribute_key", keystore, "--match", pattern, robot, "--keyless", "--force").ok()
         assert (robot / f"enclaves{name}/key.pem").read_bytes() == kept, "the only copy"

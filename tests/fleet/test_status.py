@@ -1370,7 +1370,9 @@ def test_the_dds_of_a_robot(
     chosen = ("fleet", "status", "ks", "--fail-on", "vulnerabilities")
     field.run(*chosen, status=1 if outdated else 0)
     assert "exclude each other" in field.run(*chosen, "--no-advisories", status=2).err
-    assert text in field.run("fleet", "status", "ks", "--robot", "r1").out
+    of_robot = ("--robot", "r1")
+    assert text in field.run(*chosen, *of_robot, status=1 if outdated else 0).out
+    assert field.run("fleet", "status", "ks", *of_robot).out.splitlines()[-1] == last, "the sum"
     assert "DDS" not in field.run("fleet", "status", "ks", "--no-advisories").out
     found = json.loads(field.run("fleet", "status", "ks", "--json").out)
     assert (found["complete"], found["outdated_dds"]) == (True, outdated)
@@ -1401,7 +1403,7 @@ def test_an_earlier_confirmation_does_not_name_the_dds(field: Field) -> None:
     assert (
         "on the DDS of robots: 1 note; see --robot NAME" in field.run("fleet", "status", "ks").out
     )
-    ended = field.run("fleet", "status", "ks", "--robot", "r1")
+    ended = field.run("fleet", "status", "ks", "--robot", "r1", "--fail-on", "vulnerabilities")
     assert f"[{NOT_SEEN}]" in ended.out and "not reported by r1" in ended.out
 
 

@@ -239,6 +239,19 @@ def test_a_certificate_for_an_earlier_key_of_the_robot_is_not_exported(
     assert distribute(OpenedKeystore(backup), [BORN], robot, now=NOW, keyless=True, force=True)
 
 
+def test_an_export_with_keyless_says_which_private_keys_it_has(fleet: Path, tmp_path: Path) -> None:
+    """Its name reads as if it left all keys out."""
+    keystore = OpenedKeystore(fleet)
+    names = [BORN, "/base"]
+    for notes in (
+        distribute(keystore, names, tmp_path / "robot", now=NOW, keyless=True).notes,
+        pack_enclaves(keystore, names, now=NOW, keyless=True).notes,
+    ):
+        (said,) = (note.text for note in notes if note.id == "export.keys-included")
+        assert "the export has /base with its private key: " in said
+    assert not distribute(keystore, ["/base"], tmp_path / "other", now=NOW).notes
+
+
 # ── selection ──────────────────────────────────────────────────────────────────────────────
 
 

@@ -149,7 +149,7 @@ def distribute(
             ``target`` has other content, which only ``force`` replaces.
     """
     files = exported_files(keystore, names, now, keyless=keyless)
-    notes = (*_token_notes(files), *unrecorded_notes(keystore, load_fleet(keystore), names))
+    notes = (*_key_notes(files, keyless), *unrecorded_notes(keystore, load_fleet(keystore), names))
     if target.name.endswith(SUFFIXES):
         changes = _write_archive(keystore, target, files, now=now, force=force, dry_run=dry_run)
         return Export(target, tuple(names), changes, notes)
@@ -158,8 +158,16 @@ def distribute(
     return Export(target, tuple(names), changes, notes)
 
 
-def _token_notes(files: Mapping[str, bytes]) -> Iterator[Note]:
-    """Yield a note for each exported enclave whose key is on a PKCS#11 token."""
+def _key_notes(files: Mapping[str, bytes], keyless: bool) -> Iterator[Note]:
+    """Yield notes on private keys that are exported with ``keyless``, or that are on tokens."""
+    if keyless and (keys := [path for path in files if path.endswith(f"/{KEY_FILE}")]):
+        their = "its private key" if len(keys) == 1 else "their private keys"
+        yield Note(
+            "export.keys-included",
+            f"the export has {first_few(list(map(enclave_of, keys)), _SHOWN)} with {their}: "
+            "--keyless leaves out nothing, it adds enclaves whose keys were made on their robots. "
+            "Releases of `sros fleet publish` have no private key.",
+        )
     for path in files:
         folder, _, file = path.rpartition("/")
         if file == KEY_URI_FILE:
@@ -241,7 +249,7 @@ def pack_enclaves(
         KeystoreError: an enclave does not exist, or cannot run.
     """
     files = exported_files(keystore, names, now, keyless=keyless)
-    return PackedEnclaves(pack(files), tuple(files), tuple(_token_notes(files)))
+    return PackedEnclaves(pack(files), tuple(files), tuple(_key_notes(files, keyless)))
 
 
 def exported_files(
