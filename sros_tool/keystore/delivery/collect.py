@@ -590,7 +590,10 @@ class _Verifier:
                 why += "docs/howto/keystore_is_lost.md)"
             raise _RefusedError(f"{why}: {fault}")
         if signer.serial_number in self._revoked:
-            raise _RefusedError(f"its certificate, {signer.serial_number:x}, was revoked")
+            raise _RefusedError(
+                f"its certificate, {signer.serial_number:x}, was revoked: perhaps the robot lacks "
+                "its new keys, or another computer with its earlier keys replaces its messages"
+            )
         issued = self._issued(digest(signer))
         if issued is None:
             raise _RefusedError(
