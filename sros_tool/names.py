@@ -171,6 +171,17 @@ def namespace_problem(name: str) -> str:
     return ""
 
 
+_MOVES = re.compile(r"(^|/)(cmd_vel|[^/]*commands?\Z|joint_trajectory|follow_joint_trajectory)")
+
+
+def moves_robot(name: str) -> bool:
+    """Return whether what usually moves a robot has this name, such as /cmd_vel.
+
+    ``MOVES`` in web/src/table.js is the same pattern.
+    """
+    return bool(_MOVES.search(name))
+
+
 def is_expression(name: str) -> bool:
     """Return whether ``name`` contains a wildcard: ``*``, ``?`` or ``[``."""
     return "*" in name or "?" in name or "[" in name

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 from fnmatch import fnmatchcase
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sros_tool import names
 from sros_tool.errors import InvalidNameError
 from sros_tool.names import (
     check_enclave_name,
@@ -17,6 +19,7 @@ from sros_tool.names import (
     expand,
     expression_problem,
     is_expression,
+    moves_robot,
 )
 
 ENCLAVE = re.compile(r"/|(/[A-Za-z_][A-Za-z0-9_]*)+", re.ASCII)
@@ -143,3 +146,11 @@ def test_names_in_dds(right: str) -> None:
     names = dds_names(right, "/x")
     assert (set(names.publish), set(names.subscribe)) == TABLE[right]
     assert len(names.publish) == len(set(names.publish))
+
+
+def test_what_moves_a_robot_is_the_same_in_the_page() -> None:
+    pattern = names._MOVES.pattern.replace("(^|/)", r"(^|\/)").replace(r"\Z", "$")
+    table = Path(__file__).parent.parent / "web/src/table.js"
+    assert f"const MOVES = /{pattern}/;\n" in table.read_text()
+    assert moves_robot("/a/cmd_vel") and moves_robot("/arm/joint_commands")
+    assert not moves_robot("/commands_seen") and not moves_robot("/my_cmd_vel")

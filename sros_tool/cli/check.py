@@ -462,9 +462,11 @@ def _system(
 
 
 def _suggested(system: System) -> str:
-    from sros_tool.proof.suggestions import render_requirements, suggest
+    from sros_tool.proof.suggestions import not_proposed, render_requirements, suggest
 
-    return render_requirements(suggest(system.rights, system.worlds, system.fleet()), system.file)
+    proposed = suggest(system.rights, system.worlds, fleet := system.fleet())
+    comments = () if fleet else not_proposed(system.rights, proposed)
+    return render_requirements(proposed, system.file, comments)
 
 
 def _family(targets: tuple[Path, ...]) -> tuple[str, tuple[Path, ...]]:

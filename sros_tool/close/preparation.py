@@ -89,10 +89,11 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     done, problems, is_stopped = _do_steps(robot, duration, partial=partial, dry_run=dry_run)
     ignored = [] if dry_run else _ignore_in_git(robot)
     removed = [] if dry_run or is_stopped else _remove_enclaves(robot)
+    if not (dry_run or is_stopped):
+        _remember_later_processes(robot)
     state = current_state(robot, robot.read_policy())._replace(steps=done, dry_run=dry_run)
     if dry_run or is_stopped:
         return state._replace(problems=problems, changes=ignored)
-    _remember_later_processes(robot, state.observed)
     changes = [*ignored, *write_start_files(robot, state), *removed]
     denied = _denied_access(robot)
     newly_denied = [right for right in denied if right not in denied_before]
@@ -132,14 +133,25 @@ def _ignore_in_git(robot: LocalRobot) -> list[FileChange]:
     return [FileChange("create", str(file))]
 
 
-def _remember_later_processes(robot: LocalRobot, observed: ObservedProcesses) -> None:
-    """Write the processes of enclaves of which none was observed, if the robot was watched."""
-    if robot.observed:
-        known = {process.enclave for process in robot.observed.processes}
-        later = [process for process in observed.processes if process.enclave not in known]
-        if later:
-            processes = [*robot.observed.processes, *later]
-            robot.remember(robot.observed._replace(processes=processes))
+def _remember_later_processes(robot: LocalRobot) -> None:
+    """Write the processes as they were started later, if the robot was watched, and say which.
+
+    An enclave that neither the keystore nor the policy has any more belongs to no other machine.
+    """
+    if robot.observed is None:
+        return
+    known = robot.keystore_enclaves() | robot.policy_enclaves()
+    not_here = [name for name in robot.observed.not_here if name in known]
+    before = robot.observed._replace(not_here=not_here)
+    now = RunningRobot(robot).with_later_processes(before)
+    for old, new in zip(before.processes, now.processes, strict=False):
+        if new != old:
+            robot.shell.say(
+                f"{new.enclave} runs by another command than before, which sros remembers: "
+                f"{new.open_command(robot.domain)}; before: {old.open_command(robot.domain)}"
+            )
+    if now != robot.observed:
+        robot.remember(now)
 
 
 def _denied_access(robot: LocalRobot) -> list[str]:
@@ -368,7 +380,8 @@ def _unknown_process_problems(robot: LocalRobot, state: CloseState) -> Iterator[
         options = " ".join(f"--elsewhere {name}" for name in only_there)
         yield (
             f"sros knows no process of this machine for nodes of {enclaves}; if they run on "
-            f"another machine: {close} {options}; otherwise {silent}"
+            f"another machine: {close} {options}; if you do not know one of them, it may be a "
+            f"stranger: remove its enclave from '{robot.policy}'; otherwise {silent}"
         )
 
 

@@ -372,7 +372,10 @@ class _TalkComparison:
         text += f"; new, without a profile: {first_few(new, MOST_NAMES)}" if new else ""
         expected = {*map(node_name, self._nodes.expected(self.current).nodes)}
         new = sorted({*map(node_name, with_profile)} - expected)
-        return text + (f"; not compared: {first_few(new, MOST_NAMES)} (new)" if new else "")
+        if new:
+            text += f"; not compared: {first_few(new, MOST_NAMES)} (new; compared once "
+            text += f"{_watch_again(self._nodes)})"
+        return text
 
 
 def _renamed_text(nodes: ObservedNodes, current: Observation | None, *, fails: bool) -> str:
@@ -393,13 +396,18 @@ def _renamed_text(nodes: ObservedNodes, current: Observation | None, *, fails: b
         node_name(node) for node in without_profile if not is_tool(node)
     } - renamed.keys()
     if not_compared and not fails:
-        close = nodes.robot.close_command
         text += (
             "; not compared, as the policy has no profile for them any more: "
             f"{first_few(sorted(not_compared), MOST_NAMES)} (if they have new names, they are "
-            f"compared once the open robot was watched again: {close} --undo, {close} --for 1m)"
+            f"compared once {_watch_again(nodes)})"
         )
     return text
+
+
+def _watch_again(nodes: ObservedNodes) -> str:
+    """Return a clause that says how nodes are watched that ran only closed."""
+    close = nodes.robot.close_command
+    return f"the open robot was watched again: {close} --undo, {close} --for 1m"
 
 
 def _ended_since(running: RunningRobot) -> dict[str, str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
+from typing import NamedTuple
 
 from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.close.robot import MOST_NAMES, REQUIREMENTS, TEMPLATE
@@ -13,10 +14,11 @@ from sros_tool.files import policies_dir
 from sros_tool.graph.learn import common_parts
 from sros_tool.keystore.layout import CLOSED_POLICY
 from sros_tool.keystore.template import load_template
-from sros_tool.names import is_expression
+from sros_tool.names import is_expression, moves_robot
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.merge import merge_into
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy
+from sros_tool.policy.patterns import overlap
 from sros_tool.policy.rights import Right, Rules, policy_rights
 from sros_tool.proof.findings import decide_all
 from sros_tool.proof.requirements import Requirement, read_requirements
@@ -31,16 +33,18 @@ _MOST_LINES = 20
 def access_lines(policy: Policy, folder: Path) -> list[str]:
     """Return a line for each name in a policy: its senders and its receivers.
 
-    Names that are used only as every node uses them (the common parts) are left out.
+    Names that are used only as every node uses them (the common parts) are left out.  What moves
+    the robot stands first, with all of its senders.
     """
     sides = _sides(policy, folder)
     kinds = [*RIGHTS]
     names_in_order = sorted(
-        sides, key=lambda use: (not all(sides[use]), kinds.index(use[0]), use[1])
+        sides,
+        key=lambda use: (not moves_robot(use[1]), not all(sides[use]), kinds.index(use[0]), use[1]),
     )
     lines = [
         f"{kind.removesuffix('s')} {name}: "
-        + " -> ".join(first_few(names, MOST_NAMES) or "nobody" for names in sides[kind, name])
+        + " -> ".join(side.text(whole=moves_robot(name)) for side in sides[kind, name])
         for kind, name in names_in_order
     ]
     surplus = len(lines) - _MOST_LINES
@@ -50,7 +54,25 @@ def access_lines(policy: Policy, folder: Path) -> list[str]:
     ]
 
 
-def _sides(policy: Policy, folder: Path) -> Mapping[tuple[str, str], Sequence[Sequence[str]]]:
+class _Side(NamedTuple):
+    """The enclaves that may use a name, or, if none may use a whole wildcard, a part of it."""
+
+    enclaves: Sequence[str]
+    in_part: Sequence[str]
+
+    def __bool__(self) -> bool:
+        return bool(self.enclaves)
+
+    def text(self, *, whole: bool) -> str:
+        """Return the enclaves as text, all of them if ``whole``."""
+        names = self.enclaves or self.in_part
+        if not names:
+            return "nobody"
+        shown = ", ".join(names) if whole else first_few(names, MOST_NAMES)
+        return shown if self.enclaves else f"in part {shown}"
+
+
+def _sides(policy: Policy, folder: Path) -> Mapping[tuple[str, str], Sequence[_Side]]:
     """Map kinds and names to the enclaves that may use them, by the rights of the kind."""
     rights = policy_rights(policy)
     rules, enclaves = Rules(rights), sorted({right.enclave for right in rights})
@@ -65,10 +87,19 @@ def _sides(policy: Policy, folder: Path) -> Mapping[tuple[str, str], Sequence[Se
         is_allowed = Right(enclave, ALLOW, right, name) in expressions
         return is_allowed and not rules.cover(Right(enclave, DENY, right, name))
 
+    def side(right: str, name: str) -> _Side:
+        users = [enclave for enclave in enclaves if may(enclave, right, name)]
+        in_part = {
+            other.enclave
+            for other in (allowed if is_expression(name) and not users else ())
+            if other.right == right
+            and overlap(other.name, name)
+            and may(other.enclave, right, other.name)
+        }
+        return _Side(users, sorted(in_part))
+
     return {
-        (kind, name): [
-            [enclave for enclave in enclaves if may(enclave, right, name)] for right in RIGHTS[kind]
-        ]
+        (kind, name): [side(right, name) for right in RIGHTS[kind]]
         for kind, name in {
             (right.kind, right.name)
             for right in allowed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence, Set
 from datetime import datetime
 from functools import cached_property
@@ -32,6 +33,7 @@ from sros_tool.runtime.processes import (
     RunningProcesses,
     plain,
     process_origin,
+    program_of,
 )
 from sros_tool.runtime.variables import STRATEGY
 from sros_tool.validity import time_of_file
@@ -165,19 +167,29 @@ class RunningRobot:
         return f"{warning}{newer} changed, or got another mode, after the start of"
 
     def with_later_processes(self, observed: ObservedProcesses) -> ObservedProcesses:
-        """Return observed processes with those that were started later, in other enclaves.
+        """Return observed processes as they were started later, and those in other enclaves.
 
         Only processes of users who can read the enclaves count, because sros proposes to run their
         commands.
         """
-        known = {OBSERVER, *observed.not_here}
-        known |= {process.enclave for process in observed.processes}
-        later = [
-            secured_process(process, enclave.name)
-            for process, enclave in self.secured
-            if enclave.name not in known and self.may_use_files(process)
+        known = Counter(process.enclave for process in observed.processes)
+        running: dict[str, list[Process]] = {}
+        for process, enclave in self.secured:
+            if self.may_use_files(process):
+                running.setdefault(enclave.name, []).append(process)
+        as_started = [
+            _as_started(process, running.get(process.enclave, ()))
+            if known[process.enclave] == 1
+            else process
+            for process in observed.processes
         ]
-        return observed._replace(processes=[*observed.processes, *later])
+        later = [
+            secured_process(process, name)
+            for name, processes in running.items()
+            if name not in {OBSERVER, *observed.not_here, *known}
+            for process in processes
+        ]
+        return observed._replace(processes=[*as_started, *later])
 
     def in_other_domains(self) -> str:
         """Return the processes of other ROS domains, with the commands that close them, or ""."""
@@ -210,6 +222,23 @@ def secured_process(process: Process, enclave: str) -> ClosedProcess:
     """Return a process that runs in an enclave, with the command that starts it open."""
     known = ClosedProcess.from_process(process, enclave, process_origin(process.pid), "enclave")
     return known._replace(command=command_without_enclave(known.command, enclave))
+
+
+def _as_started(observed: ClosedProcess, running: Sequence[Process]) -> ClosedProcess:
+    """Return an observed process with the command of the only program that runs in its enclave.
+
+    A program of `ros2`, such as `ros2 topic echo`, takes no node's place; nor does anything take
+    that of a process that something else starts: a unit, a launch, a container, another process.
+    """
+    started_by = observed.unit or observed.launch or observed.container or observed.shares
+    programs = {process.program: process for process in running}
+    if started_by or len(programs) != 1 or any(map(observed.fits, running)):
+        return observed
+    (process,) = programs.values()
+    now = secured_process(process, observed.enclave)
+    if now.unit or now.launch or now.container or program_of(process.command) == "ros2":
+        return observed
+    return observed._replace(command=now.command, folder=now.folder, rmw=now.rmw, user=now.user)
 
 
 def keystore_text(enclave: ProcessEnclave) -> str:

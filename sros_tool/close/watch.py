@@ -106,7 +106,7 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
     _remember(robot, document, observed)
     _say_variables(running, observed)
     number = counted(len(observed.processes), "process", "processes")
-    robot.shell.say(f"saw {counted(len(nodes), 'node')} in {number} of this machine")
+    robot.shell.say(f"saw {counted(len(nodes), 'node')}, and {number} of this machine")
     if others := running.in_other_domains():
         robot.shell.say(others)
     if os.path.lexists(robot.observed_policy):  # of an earlier watch

@@ -58,7 +58,13 @@ from sros_tool.pki.certificates import IDENTITY_DIGITS
 from sros_tool.policy.model import ALLOW, OTHER_SIDE, Enclave, Policy, policy_in_namespace
 from sros_tool.policy.patterns import Names, covers
 from sros_tool.policy.rights import Right
-from sros_tool.runtime.log_texts import NO_ENCLAVE, RUNS_OPEN, UNKNOWN, LogText
+from sros_tool.runtime.log_texts import (
+    LET_ENTER_OR_RESTART,
+    NO_ENCLAVE,
+    RUNS_OPEN,
+    UNKNOWN,
+    LogText,
+)
 from sros_tool.runtime.vendor_log import (
     CONTINUATION,
     LINE_DOMAIN,
@@ -171,14 +177,14 @@ class SearchedKeystore:
     def has_other_side(self, right: Right) -> bool | None:
         """Return whether an enclave has the right that the peers of a right need, by its name.
 
-        None if that is not known, as in an export or with unreadable permissions, or if an enclave
-        has it only by a wildcard.
+        None if that is not known, as with unreadable permissions, or if an enclave has it only by a
+        wildcard.  In an export, other machines can have an enclave with it: `place`.
         """
         exact, expressions = self._allowed_names[OTHER_SIDE[right.right]]
         if right.name in exact:
             return True
         with suppress(SrosError):  # too many wildcards to compare
-            if self._is_whole and not expressions.cover(right.name):
+            if self._rights and self._rights.sound and not expressions.cover(right.name):
                 return False
         return None
 
@@ -215,9 +221,10 @@ class SearchedKeystore:
         return None
 
     @property
-    def _is_whole(self) -> bool:
-        """Whether these are all enclaves of the keystore, with all of their rights."""
-        return self._rights is not None and self._rights.sound and self._rights.scope is None
+    def place(self) -> str:
+        """What has these enclaves: the keystore, or an export, which may lack some of them."""
+        is_whole = self._rights is not None and self._rights.scope is None
+        return "keystore" if is_whole else "export"
 
     @cached_property
     def _allowed_names(self) -> Mapping[str, tuple[frozenset[str], Names]]:
@@ -685,7 +692,13 @@ class _Examiner:
         )
         if meaning.id.startswith("peer-"):
             return self._with_peer_causes(plain, hits)
-        if better := self._other_folder_remedy(first.fields.get("path", ""), remedy_of):
+        path = first.fields.get("path", "")
+        if meaning.id in _ABOUT_FOLDERS and _is_folder(path):
+            advice = self._with_names(LET_ENTER_OR_RESTART, named, first)
+            if meaning.id != _ABOUT_FOLDERS[0]:
+                advice = f"{advice} {remedy_of}"
+            return replace(plain, found=("the folder is here",), checked=True, remedy=advice)
+        if better := self._other_folder_remedy(path, remedy_of):
             return replace(plain, remedy=better)
         examined = meaning.faults or meaning.id == "service"
         enclave = named if examined and not self._policy else None
@@ -949,8 +962,9 @@ class _Examiner:
             return [f"{other}, but {name} is {with_article(question.type)}"], ""
         is_used = self._keystore.has_other_side(denied) if self._keystore else None
         names = () if is_used else likely_names(asked)  # a name that peers have is no mistake
-        if not names and is_used is False:
-            return [f"no enclave of the keystore may {OTHER_SIDE[denied.right]} {name}"], (
+        if not names and is_used is False and self._keystore:
+            place = self._keystore.place
+            return [f"no enclave of the {place} may {OTHER_SIDE[denied.right]} {name}"], (
                 "If another name is meant, the node perhaps lacks a remapping: compare its command "
                 "with the one that the robot starts (after `sros close`: start/commands.txt). "
                 f"Otherwise, {remedy}"
@@ -1043,6 +1057,14 @@ class _Examiner:
         )
 
 
+def _is_folder(path: str) -> bool:
+    """Return whether a path that a log names is a folder here; False if sros cannot see that."""
+    try:
+        return Path(path).is_absolute() and Path(path).is_dir()
+    except (OSError, ValueError):  # the log chooses the path
+        return False
+
+
 def _unknown_cause(hits: Iterable[_Hit]) -> str:
     """Return the cause of lines that are not understood: which they are, each text once."""
     lines: dict[str, int] = {}
@@ -1080,6 +1102,7 @@ _NOT_RESTARTED = {
 _OLDER_FILES = (
     "Restart the processes of {peer}, and then this process: one of them loaded older files."
 )
+_ABOUT_FOLDERS = ("enclave-missing", "runs-unsecured")
 _ABOUT_DOMAINS = ("domain", "domain-of-permissions")
 _EVERY_NODE = "the rights that every node needs: parameter services, /rosout, /parameter_events"
 _TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events")

@@ -10,7 +10,7 @@ from itertools import islice
 
 from sros_tool.automata import SearchLimit
 from sros_tool.fleet.robots import Fleet, Robot
-from sros_tool.names import READING_SERVICES, expression_problem, is_expression
+from sros_tool.names import READING_SERVICES, expression_problem, is_expression, moves_robot
 from sros_tool.policy.model import OTHER_SIDE, RIGHTS, Level, Source
 from sros_tool.policy.placeholders import Placeholder
 from sros_tool.policy.rights import Right
@@ -26,9 +26,12 @@ from sros_tool.proof.requirements import (
     demand,
 )
 from sros_tool.proof.worlds import World
+from sros_tool.wording import counted
 
 _NOWHERE = Source("", 0)
 _OF_EVERY_NODE = frozenset({"/rosout", "/parameter_events"})
+_SENDING = ("publish", "call", "request")
+"""The rights to send something first, in the order of the proposals."""
 _FEW = 3
 """Highest number of enclaves with a right to a name that are proposed as the only ones."""
 _MOST = 1000
@@ -60,6 +63,26 @@ def suggest(
             last = _joined_requirement(requirements[-1], requirement) if requirements else None
             requirements[-1:] = [last] if last else [*requirements[-1:], requirement]
     return tuple(_with_placeholders_for_robots(requirements, fleet) if fleet else requirements)
+
+
+def not_proposed(rights: Iterable[Right], requirements: Iterable[Requirement]) -> Iterator[str]:
+    """Yield a comment on each name that moves a robot, and that no requirement reserves.
+
+    ``requirements`` are those that `suggest` proposed for one robot.
+    """
+    reserved = {
+        (right, name)
+        for requirement in requirements
+        if isinstance(requirement, Only)
+        for right, names in requirement.rights
+        for name in names
+    }
+    for (right, name), users in sorted(_Stated(rights).users.items()):
+        if right in _SENDING and moves_robot(name) and (right, name) not in reserved:
+            yield (
+                f"# not proposed: who alone may {right} {name} (stated for "
+                f"{counted(len(users), 'enclave')}; others may by a wildcard, or a DENY is there)"
+            )
 
 
 def _joined_requirement(requirement: Requirement, other: Requirement) -> Requirement | None:
@@ -95,7 +118,7 @@ class _Stated:
 
 
 def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Requirement]:
-    for right in ("publish", "call", "request"):
+    for right in _SENDING:
         yield from _few_holders(stated_rights, right)
     yield from _unused_services(stated_rights)
     yield from _gate_requirements(worlds[0])
@@ -108,13 +131,16 @@ def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Req
 
 
 def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
-    """Yield a requirement for each up to three enclaves that alone use the same names."""
+    """Yield a requirement for each up to three enclaves that alone use the same names.
+
+    What moves the robot has one for any number of enclaves, and also if nobody is known to receive.
+    """
     other = OTHER_SIDE[right]
     names: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for name in stated_rights.names(right):
         users = tuple(sorted(stated_rights.users[right, name]))
         received = name not in _OF_EVERY_NODE and (other, name) in stated_rights.users
-        if len(users) <= _FEW and received:
+        if moves_robot(name) or (len(users) <= _FEW and received):
             names[users].append(name)
     for enclaves, names_held in sorted(names.items(), key=lambda item: (len(item[0]), item[0])):
         yield Only(source=_NOWHERE, rights=((right, tuple(names_held)),), enclaves=enclaves)
@@ -278,8 +304,10 @@ _HEAD = """\
 """
 
 
-def render_requirements(requirements: Iterable[Requirement], of: str) -> str:
-    """Return requirements as TOML, with their demands as comments.
+def render_requirements(
+    requirements: Iterable[Requirement], of: str, comments: Iterable[str] = ()
+) -> str:
+    """Return requirements as TOML, with their demands as comments, and ``comments`` at the end.
 
     ``of`` names the source at the top.  `sros_tool.proof.requirements.parse_requirements` returns
     equal requirements, with other places.
@@ -289,7 +317,7 @@ def render_requirements(requirements: Iterable[Requirement], of: str) -> str:
         lines += [f"# {demand(requirement)}", f"[[{requirement.KIND}]]"]
         lines += [f"{key} = {_toml(value)}" for key, value in _values(requirement)]
         lines.append("")
-    return "\n".join(lines)
+    return "\n".join([*lines, *(f"{comment}\n" for comment in comments)])
 
 
 def _values(requirement: Requirement) -> Iterator[tuple[str, object]]:

@@ -129,6 +129,17 @@ _MAKE_READABLE_FOR_USER = (
     "USER KEYSTORE`. If the folder has the CA keys, which no node should be able to read, export "
     "the enclave into a folder of the user."
 )
+_NO_FOLDER = "rcl does not find the enclave's folder {path}"
+_WHY_NO_FOLDER = (
+    "ROS_SECURITY_KEYSTORE or the enclave's name is wrong, or the user of the node cannot enter it"
+)
+_LET_ENTER = (
+    "`namei -l {path}` shows who may enter. If it is in an export, give the export to the user of "
+    "the node: `sudo chown -R USER KEYSTORE`. If it is next to the CA keys, which no node should "
+    "be able to read, export the enclave into a folder of the user."
+)
+LET_ENTER_OR_RESTART = f"{_LET_ENTER} If it was made after the node started, restart the node."
+"""The remedy if a folder that rcl did not find is there."""
 _SET_DOMAIN = (
     "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env KEYSTORE ENCLAVE --domain ID` prints "
     "the variables."
@@ -180,13 +191,14 @@ _ROS_TEXTS = (
     _log_text(
         "enclave-missing", _ROS,
         r"rcl: SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",
-        "the enclave's folder {path} does not exist: ROS_SECURITY_KEYSTORE or the enclave's name "
-        "is wrong", "Correct the name: `sros list_enclaves KEYSTORE` shows all names.",
+        f"{_NO_FOLDER}: {_WHY_NO_FOLDER}",
+        "Correct the name: `sros list_enclaves KEYSTORE` shows all names. If the folder is there: "
+        f"{_LET_ENTER}",
     ),
     _log_text(
         "runs-unsecured", _ROS, r"SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",
-        "the enclave's folder {path} does not exist, and as ROS_SECURITY_STRATEGY is not exactly "
-        "Enforce, the node RUNS UNSECURED",
+        f"{_NO_FOLDER} ({_WHY_NO_FOLDER}), and as ROS_SECURITY_STRATEGY is not exactly Enforce, "
+        "the node RUNS UNSECURED",
         "Start the node with `sros run`, which runs a node secured or not at all.",
     ),
     _log_text(

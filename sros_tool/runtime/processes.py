@@ -64,6 +64,8 @@ _ZENOHD = "zenohd"
 _ROUTERS = ("rmw_zenohd", _ZENOHD)
 _BRIDGES = ("zenoh-bridge-ros2dds", "zenoh-bridge-dds")
 _INTERPRETER = re.compile(r"(?:python[\d.]*|sh|bash|dash|perl|ruby|node)\Z")
+_FLAGS = re.compile(r"-[BEIOPbdiqsuvx]+\Z")
+"""Options of an interpreter that take no word: those of python (-u), of which shells have some."""
 _SCRIPTS_OF_SROS = ("sros", "sros_tool")
 
 _LOADING = timedelta(milliseconds=20)
@@ -252,12 +254,14 @@ def plain(text: str, longest: int = _LONGEST) -> str:
 
 def program_of(command: tuple[str, ...]) -> str:
     """Return the name of a command's program, or of the script or module that it interprets."""
-    name = Path(command[0]).name if command else ""
-    if len(command) > 1 and _INTERPRETER.match(name):
-        if command[1] == "-m" and len(command) > 2:
-            name = command[2]
-        elif not command[1].startswith("-"):
-            name = Path(command[1]).name
+    name, *words = (Path(command[0]).name, *command[1:]) if command else ("",)
+    if _INTERPRETER.match(name):
+        while words and _FLAGS.match(words[0]):
+            del words[0]
+        if words[:1] == ["-m"] and len(words) > 1:
+            name = words[1]
+        elif words and not words[0].startswith("-"):
+            name = Path(words[0]).name
     return plain(name or "?")
 
 

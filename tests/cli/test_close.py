@@ -467,7 +467,12 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     assert "process 4712" in said and "process 4711" not in said
     robot.by_hand, robot.named = {"/talker", "/listener"}, True
     ended = robot.close()
-    assert "  /talker: started by another command than observed: closed\n" in ended.out
+    assert "  /talker: process 4711: closed\n" in ended.out
+    now = "/opt/run talker --ros-args -r __node:=talker"
+    remembered = "/talker runs by another command than before, which sros remembers: cd /opt && "
+    assert f"{remembered}{now}; before: cd /opt && /opt/run talker\n" in ended.err
+    commands = (robot.folder / "robot/start/commands.txt").read_text()
+    assert f" /talker -- {now}\n" in commands and " /opt/run talker\n" not in commands
     assert re.fullmatch(
         "the processes run in their enclaves; the files are valid until 20.*Z; "
         "next: sros close robot --proof",
@@ -871,6 +876,7 @@ def test_processes_that_show_no_id_are_to_be_named(robot: Robot) -> None:
     said = robot.close(status=1).out
     assert "; watch again while they run, or name its node in the command of each process" in said
     assert "for nodes of /left, /right; if they run on another machine" in said
+    assert "stranger: remove its enclave from 'robot/policy.xml'; otherwise they" in said
 
 
 @sometimes("nothing_is_closed_of_what_is_not_understood", 1 / 2)
@@ -945,7 +951,7 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     said = robot.close("--proof").out
     assert "policy has no profile for them any more: /rear_camera (if they have new names, " in said
     assert "watched again: sros close robot --undo, sros close robot --for 1m)\n" in said
-    assert "; not compared: /nav/bow_camera, /nav/stern_camera (new); not" in said
+    assert "; not compared: /nav/bow_camera, /nav/stern_camera (new; compared once" in said
 
 
 def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None:
@@ -1422,6 +1428,11 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     assert list_enclaves(robot.folder / "robot/export") == ("/sros_observer", "/talker")
     robot.remaining = (TALKER, LISTENER)
     assert "(types are not compared), without /operator/look\n" in robot.close("--proof").out
+    sros("revoke", "robot/keystore", "/operator/look", cwd=robot.folder).ok()
+    assert "\nnot on this machine: /listener (to " in robot.close().out
+    assert "/operator/look" not in robot.close("--proof").out
+    sros("create_enclave", "robot/keystore", "/operator/look", cwd=robot.folder).ok()
+    robot.close("--elsewhere", "/operator/look")
     robot.by_hand = set()
     there = "start /listener and /operator/look, on other machines, without sros run, too"
     assert f"sros sees no process in an enclave of this folder; {there}\n" in (

@@ -210,6 +210,9 @@ def test_two_enclaves_with_a_right_are_proposed_by_name(tmp_path: Path) -> None:
     policy.write_text(policy_text({"/a": drives, "/b": drives, "/base": subscribe("/cmd_vel")}))
     suggested = sros("check", policy, "--suggest").ok().out
     assert '[[only]]\npublish = ["/cmd_vel"]\nenclaves = ["/a", "/b"]' in suggested
+    policy.write_text(policy_text({"/a": drives, "/look": publish("/*")}))
+    suggested = sros("check", policy, "--suggest").ok().out
+    assert "\n# not proposed: who alone may publish /cmd_vel (stated for 1 enclave; " in suggested
 
 
 @pytest.mark.parametrize(

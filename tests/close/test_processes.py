@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import subprocess
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from sros_tool.close import state
 from sros_tool.close.assignment import assign
 from sros_tool.close.processes import ClosedProcess, ObservedProcesses, run_words
 from sros_tool.close.state import RunningRobot
@@ -75,6 +77,47 @@ def test_sros_does_not_choose_among_processes_that_fit_equally() -> None:
     for seen in ((twins[0], secured), (secured, process(7, "talk"))):
         now = now.with_current_pid(RunningProcesses(seen), 0, Path("/export"))
         assert (now.pid, now.known_by, now.alike) == (9, "command", ())
+
+
+def test_the_command_of_a_secured_process_takes_the_place_of_the_observed_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not that of a tool, of another user, or one of several; nor where something else starts it.
+
+    A command that starts a node later would otherwise be one that the robot does not use any more.
+    """
+    origins = {99: ProcessOrigin("pilot.service", "/new")}
+    monkeypatch.setattr(
+        state, "process_origin", lambda pid: origins.get(pid, ProcessOrigin("", "/new"))
+    )
+    folder = tmp_path.stat()
+    enclave = ProcessEnclave("/e", "/pilot", folders=((folder.st_dev, folder.st_ino),))
+    camera = replace(process(8, "pilot", "--camera"), enclave=enclave, user=os.geteuid())
+    other = replace(camera, pid=9, command=("pilot", "--lidar"))
+    before = ClosedProcess("/pilot", 7, ("pilot",), "/opt", os.geteuid(), "", "process id")
+    robot: Any = SimpleNamespace(export=tmp_path, domain=0)
+
+    def command_after(known: Sequence[ClosedProcess], *running: Process) -> tuple[str, str]:
+        observed = ObservedProcesses(0, known)
+        now = RunningRobot(robot, RunningProcesses(running)).with_later_processes(observed)
+        assert len(now.processes) == len(known)
+        return " ".join(now.processes[0].command), now.processes[0].folder
+
+    assert command_after([before], camera) == ("pilot --camera", "/new")
+    ros2 = replace(camera, command=("/usr/bin/python3", "/opt/ros/bin/ros2", "topic", "echo"))
+    for known, running in (
+        ([before], (camera, other)),
+        ([before], (camera, replace(camera, pid=9, command=("pilot",)))),
+        ([before], (replace(camera, user=4321),)),
+        ([before], (replace(camera, pid=99),)),
+        ([before], (ros2,)),
+        ([before], (replace(camera, enclave=replace(enclave, folders=((1, 1),))),)),
+        ([before, before._replace(pid=6)], (camera,)),
+        ([before._replace(unit="pilot.service")], (camera,)),
+        ([before._replace(launch=("ros2", "launch", "a"))], (camera,)),
+        ([before._replace(shares=("/x",))], (camera,)),
+    ):
+        assert command_after(known, *running) == ("pilot", "/opt"), (known, running)
 
 
 def test_commands_name_the_rmw_and_on_zenoh_the_enclave() -> None:

@@ -18,4 +18,18 @@ def test_wildcards_and_denials_count_in_what_is_shown(tmp_path: Path) -> None:
     })  # fmt: skip
     (tmp_path / "p.xml").write_text(text)
     lines = access_lines(read_policy(tmp_path / "p.xml"), tmp_path)
-    assert lines == ["topic /odom: /a -> /b, /look", "topic /*: nobody -> /look, /not"]
+    assert lines == ["topic /odom: /a -> /b, /look", "topic /*: in part /a -> /look, /not"]
+
+
+def test_all_who_may_move_the_robot_are_shown_first(tmp_path: Path) -> None:
+    """The first lines are what most users read, and a name that is left out there may drive."""
+    drivers = {f"/d{number}": publish("/cmd_vel", "/image") for number in range(6)}
+    names = tuple(f"/a{number}" for number in range(30))
+    others = {"/base": subscribe("/cmd_vel", "/image"), "/x": publish(*names), "/y": publish("/z*")}
+    (tmp_path / "p.xml").write_text(policy_text(drivers | others))
+    lines = access_lines(read_policy(tmp_path / "p.xml"), tmp_path)
+    assert lines[:2] == [
+        "topic /cmd_vel: /d0, /d1, /d2, /d3, /d4, /d5 -> /base",
+        "topic /image: /d0, /d1, /d2 and 3 more -> /base",
+    ]
+    assert lines[-1] == "and 13 more names"

@@ -1053,6 +1053,21 @@ def test_a_folder_that_is_missing_is_looked_for_in_the_keystore(
         assert told in ended.out and "only-text" not in ended.err
 
 
+def test_a_folder_that_is_there_has_the_right_name(keystore: Path, tmp_path: Path) -> None:
+    """rcl says the same of a folder that does not exist and of one that the user cannot enter."""
+    log, folder = tmp_path / "robot.log", keystore / f"enclaves{ENCLAVE}"
+    sros("distribute_key", keystore, ENCLAVE, export := tmp_path / "export").ok()
+    exported = export / f"enclaves{ENCLAVE}"
+    for place, words in ((folder, [keystore]), (folder, []), (exported, [keystore])):
+        for begin, unsecured in (("rcl: ", False), ("", True)):
+            log.write_text(f"{begin}SECURITY ERROR: directory '{place}' does not exist.\n")
+            found = sros("explain", *words, "--log", log).out
+            assert f"`namei -l {place}` shows who may enter. If it is in an export" in found
+            assert "the folder is here\n" in found and "restart the node" in found
+            assert "Correct the name" not in found and "has to be" not in found
+            assert ("RUNS UNSECURED" in found) is ("with `sros run`" in found) is unsecured
+
+
 def test_a_forgotten_remapping_is_shown(keystore: Path, tmp_path: Path) -> None:
     log = tmp_path / "robot.log"
     meant = ": perhaps that is meant"
@@ -1105,9 +1120,12 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
         assert ("[explain.likely-name]" in notes) is (len(facts) == 1)
     export = tmp_path / "export"
     sros("distribute_key", keystore, "/weed", export).ok()
+    found = sros("explain", export, "--log", log, "/weed").out
+    assert "no enclave of the export may publish /odometry\n" in found
+    assert "perhaps lacks a remapping: " in found
     (keystore / "enclaves/camera/permissions.p7s").write_text("damaged")
-    for part in (export, keystore):  # from which nothing follows for the name
-        assert "no enclave" not in sros("explain", part, "/weed", "--log", log).out
+    found = sros("explain", keystore, "/weed", "--log", log).out
+    assert "no enclave" not in found  # nothing follows for the name
     assert "no enclave" not in sros("explain", export, "/weed", "subscribe", "/odometry").err
 
 

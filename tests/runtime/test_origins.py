@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.runtime.processes import ProcessOrigin, _forked_by, process_origin
+from sros_tool.runtime.processes import ProcessOrigin, _forked_by, process_origin, program_of
 
 
 @pytest.mark.parametrize(
@@ -52,6 +52,23 @@ def test_the_program_of_a_process(
     first = _forked_by(folder, command)
     os.close(folder)
     assert first == (program, commands[program - 7] if program else ())
+
+
+def test_the_name_of_a_program() -> None:
+    """An option of the interpreter, such as -u for logs that are not buffered, is not its name."""
+    for command, name in (
+        ("python3 eyes.py", "eyes.py"),
+        ("/usr/bin/python3.12 -u /opt/eyes.py -v", "eyes.py"),
+        ("python3 -P -B -u -m pkg.eyes", "pkg.eyes"),
+        ("python3 -c eyes.py", "python3"),
+        ("python3 -W error eyes.py", "python3"),
+        ("bash -c eyes", "bash"),
+        ("sh -u eyes.sh", "eyes.sh"),
+        ("/opt/eyes -u eyes.py", "eyes"),
+        ("python3 -u", "python3"),
+        ("", "?"),
+    ):
+        assert program_of(tuple(command.split())) == name
 
 
 @pytest.mark.parametrize(
