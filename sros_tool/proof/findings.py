@@ -25,7 +25,7 @@ from sros_tool.names import (
     is_expression,
     service_of,
 )
-from sros_tool.policy.model import ALLOW, Source
+from sros_tool.policy.model import ALLOW, Level, Source
 from sros_tool.policy.rights import KIND_OF, Right
 from sros_tool.proof.decide import MOST_STEPS, KeptUse, Use, Verdict, Witness, Worlds
 from sros_tool.proof.requirements import (
@@ -341,12 +341,39 @@ def _with_title(requirement: Requirement) -> str:
     return f"{name}{demand(requirement)}"
 
 
+def short_text(violation: Violation) -> str:
+    """Return what breaks the requirement, such as ``/teleop may publish /cmd_vel``.
+
+    The chain of an influence is left out, and further enclaves are only counted.
+    """
+    match violation.requirement:
+        case AtMost():
+            text = _clause(violation)
+        case Protected(level=level):
+            is_wanted = "encrypted" if level is Level.ENCRYPT else "signed"
+            text = f"messages of {_subject(violation)} are not {is_wanted}"
+        case _:
+            text = f"{_subject(violation)} {_clause(violation)}"
+    more = len(violation.witness.others)
+    return f"{text}, and {more} more break it" if more else text
+
+
 def _fact(violation: Violation) -> str:
     """Return a clause that says what breaks the requirement, without the finding's subject."""
+    match violation.requirement:
+        case Apart():
+            return f"{_clause(violation)}: {_chain(violation.steps)}"
+        case Must() | Protected():
+            return _clause(violation)
+        case _:
+            return f"{_clause(violation)}{_other_violators(violation)}"
+
+
+def _clause(violation: Violation) -> str:
     steps = violation.steps
     match violation.requirement:
         case Apart():
-            return f"influences {steps[-1].use.enclave}: {_chain(steps)}"
+            return f"influences {steps[-1].use.enclave}"
         case Must():
             if violation.missing:
                 return "does not exist"
@@ -356,12 +383,11 @@ def _fact(violation: Violation) -> str:
         case Protected():
             return "its messages are not"
         case AtMost():
-            return f"{_joined_steps(steps)}{_other_violators(violation)}"
+            return _joined_steps(steps)
         case NotBoth():
-            actions = f"{steps[0].action_text()} and {steps[1].action_text()}"
-            return f"may {actions}{_other_violators(violation)}"
+            return f"may {steps[0].action_text()} and {steps[1].action_text()}"
         case _:
-            return f"may {steps[0].action_text()}{_other_violators(violation)}"
+            return f"may {steps[0].action_text()}"
 
 
 def _chain(steps: Sequence[Step]) -> str:

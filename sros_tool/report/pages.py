@@ -24,7 +24,14 @@ from sros_tool.names import is_expression
 from sros_tool.policy.model import ALLOW
 from sros_tool.reach import OF_EVERY_NODE
 from sros_tool.report.layout import Scene
-from sros_tool.report.picture import Bundle, Picture, PicturedEnclave, fold, lack_text
+from sros_tool.report.picture import (
+    Bundle,
+    Picture,
+    PicturedEnclave,
+    Requirements,
+    fold,
+    lack_text,
+)
 from sros_tool.terminal import visible_json, visible_line
 from sros_tool.validity import iso
 from sros_tool.values import as_plain
@@ -121,7 +128,8 @@ def _page_data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> d
     for each right.
     """
     return {
-        "headlines": picture.answers,
+        "requirements": _requirements_json(picture.requirements),
+        "headlines": picture.other_answers,
         "notes": picture.notes,
         "overlay": as_plain(picture.overlay),
         "of_every_node": OF_EVERY_NODE,
@@ -138,6 +146,15 @@ def _page_data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> d
         "validities": as_plain(picture.validities),
         "findings": as_plain(picture.findings),
         "unread": sum(units.enclaves for units in picture.unread),
+    }
+
+
+def _requirements_json(requirements: Requirements | None) -> dict[str, Any] | None:
+    """Return how many requirements hold, and what breaks the others; findings say the rest."""
+    return requirements and {
+        "hold": requirements.hold,
+        "assumed": len(requirements.assumed),
+        "violations": [violation.short for violation in requirements.violations],
     }
 
 

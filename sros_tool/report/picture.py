@@ -373,6 +373,8 @@ class PicturedViolation(NamedTuple):
 
     text: str
     """What breaks the requirement, and what the requirement demands."""
+    short: str
+    """What breaks the requirement, such as `/teleop may publish /cmd_vel`."""
     uses: tuple[PicturedUse, ...]
     """Uses of names that break the requirement."""
 
@@ -521,9 +523,14 @@ class Picture:
     def answers(self) -> tuple[str, ...]:
         """What the picture answers, and what it lacks, as sentences without a full stop."""
         requirements = self.requirements.sentences() if self.requirements else ()
+        return (*requirements, *self.other_answers)
+
+    @property
+    def other_answers(self) -> tuple[str, ...]:
+        """The answers except those on requirements."""
         focus = (focus.sentence for focus in self.focus)
         exports = map(_sentence_on_export, self.exports)
-        return (*focus, *exports, *requirements, *self._unread_sentences())
+        return (*focus, *exports, *self._unread_sentences())
 
     @property
     def notes(self) -> tuple[str, ...]:

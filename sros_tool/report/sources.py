@@ -388,7 +388,12 @@ def _with_requirements(
         SrosError: the requirements cannot be read.
     """
     from sros_tool.checks.keystores.opened import Circumstances
-    from sros_tool.proof.findings import assumption_text, decide_all, decided_findings
+    from sros_tool.proof.findings import (
+        assumption_text,
+        decide_all,
+        decided_findings,
+        short_text,
+    )
     from sros_tool.proof.requirements import demand, read_requirements
     from sros_tool.proof.system import load_system
 
@@ -405,6 +410,7 @@ def _with_requirements(
     violations = tuple(
         PicturedViolation(
             _finding_text(finding, finding.subject),
+            short_text(violation),
             tuple(
                 PicturedUse(step.use.enclave, *step.drawn())
                 for step in violation.steps

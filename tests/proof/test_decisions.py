@@ -13,7 +13,7 @@ from sros_tool.dds.decision.vendors import TESTED
 from sros_tool.files import templates_dir
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
-from sros_tool.proof.findings import Decided, decide_all, requirement_findings
+from sros_tool.proof.findings import Decided, decide_all, requirement_findings, short_text
 from sros_tool.proof.requirements import Only, Protected, parse_requirements
 from sros_tool.proof.suggestions import not_proposed, suggest
 from sros_tool.proof.system import System, load_system, policy_system
@@ -96,6 +96,32 @@ HOLDERS = {
 def test_whoever_has_a_part_of_an_action_holds_the_right_to_it(case: str) -> None:
     rights, required, text = HOLDERS[case]
     assert texts(rights, required) == ([text] if text else [])
+
+
+def test_in_short_a_violation_says_who_breaks_it_by_what() -> None:
+    rights = {
+        "/a": may("publish", "/x", "/z"),
+        "/b": may("publish", "/x") + may("subscribe", "/z"),
+        "/c": may("publish", "/y") + may("subscribe", "/x"),
+    }
+    required = """
+    [[only]]\npublish = ["/x"]\nenclaves = ["/c"]
+    [[apart]]\nfrom = ["/a"]\nto = ["/c"]
+    [[must]]\nenclave = "/a"\npublish = ["/y"]
+    [[at_most]]\npublish = ["/x"]\nenclaves = 1
+    [[not_both]]\nfirst.publish = ["/x"]\nsecond.publish = ["/z"]
+    [[protected]]\ntopics = ["/x"]\nlevel = "encrypt"
+    """
+    system = robot(rights | {"/a": rights["/a"].replace("/x<", '/x<?sros protect="sign"?><')})
+    violations = decide_all(parse_requirements(required.encode(), "r.toml"), system).violations
+    assert [short_text(violation) for violation in violations] == [
+        "/a may publish /x, and 1 more break it",
+        "/a influences /c",
+        "/a may not publish /y",
+        "/a and /b may publish /x",
+        "/a may publish /x and publish /z",
+        "messages of /x are not encrypted",
+    ]
 
 
 @pytest.mark.parametrize(

@@ -277,6 +277,7 @@ def test_what_breaks_a_requirement_is_red_and_said(tmp_path: Path) -> None:
     line = 1 + policy.read_text().split("/cmd*")[0].count("\n")
     text = f"{policy.name}:{line}: /web: may publish /cmd_vel by /cmd*, but "
     assert violation["text"].startswith(text)
+    assert violation["short"] == "/web may publish /cmd_vel by /cmd*"
     (finding,) = (
         finding for finding in shown_picture["findings"] if finding["id"].startswith("requirement.")
     )

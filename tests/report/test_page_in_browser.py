@@ -772,6 +772,47 @@ def test_only_what_was_checked_is_without_an_error(browser: Browser, tmp_path: P
             assert said in page.inner_text("#headlines").split("\n")
 
 
+def test_what_is_violated_comes_first_and_the_map_opens_where_it_is(
+    browser: Browser, tmp_path: Path
+) -> None:
+    policy, wanted, path = (tmp_path / name for name in ("p.xml", "r.toml", "p.html"))
+    enclaves = {f"/a{n}": publish(*(f"/n{n}/t{m}" for m in range(9))) for n in range(9)}
+    for n in range(9):
+        enclaves[f"/a{n}"] += subscribe(*(f"/n{(n + 1) % 9}/t{m}" for m in range(9)))
+    policy.write_text(policy_text({**enclaves, "/mux": publish("/n8/t8")}))
+    only = '[[only]]\npublish = ["/n8/t8"]\nenclaves = ["/mux"]\n'
+    hold = '[[nobody]]\npublish = ["/n0/no"]\n[[protected]]\ntopics = ["/n0/t0"]\nlevel = "sign"\n'
+    wanted.write_text(only + hold)
+    sros("view", policy, "--requirements", wanted, "-o", path).ok()
+    inside = """() => {
+        const room = document.querySelector('#canvas').getBoundingClientRect();
+        const {top, bottom} = document.querySelector('#map .violates').getBoundingClientRect();
+        return room.top <= bottom && top <= room.bottom && top < innerHeight;
+    }"""
+    with opened(browser, path) as page:
+        first, second, *others = filter(None, page.inner_text("#headlines").split("\n"))
+        only_one = "; 1 of the others holds only under an assumption"
+        assert first == f"1 of 3 requirements violated{only_one}"
+        assert second == "/a8 may publish /n8/t8"
+        # It is said once, and what looks wrong besides it is not called none.
+        assert "may publish /n8/t8" not in " ".join(others)
+        assert "No error" not in " ".join(others)
+        assert page.evaluate(inside)
+        page.click("#headlines .violated .link-button")
+        assert "/a8: p.xml:1: may publish /n8/t8, but only /mux" in page.inner_text("#findings")
+    policy.write_text(policy_text({**enclaves, "/a8": publish("/z"), "/mux": publish("/n8/t8")}))
+    sros("view", policy, "--requirements", wanted, "-o", path, "--force").ok()
+    with opened(browser, path, "phone") as page:
+        held = "3 requirements hold, 1 of them only under an assumption"
+        assert page.inner_text("#headlines").startswith(held)
+        # A long head is not cut off, and a tab brings what it shows into sight.
+        page.evaluate("document.querySelector('h1').style.height = '700px'")
+        page.click("#tab-findings")
+        assert page.evaluate(
+            "document.querySelector('#panel-findings').getBoundingClientRect().top < 100"
+        )
+
+
 def test_it_prints_every_part(browser: Browser, robot_page: Path) -> None:
     with opened(browser, robot_page, kept=False) as page:
         page.emulate_media(media="print")

@@ -56,7 +56,7 @@ function longList(items) {
 }
 
 // Backticks mark commands.
-const marked = (text) => text.split("`").map((part, at) => (at % 2 ? el("code", { text: part }) : part));
+export const commands = (text) => text.split("`").map((part, at) => (at % 2 ? el("code", { text: part }) : part));
 
 // A finding; `enclaves` are all that have this very finding, each with a link.
 export function findingItem(finding, enclaves = [], onEnclave = null) {
@@ -69,8 +69,8 @@ export function findingItem(finding, enclaves = [], onEnclave = null) {
     " ",
     el("code", { text: finding.id }),
     many ? el("details", {}, el("summary", { text: `${links.length} enclaves` }), el("ul", { class: "plain" }, links)) : null,
-    el("p", {}, links.length === 1 ? [link(enclaves[0], () => onEnclave(enclaves[0])), ": "] : [], marked(finding.text)),
-    finding.remedy ? el("p", { class: "soft" }, marked(finding.remedy)) : null,
+    el("p", {}, links.length === 1 ? [link(enclaves[0], () => onEnclave(enclaves[0])), ": "] : [], commands(finding.text)),
+    finding.remedy ? el("p", { class: "soft" }, commands(finding.remedy)) : null,
   );
 }
 

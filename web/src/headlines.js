@@ -1,22 +1,24 @@
 // What the page claims before anything else: its answers, who may drive the robot, or else who may do
 // most, and what permissions do not control.
 
+import { commands } from "./details.js";
 import { counted, el } from "./dom.js";
 import { SHOWN, moves, nameButton, rank } from "./table.js";
 import { daysLeft } from "./timeline.js";
 import { SENDS, noneText, sends } from "./words.js";
 
 const DRIVERS = 3;
+const VIOLATED = "requirement.violated";
 
 function button(text, onclick) {
-  return el("button", { type: "button", class: "link-button", text, onclick });
+  return el("button", { type: "button", class: "link-button words", text, onclick });
 }
 
 // `opens(kind, name)` returns what shows a name; `act.enclave` shows an enclave, and `showTab` the
 // names or differences that are only counted.
 export function headlines(model, opens, act, showTab) {
-  const parts = model.headlines.map((text) => el("p", { text: `${text}.` }));
   const showTable = () => showTab("names");
+  const parts = [requirementLines(model, () => showTab("findings")), model.headlines.map((text) => el("p", { text: `${text}.` }))].flat();
   // A focus has its own answer, and in a comparison there are two.
   if (model.overlay) parts.push(differencesLine(model, () => showTab("differences")));
   else if (model.scenes[0].id !== "focus") {
@@ -30,6 +32,20 @@ export function headlines(model, opens, act, showTab) {
     parts.push(el("details", { class: "notes" }, el("summary", { text: summary }), rest.map((text) => el("p", { text: `${text}.` }))));
   } else if (first) parts.push(el("p", { class: "notes", text: `${first}.` }));
   return parts;
+}
+
+// Violations are said in short: the findings say all of each, and what was assumed for the others.
+function requirementLines({ requirements }, showFindings) {
+  if (!requirements) return [];
+  const { hold, violations, assumed } = requirements;
+  const number = violations.length;
+  const all = counted(hold + number, "requirement");
+  const some = number ? `; ${assumed} of the others hold${assumed === 1 ? "s" : ""}` : `, ${assumed} of them`;
+  const under = assumed ? [`${some} only `, button("under an assumption", showFindings)] : "";
+  if (!number) return [el("p", { class: "drivers" }, `${all} hold${hold === 1 ? "s" : ""}`, under)];
+  const lines = violations.slice(0, DRIVERS).map((text) => el("p", { class: "violated" }, commands(text)));
+  if (number > DRIVERS) lines.push(el("p", {}, button(`and ${number - DRIVERS} more`, showFindings)));
+  return [el("p", { class: "drivers" }, el("b", { class: "violated" }, button(`${number} of ${all} violated`, showFindings)), under), ...lines];
 }
 
 function differencesLine({ overlay, differences }, showDifferences) {
@@ -82,7 +98,8 @@ function widestLine(model, act) {
 }
 
 // What looks wrong: the worst finding, how many others there are, and what expired since the page was made.
-function wrongLine({ findings, validities, unread }, showTab) {
+function wrongLine({ findings: all, requirements, validities, unread }, showTab) {
+  const findings = all.filter(({ id }) => id !== VIOLATED);
   const of = (severity) => findings.filter((finding) => finding.severity === severity);
   const [errors, warnings, notes] = ["error", "warning", "note"].map(of);
   const expired = validities.filter((validity) => daysLeft(validity) < 0);
@@ -95,6 +112,7 @@ function wrongLine({ findings, validities, unread }, showTab) {
   if (parts.length) return el("p", { class: "lack" }, "Looks wrong: ", parts.flatMap((part, at) => (at ? [", ", ...part] : part)));
   const unchecked = findings.find(({ id }) => id === "view.not-checked");
   if (unchecked) return el("p", { class: "lack" }, "Not all was checked: ", button(counted(notes.length, "note"), () => showTab("findings")));
+  if (requirements?.violations.length) return null;
   const read = unread ? " in the enclaves that were read" : "";
   return el("p", {}, `No error or warning was found${read}`, notes.length ? [", but ", button(counted(notes.length, "note"), () => showTab("findings"))] : "", ".");
 }

@@ -80,6 +80,16 @@ function showMap() {
   zoom(0);
   light();
   showFocus();
+  showViolation();
+}
+
+// What breaks a requirement is in sight.
+function showViolation() {
+  const canvas = byId("canvas");
+  const broken = byId("map").querySelector(".violates")?.getBoundingClientRect();
+  if (!broken || state.flow || filtering()) return;
+  const room = canvas.getBoundingClientRect();
+  canvas.scrollTop += broken.top + broken.height / 2 - room.top - room.height / 2;
 }
 
 // What was asked about is in sight.
@@ -380,7 +390,10 @@ function start() {
     document.documentElement.dataset.theme = event.target.value;
   });
   for (const tab of document.querySelectorAll("[role=tab]")) {
-    tab.addEventListener("click", () => showTab(tab.id.replace("tab-", "")));
+    tab.addEventListener("click", () => {
+      showTab(tab.id.replace("tab-", ""));
+      if (isSmall()) tab.parentElement.scrollIntoView();
+    });
     tab.addEventListener("keydown", tabKeys);
   }
   document.addEventListener("keydown", (event) => {
@@ -420,7 +433,7 @@ function foldAgain() {
 function startsWithoutEnclaves() {
   const { id, cards } = state.shown;
   const tops = cards.filter((card) => card.role !== "names").map((card) => card.y);
-  return id === "essential" && !model.overlay && Math.min(...tops) * state.zoom > byId("canvas").clientHeight;
+  return id === "essential" && !model.overlay && !model.requirements?.violations.length && Math.min(...tops) * state.zoom > byId("canvas").clientHeight;
 }
 
 function hop(step) {
