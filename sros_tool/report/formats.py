@@ -48,8 +48,8 @@ _STYLE = """\
 svg{--paper:#fbfcfd;--card:#fff;--ink:#17222e;--soft:#56657a;--rule:#cfd7e1;--frame:#eef2f6;\
 --line:#5d7590;--deny:#b3261e;--first:#a34a00;--second:#176b3a;--encrypt:#176b3a;--sign:#1f5fae;\
 --open:#a34a00;background:var(--paper)}
-@media (prefers-color-scheme:dark){svg{--paper:#10161d;--card:#1a232d;--ink:#e8eef5;--soft:#a3b2c4;\
---rule:#37465a;--frame:#151d26;--line:#8aa3bf;--deny:#ff8a80;--first:#ffb070;--second:#7fd6a0;\
+@media (prefers-color-scheme:dark){svg{--paper:#131416;--card:#1e2023;--ink:#e8eef5;--soft:#a9b2bc;\
+--rule:#424850;--frame:#191b1e;--line:#8aa3bf;--deny:#ff8a80;--first:#ffb070;--second:#7fd6a0;\
 --encrypt:#7fd6a0;--sign:#8fbcff;--open:#ffb070}}
 text{font:12px ui-monospace,"SFMono-Regular",Menlo,Consolas,"DejaVu Sans Mono",monospace;\
 fill:var(--ink);white-space:pre}
@@ -70,16 +70,16 @@ letter-spacing:.06em}
 .second{stroke:var(--second);stroke-width:2.25;marker-end:url(#to2)}
 .differs{stroke:var(--sign);stroke-width:3;stroke-opacity:1;marker-end:url(#odd)}
 .tipodd{fill:var(--sign)}
-.deny{stroke:var(--deny);stroke-width:1.75;stroke-opacity:1;marker-end:url(#no)}
+.deny{stroke:var(--soft);stroke-width:1.75;stroke-opacity:1;marker-end:url(#no)}
 .violates{stroke:var(--deny);stroke-width:3;stroke-opacity:1;marker-end:url(#bad)}
 .tip{fill:var(--line)}.tipbad{fill:var(--deny)}.tip1{fill:var(--paper);stroke:var(--first);stroke-width:1.2}.tip2{fill:var(--second)}
-.cross{fill:var(--paper);stroke:var(--deny);stroke-width:1.6}
+.cross{fill:var(--paper);stroke:var(--soft);stroke-width:1.6}
 .glyph{fill:none;stroke:var(--soft);stroke-width:1.4}
 .lock{fill:none;stroke-width:1.4}.lock-encrypt{stroke:var(--encrypt)}.lock-sign{stroke:var(--sign)}\
 .lock-none{stroke:var(--open)}
 .tag{font:700 11px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;fill:var(--soft)}
 """
-_USE = "svg{--second:var(--deny)}\n"  # use without permission is drawn like a denial
+_USE = "svg{--second:var(--deny)}\n"  # use without permission is drawn like a violation
 _MARKERS = """\
 <marker id="to" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="8" markerHeight="8" \
 markerUnits="userSpaceOnUse" orient="auto"><path class="tip" d="M0 0.5L8 4L0 7.5z"/></marker>
@@ -334,7 +334,7 @@ _COLORS = {
     OverlaySide.FIRST: "#a34a00",
     OverlaySide.SECOND: "#176b3a",
 }
-_DENIED = "#b3261e"
+_VIOLATING = "#b3261e"
 _MERMAID_ARROWS = {"encrypt": "==>", "sign": "-->", "none": "-.->", "unknown": "-->"}
 _WAIT = 60
 
@@ -379,8 +379,7 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
         arrow = _MERMAID_ARROWS[link.level.value] if link.qualifier is ALLOW else "--x"
         text = _entities(_link_label(picture, link))
         lines.append(f'  {_node_id(link.source)} {arrow}|"{text}"| {_node_id(link.target)}')
-        red = link.violates or link.qualifier is not ALLOW
-        color = _DENIED if red else _COLORS[link.mark]
+        color = _VIOLATING if link.violates else _COLORS[link.mark]
         styles[color].append(number)
     lines += [
         f"  linkStyle {','.join(map(str, links))} stroke:{color}"
@@ -531,7 +530,7 @@ def _dot_edge(picture: Picture, link: Link) -> str:
     denied = link.qualifier is not ALLOW
     attributes = [
         f"label={_quoted(_link_label(picture, link))}",
-        f'color="{_DENIED if denied or link.violates else _COLORS[link.mark]}"',
+        f'color="{_VIOLATING if link.violates else _COLORS[link.mark]}"',
         f"style={_DOT_STYLES[link.level.value]}",
     ]
     attributes += ["arrowhead=tee"] if denied else []

@@ -21,7 +21,7 @@ function chip(kind, text) {
 
 export function chips(model, tie) {
   const shown = [];
-  if (tie.deny) shown.push(chip("deny", "DENY"));
+  if (tie.deny) shown.push(chip("", "DENY"));
   const marked = markText(model.overlay, tie.mark);
   if (marked) shown.push(chip(tie.mark, marked));
   if (tie.by?.length) shown.push(chip("", `by ${tie.by.join(", ")}`));

@@ -127,7 +127,7 @@ const levelText = (level) => LEVELS[level].replace("protection ", "");
 
 function line(row, opens, withLevel) {
   const names = row.names.map((name) => el("div", {}, nameButton(row.kind, name, opens)));
-  const denied = row.denied.length ? el("div", {}, el("span", { class: "chip deny", text: "DENY" }), " ", list(row.denied, "")) : null;
+  const denied = row.denied.length ? el("div", {}, el("span", { class: "chip", text: "DENY" }), " ", list(row.denied, "")) : null;
   return el(
     "tr",
     {},
