@@ -13,7 +13,8 @@ import hashlib
 import html
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime
 from itertools import groupby
 from pathlib import Path
@@ -29,6 +30,7 @@ from sros_tool.report.picture import (
     Picture,
     PicturedEnclave,
     Requirements,
+    Tie,
     fold,
     lack_text,
 )
@@ -127,6 +129,7 @@ def _page_data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> d
     Rights are grouped by names with equal rights (bundles), which takes less space than one entry
     for each right.
     """
+    bundles = fold(picture.names, picture.edges, separate_questions=True)
     return {
         "requirements": _requirements_json(picture.requirements),
         "headlines": picture.other_answers,
@@ -135,10 +138,7 @@ def _page_data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> d
         "of_every_node": OF_EVERY_NODE,
         "join_needs_right": picture.join_needs_right,
         "enclaves": [_enclave_json(enclave) for enclave in picture.enclaves],
-        "bundles": [
-            _bundle_json(bundle)
-            for bundle in fold(picture.names, picture.edges, separate_questions=True)
-        ],
+        **_bundles_json(bundles, [enclave.path for enclave in picture.enclaves]),
         "scenes": [_scene_json(scene) for scene in scenes],
         "equal": as_plain(picture.equal),
         "rows": [_row_json(bundle) for bundle in fold(drawn.names, drawn.edges)],
@@ -173,21 +173,47 @@ def _with_denial_flag(value: dict[str, Any]) -> dict[str, Any]:
     return value
 
 
-def _bundle_json(bundle: Bundle) -> dict[str, Any]:
-    ties = [_with_denial_flag(as_plain(tie)) for tie in bundle.ties]
-    for tie in ties:
-        tie["enclave"] = tie.pop("node")
-        del tie["differs"]
+def _bundles_json(bundles: Iterable[Bundle], enclaves: Sequence[str]) -> dict[str, Any]:
+    """Return bundles as JSON, in which what bundles or ties have in common is there only once.
+
+    A bundle is its names, the number of its traits, and its ties: each list is the number of what
+    ties have in common, followed by the numbers of their enclaves.
+    """
+    numbers = {path: number for number, path in enumerate(enclaves)}
+    traits: dict[Bundle, int] = {}
+    kinds: dict[Tie, int] = {}
+    listed = [
+        [
+            bundle.names,
+            traits.setdefault(replace(bundle, names=(), ties=()), len(traits)),
+            [
+                [kinds.setdefault(kind, len(kinds)), *(numbers[tie.node] for tie in ties)]
+                for kind, ties in groupby(bundle.ties, key=lambda tie: replace(tie, node=""))
+            ],
+        ]
+        for bundle in bundles
+    ]
+    return {
+        "bundles": listed,
+        "traits": [_traits_json(bundle) for bundle in traits],
+        "ties": [_tie_json(tie) for tie in kinds],
+    }
+
+
+def _traits_json(bundle: Bundle) -> dict[str, Any]:
     return {
         "kind": bundle.kind,
-        "names": bundle.names,
         "asks": bundle.asks,
         "open": bundle.protection.open_text(bundle.kind),
         "everybody": bundle.protection.everybody,
         "lacks": lack_text(bundle.kind, bundle.lacks) if bundle.lacks else "",
         "protection": as_plain(bundle.protection),
-        "ties": _table(ties),
     }
+
+
+def _tie_json(tie: Tie) -> dict[str, Any]:
+    value = _with_denial_flag(as_plain(tie))
+    return {key: value[key] for key in value if key not in ("node", "differs")}
 
 
 def _row_json(bundle: Bundle) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 
 import { commands } from "./details.js";
 import { counted, el } from "./dom.js";
-import { SHOWN, moves, nameButton, rank } from "./table.js";
+import { SHOWN, nameButton, rank, rowsByMotion } from "./table.js";
 import { daysLeft } from "./timeline.js";
 import { SENDS, noneText, sends } from "./words.js";
 
@@ -23,8 +23,12 @@ export function headlines(model, opens, act, showTab) {
   if (model.overlay) parts.push(differencesLine(model, () => showTab("differences")));
   else if (model.scenes[0].id !== "focus") {
     const said = drivers(model.rows, opens, showTable);
-    const widest = said.length ? [] : [widestLine(model, act)];
-    parts.push(el("div", { class: "drivers" }, said, widest.filter(Boolean), wrongLine(model, showTab), openLine(model, showTable)));
+    const widest = said.length ? [] : widestLine(model, act);
+    const lines = [...said, ...widest, wrongLine(model, showTab)];
+    const isStated = model.bundles.some(({ protection }) => protection.data);
+    if (isStated) lines.unshift(openLine(model, showTable));
+    else lines.push(el("p", { class: "soft", text: "What strangers may do is not stated here: a keystore's governance says it." }));
+    parts.push(el("div", { class: "drivers" }, lines));
   }
   const [first, ...rest] = model.notes;
   if (rest.length) {
@@ -57,12 +61,15 @@ function differencesLine({ overlay, differences }, showDifferences) {
 
 // Who may drive the robot; where nothing is known to move it, who may use its names if they are few.
 function drivers(rows, opens, showTable) {
-  const moving = rows.filter((row) => rank(row) < 2).sort((a, b) => rank(a) - rank(b));
+  const known = rowsByMotion(rows).filter((row) => rank(row) < 2).sort((a, b) => rank(a) - rank(b));
+  // That nobody drives is said where nobody drives at all.
+  const driven = known.filter((row) => row.all_send || row.senders.length);
+  const moving = driven.length ? driven : known;
   const own = rows.filter((row) => !row.common);
   const few = own.length <= DRIVERS ? own : [];
   const shown = moving.length ? moving : few;
   const said = shown.slice(0, DRIVERS).map((row) => {
-    const name = row.names.find(moves) ?? row.names[0];
+    const [name] = row.names;
     const all = [...(row.all_send ? [row.everybody] : []), ...row.senders];
     const more = all.length > SHOWN ? ` and ${all.length - SHOWN} more` : "";
     const who = all.length ? `${all.slice(0, SHOWN).join(", ")}${more}` : noneText(row, row.receivers);
@@ -119,9 +126,6 @@ function wrongLine({ findings: all, requirements, validities, unread }, showTab)
 
 // What may be used without a right.  Only a keystore's governance says it, and only of DDS.
 function openLine(model, showTable) {
-  if (!model.bundles.some((bundle) => bundle.protection.data)) {
-    return el("p", { class: "soft", text: "What strangers may do is not stated here: a keystore's governance says it." });
-  }
   const open = model.bundles.filter(({ protection }) => !protection.read_control || !protection.write_control);
   const number = open.reduce((sum, bundle) => sum + bundle.names.length, 0);
   if (!number) return el("p", { text: "On DDS, strangers, who have no identity, may use none of these names, and enclaves only those that they have a right to." });

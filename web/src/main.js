@@ -317,17 +317,15 @@ function fillLists() {
   }
   byId("findings").replaceChildren(sorted.length ? list : none);
   byId("tab-findings").textContent = sorted.length ? `Findings (${sorted.length})` : "Findings";
-  const opens = (kind, name) => model.bundle(kind, name) && (() => act.name(kind, name));
+  // A name that stands for several is a card of the first scene.
+  const opens = (kind, name) => {
+    if (model.bundle(kind, name)) return () => act.name(kind, name);
+    const card = model.scenes[0].cards.find((each) => each.kind === kind && each.lines.join("") === name);
+    return card && (() => choose(card));
+  };
   byId("headlines").replaceChildren(...headlines(model, opens, act, showTab));
   byId("headlines").hidden = !byId("headlines").children.length;
-  const lacking = model.bundles.filter((bundle) => bundle.lacks && !bundle.ties.every((tie) => tie.common));
-  byId("names").replaceChildren(
-    ...namesTable(
-      model.rows,
-      lacking.reduce((sum, bundle) => sum + bundle.names.length, 0),
-      opens,
-    ),
-  );
+  byId("names").replaceChildren(...namesTable(model.rows, opens));
   byId("timeline").replaceChildren(...timeline(model.validities, act.enclave));
   byId("tab-differences").hidden = !model.overlay;
   if (!model.overlay) return;

@@ -19,7 +19,11 @@ export class Model {
   constructor(data) {
     Object.assign(this, data);
     this.#parts = partsOfDomains(data.enclaves);
-    for (const bundle of data.bundles) bundle.ties = rowsOf(bundle.ties);
+    this.bundles = data.bundles.map(([names, traits, ties]) => ({
+      ...data.traits[traits],
+      names,
+      ties: ties.flatMap(([kind, ...numbers]) => numbers.map((number) => ({ ...data.ties[kind], enclave: data.enclaves[number].path }))),
+    }));
     for (const scene of data.scenes) {
       scene.cards = rowsOf(scene.cards);
       scene.links = rowsOf(scene.links);
@@ -27,11 +31,11 @@ export class Model {
     this.enclave = new Map(data.enclaves.map((enclave) => [enclave.path, enclave]));
     this.bundleOf = new Map();
     this.tiesOf = new Map(data.enclaves.map((enclave) => [enclave.path, []]));
-    for (const bundle of data.bundles) {
+    for (const bundle of this.bundles) {
       for (const name of bundle.names) this.bundleOf.set(`${bundle.kind} ${name}`, bundle);
       for (const tie of bundle.ties) this.tiesOf.get(tie.enclave).push({ tie, bundle });
     }
-    this.names = data.bundles.flatMap((bundle) =>
+    this.names = this.bundles.flatMap((bundle) =>
       bundle.names.map((name) => ({
         kind: bundle.kind,
         name,

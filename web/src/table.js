@@ -12,7 +12,12 @@ const FEW = 12;
 // use is last.  Each part is in the order of names.
 const MOVES = /(^|\/)(cmd_vel|[^/]*commands?$|joint_trajectory|follow_joint_trajectory)/;
 
-export const moves = (name) => MOVES.test(name);
+const moves = (name) => MOVES.test(name);
+
+// Names that move a robot have rows of their own, also where names with the same rights do not.
+export function rowsByMotion(rows) {
+  return rows.flatMap((row) => [row.names.filter(moves), row.names.filter((name) => !moves(name))].filter((names) => names.length).map((names) => ({ ...row, names })));
+}
 
 export function rank(row) {
   return row.names.some(moves) ? (row.lacks ? 1 : 0) : row.all_send || row.all_receive ? 2 : row.lacks ? 4 : 3;
@@ -43,10 +48,10 @@ export function nameButton(kind, name, opens) {
   return open ? el("button", { type: "button", class: "link-button", text: name, onclick: open }) : el("code", { text: name });
 }
 
-// `lacking` is the number of names that only one side may use;
-// `opens(kind, name)` returns what shows a name, or nothing for one that stands for several.
-export function namesTable(rows, lacking, opens) {
-  const ordered = rows
+// `opens(kind, name)` returns what shows a name, or nothing if only the table has it.
+export function namesTable(rows, opens) {
+  const lacking = namesIn(rows.filter((row) => row.lacks && !row.common));
+  const ordered = rowsByMotion(rows)
     .map((row) => [rank(row), -reach(row), row])
     .sort((a, b) => a[0] - b[0] || a[1] - b[1])
     .map(([, , row]) => row);
