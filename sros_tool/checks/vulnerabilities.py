@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, names_text
 from sros_tool.dds.advisories import (
@@ -92,11 +92,14 @@ def vulnerability_findings(
 
 
 def robot_findings(
-    robots: Mapping[str, RobotDds | None], advisories: Sequence[Advisory] | None = None
+    robots: Mapping[str, RobotDds | None],
+    advisories: Sequence[Advisory] | None = None,
+    names: Callable[[Sequence[str]], str] = names_text,
 ) -> Iterator[Finding]:
     """Yield a finding for each DDS library of robots, and one on robots whose DDS is not known.
 
-    ``robots`` maps the names of robots to their DDS, None where they did not report it.
+    ``robots`` maps the names of robots to their DDS, None where they did not report it.  ``names``
+    returns names of robots as a text.
     """
     seen: dict[MappedLibrary, dict[Seen, list[str]]] = {}
     lacking: dict[str, list[str]] = {}
@@ -112,12 +115,12 @@ def robot_findings(
         if dds.unseen:
             lacking.setdefault(_UNSEEN, []).append(robot)
     by = {
-        library: [f"{_SEEN[how]} {names_text(where[how])}" for how in Seen if how in where]
+        library: [f"{_SEEN[how]} {names(where[how])}" for how in Seen if how in where]
         for library, where in seen.items()
     }
     yield from _library_findings(by, advisories)
     if lacking:
-        parts = (template.format(names_text(names)) for template, names in lacking.items())
+        parts = (template.format(names(robots)) for template, robots in lacking.items())
         remedy = _UNSEEN_REMEDY if lacking.keys() == {_UNSEEN} else ""
         yield ROBOTS_UNKNOWN.found("DDS of robots", "; ".join(parts), remedy=remedy)
 
@@ -162,12 +165,13 @@ def _library_findings(
             kind = KNOWN_VULNERABILITIES
             if library.packaged:
                 kind = PACKAGE_VULNERABILITIES
-            described = _counted_vulnerabilities(known.known, library.version)
+            number = _counted_vulnerabilities(known.known, library.version)
+            ids = f": {', '.join(advisory.id for advisory in known.known)}"
             if known.unclear:
-                described += f". {_unclear(known.unclear)}"
-            if (first := place_by_text.setdefault(f"{name}: {described}", place)) != place:
-                described = f"with the same vulnerabilities as {first}"
-            text = f"{place}{by}, {described}"
+                ids += f". {_unclear(known.unclear)}"
+            if (first := place_by_text.setdefault(f"{name}: {number}{ids}", place)) != place:
+                number, ids = f"the same known vulnerabilities as {first}", ""
+            text = f"{'; '.join((number, *clauses))}; in {place}{ids}"
             yield kind.found(name, text, remedy=_remedy(kind, library))
         elif known.unclear:
             text = f"{place}{by}. {_unclear(known.unclear)}"
@@ -220,12 +224,13 @@ def _users(
 
 
 def _counted_vulnerabilities(advisories: Sequence[Advisory], version: str) -> str:
-    """Return a clause with the number of vulnerabilities, what they need, and their ids."""
+    """Return a clause with the number of vulnerabilities, what they need, and what fixes them."""
     secured = sum("security" in advisory.needs for advisory in advisories)
     needs = (
         [f"{len(advisories) - secured} concern all processes"] if secured < len(advisories) else []
     )
     needs += [f"{secured} only those with DDS Security"] if secured else []
+    needs = ["only with DDS Security"] if secured == len(advisories) else needs
     numbers = version_numbers(version)
     major = numbers[0] if numbers else ""
     releases = Counter(advisory.fixed_in(numbers) if numbers else "" for advisory in advisories)
@@ -233,9 +238,8 @@ def _counted_vulnerabilities(advisories: Sequence[Advisory], version: str) -> st
         f"{number} in {release}" if release else f"{number} in no known release {major}.x"
         for release, number in sorted(releases.items(), reverse=True)
     ]
-    ids = ", ".join(advisory.id for advisory in advisories)
     count = counted(len(advisories), "known vulnerability", "known vulnerabilities")
-    return f"{count} ({'; '.join(needs)}), fixed: {', '.join(fixes)}: {ids}"
+    return f"{count} ({'; '.join(needs)}), fixed: {', '.join(fixes)}"
 
 
 def _unclear(advisories: Sequence[Advisory]) -> str:

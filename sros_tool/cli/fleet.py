@@ -681,7 +681,12 @@ def _status(
         for robot, dds in reported.items()
         if dds and any(is_fixed_later(library, known) for library in dds.libraries)
     ]
-    compared = ComparedFleet(moment, status, outdated, list(robot_findings(reported, known)))
+
+    def names(robots: Sequence[str]) -> str:
+        return _robot_names(robots, status.names, status.groups, len(robots))
+
+    listed = robot_findings(reported, known, names) if html else robot_findings(reported, known)
+    compared = ComparedFleet(moment, status, outdated, list(listed))
     exit_status = 0 if status.complete and not (outdated and on_vulnerabilities) else 1
     if as_json:
         print_json(compared)
@@ -696,13 +701,15 @@ def _status(
         from sros_tool.values import as_plain
 
         rows = list(_page_rows(compared, robots))
+        in_force, total = _list_in_force(status) or (0, 0)
+        list_lacking = "".join(_list_facts(compared)) if in_force < total else ""
         text = render_fleet_page(
             as_plain(compared),
             _WORDS,
-            list(_facts(compared)),
+            [fact for fact in _facts(compared) if fact != list_lacking],
             rows,
             _remedies(status, {to_do for *_, to_do, _ in rows}),
-            _list_in_force(status),
+            list_lacking,
         )
     else:
         listed = advisories is not None or (bool(robots) and on_vulnerabilities)
@@ -805,6 +812,16 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     if status.stage != "complete":
         behind = counted(len(status.unconfirmed), "robot")
         yield f"CA rotation: {status.stage}; not confirmed by {behind} yet"
+    yield from _list_facts(compared_fleet)
+    yield from _expiry_facts(compared_fleet)
+    if status.unassigned:
+        number = counted(status.unassigned, "enclave")
+        yield f"{number} of no robot: not covered by the confirmations of robots"
+
+
+def _list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
+    """Yield on how many robots the revocation list is in force, if something is revoked."""
+    status = compared_fleet.status
     if numbers := _list_in_force(status):
         in_force, robots = numbers
         number = f"{in_force} of " if in_force < robots else "all " if in_force > 1 else ""
@@ -819,10 +836,6 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
             text += f"; robots need it until {until:%Y-%m-%d}, when "
             text += "the revoked certificates have expired"
         yield text
-    yield from _expiry_facts(compared_fleet)
-    if status.unassigned:
-        number = counted(status.unassigned, "enclave")
-        yield f"{number} of no robot: not covered by the confirmations of robots"
 
 
 def _list_in_force(status: FleetStatus) -> tuple[int, int] | None:
@@ -849,6 +862,10 @@ def _remedies(status: FleetStatus, to_dos: Collection[str]) -> Mapping[str, str]
     )
     to_renew = [robot for robot in status.robots if robot.to_do == "renew"]
     known = {
+        "find out why": "see whether the robot is on, and which machine reports as this robot: it "
+        "may have a wrong name, or a copied disk. If it has files of another robot, it can act as "
+        f"that one until `sros renew {where} --robot OTHER --new-key --revoke-old`; then deliver "
+        "to both",
         "deliver": by_hand,
         "publish": publish_command(root),
         "renew": f"`{renewal_command(root)}`, then {_bringing(root, to_renew)}",

@@ -471,7 +471,7 @@ def render_fleet_page(
     facts: Sequence[str],
     rows: Sequence[Sequence[str]],
     remedies: Mapping[str, str],
-    list_in_force: tuple[int, int] | None = None,
+    list_lacking: str = "",
 ) -> str:
     """Return the HTML page of a fleet's status.
 
@@ -482,38 +482,35 @@ def render_fleet_page(
         rows: of robots with the same state: this state, their names, when they confirmed, their
             first expiry, what to do, and why.
         remedies: what to do → how it is done.
-        list_in_force: the number of robots on which the revocation list is in force, and of all
-            that have to have it; None if nothing is revoked.
+        list_lacking: where the revocation list is in force, unless that is on all robots that have
+            to have it.
     """
+    order = {state: (_urgency(state), place) for place, state in enumerate(status["counts"])}
     tiles = "".join(
         f'<li class="tile {_fleet_class(state)}"><b>{number}</b> {words.get(state, state)}</li>'
-        for state, number in sorted(status["counts"].items(), key=_urgency)
+        for state, number in sorted(status["counts"].items(), key=lambda item: order[item[0]])
+        if state != "current"
     )
     if outdated := len(status["outdated_dds"]):
         tiles += f'<li class="tile warning"><b>{outdated}</b> with a DDS to upgrade</li>'
     trusted = ""
-    if list_in_force:
-        kind = "good" if list_in_force[0] == list_in_force[1] else "error"
-        number = "{} of {}".format(*list_in_force)
-        tiles = (
-            f'<li class="tile {kind}"><b>{number}</b> with the revocation list in force</li>{tiles}'
+    if list_lacking:
+        trusted = (
+            f'<p class="wrong">{_sentence(list_lacking)} Until it is in force on a robot, the '
+            "robot accepts whoever has a revoked key. Deliver the list, restart the processes, and "
+            "confirm by Ansible, <code>sros agent</code> or <code>sros fleet report "
+            "--restarted</code>.</p>"
         )
-        if kind == "error":
-            trusted = (
-                '<p class="wrong">Until the revocation list is in force on a robot, the robot '
-                "accepts whoever has a revoked key. Deliver the list, restart the processes, and "
-                "confirm by Ansible, <code>sros agent</code> or <code>sros fleet report "
-                "--restarted</code>.</p>"
-            )
+    current, robots = status["counts"].get("current", 0), counted(len(status["robots"]), "robot")
     fact_lines = "".join(f"<br>{_sentence(fact)}" for fact in facts)
     head = (
-        f"<header><h1>Status of the fleet</h1>"
-        f"<p>Keystore <code>{escape(status['keystore'])}</code>, {len(status['robots'])} robots, "
-        f"as of {_minute(status['at'])} UTC.{fact_lines}</p>"
+        f"<header><h1>{current} of {robots} current</h1>"
+        f"<p>Fleet of keystore <code>{escape(status['keystore'])}</code>, as of "
+        f"{_minute(status['at'])} UTC.{fact_lines}</p>"
         f'<ul class="tiles">{tiles}</ul>{trusted}</header>'
     )
     heads = "".join(f'<th scope="col">{name}</th>' for name in _FLEET_COLUMNS)
-    lines = "".join(_fleet_row(row, words) for row in sorted(rows, key=_urgency))
+    lines = "".join(_fleet_row(row, words) for row in sorted(rows, key=lambda row: order[row[0]]))
     table = (
         f'<table class="rows fleet"><thead><tr>{heads}</tr></thead><tbody>{lines}</tbody></table>'
     )
@@ -529,11 +526,10 @@ def render_fleet_page(
 
 
 def _dds_finding(finding: Json) -> str:
-    """Return a finding on the DDS of robots, of which the ids of vulnerabilities are folded."""
-    text, colon, ids = finding["text"].partition(": CVE-")
-    return _fold(
-        f"{finding['subject']}: {text}", f"CVE-{ids}. {finding['remedy']}" if colon else ""
-    )
+    """Return a finding on the DDS of robots, of which the path and the numbers are folded."""
+    text, comma, rest = finding["text"].partition("; in '")
+    folded = f"In '{rest}. {finding['remedy']}" if comma else ""
+    return _fold(f"{finding['subject']}: {text}", folded)
 
 
 _FLEET_COLUMNS = ("State", "Robots", "To do", "Details", "Confirmed (UTC)", "First expiry")
@@ -555,9 +551,9 @@ def _fleet_row(row: Sequence[str], words: Mapping[str, str]) -> str:
     return f'<tr><td>{chip}</td><th scope="row">{escape(robots)}</th>{cells}</tr>'
 
 
-def _urgency(row: Sequence[Any]) -> int:
-    """Return the sort key of a row or count that begins with a state: the worst comes first."""
-    return _FLEET_CLASSES.index(_fleet_class(row[0]))
+def _urgency(state: str) -> int:
+    """Return the sort key of a state: the worst comes first."""
+    return _FLEET_CLASSES.index(_fleet_class(state))
 
 
 def _fleet_class(state: str) -> str:

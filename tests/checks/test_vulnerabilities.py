@@ -56,7 +56,7 @@ def test_vulnerabilities_of_a_release_are_listed_once() -> None:
     libraries = [MappedLibrary("Fast DDS", "2.14.5", path) for path in paths]
     first, second = vulnerability_findings(running(), libraries)
     assert "CVE-2025-62599" in first.text
-    assert second.text == f"'{paths[1]}', with the same vulnerabilities as '{paths[0]}'"
+    assert second.text == f"the same known vulnerabilities as '{paths[0]}'; in '{paths[1]}'"
 
 
 def test_a_mended_release_has_no_known_vulnerability() -> None:
@@ -82,7 +82,8 @@ def test_a_path_names_no_package_that_is_none() -> None:
 def test_installed_and_loaded_library_have_one_finding() -> None:
     library = MappedLibrary("Fast DDS", "2.14.5", "/opt/ros/jazzy/lib/libfastrtps.so.2.14.5")
     (finding,) = vulnerability_findings(running(library._replace(replaced=True)), [library])
-    assert finding.text.startswith(f"'{library.path}', loaded by process 7 (a), process 8 (b)")
+    assert finding.text.startswith("27 known vulnerabilities (15 concern all processes; ")
+    assert f"; loaded by process 7 (a), process 8 (b); in '{library.path}': CVE-" in finding.text
 
 
 def test_the_metric_has_the_largest_number_of_each_product() -> None:

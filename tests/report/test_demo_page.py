@@ -156,14 +156,30 @@ def test_no_place_of_the_machine_is_written(tmp_path: Path) -> None:
 def fleet_page() -> str:
     """A fleet's status with long and hostile names, in a state of each class."""
     name = HOSTILE[0]
-    finding = {"subject": name, "text": "/opt/" + 60 * "library: CVE-1-2, ", "remedy": name}
+    text = f"1 known; on r1; in '/opt/{60 * 'library'}': CVE-1-2"
+    finding = {"subject": name, "text": text, "remedy": name}
     states = ("revoked", "earlier", "current")
-    status: dict[str, Any] = {"keystore": name, "at": "2027-01-01T00:00:00Z", "counts": {}}
+    counts = {"current": 1, "earlier": 1, "revoked": 1}
+    status: dict[str, Any] = {"keystore": name, "at": "2027-01-01T00:00:00Z", "counts": counts}
     rows = [(state, name, "2027-01-01T00:00:00Z", "", "deliver", 60 * "file") for state in states]
     status |= {"robots": states, "outdated_dds": ["r1"], "findings": [finding]}
     return render_fleet_page(
-        status, {"earlier": "an earlier one"}, [name], rows, {"deliver": name}, (1, 2)
+        status, {"earlier": "an earlier one"}, [name], rows, {"deliver": name}, f"on 1 of 2{name}"
     )
+
+
+def test_a_fleet_begins_with_how_many_are_current_and_says_it_once() -> None:
+    page = html.fromstring(fleet_page())
+    assert page.cssselect("h1")[0].text_content() == "1 of 3 robots current"
+    tiles = [tile.text_content() for tile in page.cssselect("li.tile")]
+    assert tiles == ["1 revoked", "1 an earlier one", "1 with a DDS to upgrade"]
+    chips = [chip.text_content() for chip in page.cssselect("tbody .chip")]
+    assert chips == ["revoked", "an earlier one", "current"]
+    (wrong,) = page.cssselect("p.wrong")
+    assert wrong.text_content().startswith(f"On 1 of 2{HOSTILE[0]}. Until it is in force")
+    (library,) = page.cssselect("section > details")
+    assert library.cssselect("summary")[0].text_content() == f"{HOSTILE[0]}: 1 known; on r1"
+    assert "In '/opt/library" in library.text_content() and "CVE-1-2." in library.text_content()
 
 
 @pytest.mark.browser
