@@ -339,9 +339,11 @@ def check(
     if suggest:
         if form != "text" or requirements or earlier:
             raise UsageError("--suggest prints TOML", "", "Give it alone.")
-        one_robot = _paths_of_one_system(family, paths, "--suggest")
+        systems = _paths_of_systems(family, paths, "--suggest")
+        if len(systems) > 1:
+            raise _not_one_system("--suggest")
         with progress("deciding"):
-            text = _suggested(_system(one_robot, at, template))
+            text = _suggested(_system(systems[0], at, template))
         echo_document(text)
         return 0
     if template and not requirements:
@@ -388,17 +390,19 @@ def _requirements(
     from sros_tool.proof.findings import requirement_findings, robots_left_out
     from sros_tool.proof.requirements import dropped_findings, read_all_requirements
 
-    one_robot = _paths_of_one_system(family, paths, "--requirements")
+    paths_of = _paths_of_systems(family, paths, "--requirements")
     places = [check_plain_namespace(namespace) for namespace in namespaces]
 
     def decide(load: Callable[[Sequence[Path]], System]) -> list[Finding]:
-        system = load(one_robot)
-        wanted = read_all_requirements(files, system.fleet, places)
-        findings = [*requirement_findings(wanted, system), *robots_left_out(system, places)]
-        if earlier:
-            before = read_all_requirements(earlier, system.fleet, places)
-            findings += dropped_findings(before, wanted, str(files[0]))
-        return findings
+        findings: list[Finding] = []
+        for system in map(load, paths_of):
+            wanted = read_all_requirements(files, system.fleet, places)
+            findings += requirement_findings(wanted, system)
+            findings += robots_left_out(system, places)
+            if earlier:
+                before = read_all_requirements(earlier, system.fleet, places)
+                findings += dropped_findings(before, wanted, str(files[0]))
+        return [*dict.fromkeys(findings)]
 
     return decide
 
@@ -438,18 +442,25 @@ def _one_path(family: str, paths: tuple[Path, ...], option: str) -> Path:
     )
 
 
-def _paths_of_one_system(family: str, paths: tuple[Path, ...], option: str) -> tuple[Path, ...]:
-    """Return the paths, which have to be a keystore, or policies of one robot or fleet."""
+def _paths_of_systems(
+    family: str, paths: tuple[Path, ...], option: str
+) -> Sequence[Sequence[Path]]:
+    """Return the paths of the policies of one robot or fleet, and that of a keystore, if any."""
     from sros_tool.keystore.layout import is_keystore
 
     paths = paths or (() if family == "runtime" else (keystore_from_environment(),))
-    if not paths or (len(paths) > 1 and any(is_keystore(path) for path in paths)):
-        raise UsageError(
-            f"{option} takes one keystore, or the policies of one robot or fleet",
-            "Several policies count as one.",
-            "Name the keystore alone.",
-        )
-    return paths
+    keystores = [path for path in paths if is_keystore(path)]
+    if not paths or len(keystores) > 1:
+        raise _not_one_system(option)
+    return [*filter(None, ([path for path in paths if path not in keystores], keystores))]
+
+
+def _not_one_system(option: str) -> UsageError:
+    return UsageError(
+        f"{option} takes one keystore, or the policies of one robot or fleet",
+        "Several policies count as one.",
+        "Run the command once for each of them.",
+    )
 
 
 def _system(

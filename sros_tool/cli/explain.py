@@ -131,7 +131,7 @@ _IGNORED = {
         *("moment", "time_zone"),
     ),
     "--log": (
-        *("infrastructure", "patterns", "robots", "kind", "policy", "fleet_file"),
+        *("infrastructure", "patterns", "robots", "kind", "fleet_file"),
         *("vendor", "all_vendors", "distro", "all_distros"),
     ),
 }
@@ -293,6 +293,13 @@ def explain(
     _refuse_ignored(mode)
     check_one_decider()
     root, rest = _split(arguments, keystore, verb=0 if who else 1)
+    if logs and root and policy:
+        raise UsageError(
+            "--log takes a keystore or a policy",
+            "A process decides by the signed permissions of its keystore.",
+            f"Leave --policy out; or name the policy alone: `sros explain {quote(str(policy))} "
+            f"--log {quote(logs[0])}`.",
+        )
     names_policy = root is not None and is_policy(root)
     if names_policy and not (policy or reach):
         policy, root = root, None

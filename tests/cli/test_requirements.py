@@ -235,6 +235,27 @@ def test_what_is_refused(words: tuple[str, ...], says: str, folder: Path) -> Non
     assert "defect" not in ended.err
 
 
+def test_a_policy_and_its_keystore_both_have_to_fulfill_requirements(
+    folder: Path, tmp_path: Path
+) -> None:
+    """As after an edit that is not signed yet; what each lacks by itself is a finding."""
+    (policy := tmp_path / "robot.xml").write_text(POLICY.replace(WILD, ""))
+    keystore, words = tmp_path / "keystore", (*ONLY[2:], "--requirements", "required.toml")
+    sros("create_keystore", keystore).ok()
+    sros("generate_artifacts", "-k", keystore, "-p", policy).ok()
+    alone = [sros("check", path, *words, cwd=folder) for path in (policy, keystore, "robot.xml")]
+    assert [ended.status for ended in alone] == [0, 0, 1]
+    for edited, status in ((policy, 0), (folder / "robot.xml", 1)):
+        ended = sros("check", edited, keystore, *words, cwd=folder)
+        assert ended.status == status and ("/web: may publish" in ended.out) is bool(status)
+    sros("generate_artifacts", "-k", keystore, "-p", folder / "robot.xml").ok()
+    ended = sros("check", policy, keystore, *words, cwd=folder)
+    assert ended.status == 1 and "/web: may publish /cmd_vel" in ended.out
+    for more in (("--suggest",), (keystore, *words)):
+        ended = sros("check", policy, keystore, *more, cwd=folder)
+        assert ended.status == 2 and "takes one keystore, or the policies" in ended.err
+
+
 def test_several_policies_of_a_robot_count_as_one(folder: Path, tmp_path: Path) -> None:
     """A name has its other side, and a requirement is broken, in the other file."""
     shutil.copy(folder / "required.toml", tmp_path)

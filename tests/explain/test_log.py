@@ -921,6 +921,7 @@ def test_a_log_is_explained_by_a_policy_alone(tmp_path: Path) -> None:
     assert f"`sros explain {policy} /a publish /x` shows what is missing in the policy" in said
     assert "no rule allows publish rt/x" in said and "the policy allows it" in said
     assert "now has no fault" not in said
+    assert sros("explain", "--policy", policy, "/a", "--log", log).out == said
     assert "unable to find enclave /b" in sros("explain", policy, "/b", "--log", log).err
 
 
