@@ -386,6 +386,7 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
         ended = sros("revoke", "ks", "--robot", "r1", cwd=folder)
         assert f"To revoke now, name the enclaves: `sros revoke ks {names}`;" in ended.err
     sros("revoke", "ks", "--match", "/r1/*", "--dry-run", cwd=folder).ok()
+    (folder / "ks/fleet.toml").write_text(text.replace("domain = 5", "domain = 0", 1))
     found = sros("check", "ks", "--include", "keystore.fleet-edited", cwd=folder)
     assert found.status == 1
     (folder / "fleet.toml").write_text(fleet_file())
