@@ -261,7 +261,16 @@ def render_demo_page(result: Json, made: str) -> str:
     """Return the HTML page of a demo's result; ``made`` says by which release of sros, and when."""
     is_only = len(result["scenarios"]) == 1
     scenarios = (_demo_scenario(scenario, is_only=is_only) for scenario in result["scenarios"])
-    body = "\n".join((_demo_head(result, made), *scenarios, _demo_vulnerabilities(result)))
+    why = _sentence(f"why {result['backend']}: {result['why']}" if result["why"] else "")
+    body = "\n".join(
+        (
+            _demo_head(result, made),
+            _demo_open(result["rows"]),
+            *scenarios,
+            _demo_vulnerabilities(result),
+            f'<p class="soft">{why}</p>',
+        )
+    )
     title = f"sros demo on {result['dds']}"
     return _document(title, f"<main>{body}</main>", _asset("demo.css"))
 
@@ -307,13 +316,9 @@ def _demo_head(result: Json, made: str) -> str:
         f"keystore template {escape(result['template'])}",
         where,
     ]
+    differing = sum(not row["as_expected"] for row in rows) - open_here
     tiles = [
-        (
-            ("good" if good == len(rows) else "") if result["as_expected"] else "error",
-            f"{good} of {len(rows)}",
-            "attempts ended as expected",
-        ),
-        ("", str(sum(bool(row.get("defence_removed")) for row in rows)), "with a defence removed"),
+        ("error", str(differing), "ended otherwise"),
         ("warning" if opened else "", str(opened), "known to be open"),
         ("error", str(open_here), "open in this keystore"),
         ("", str(skipped), "skipped"),
@@ -325,12 +330,37 @@ def _demo_head(result: Json, made: str) -> str:
         for kind, number, text in tiles
         if number != "0"
     )
-    why = f"Why {result['backend']}: {result['why']}" if result["why"] else ""
+    removed = sum(bool(row.get("defence_removed")) for row in rows)
+    controls = (
+        f"in {removed} of the attempts a defence is removed, and the attack has to succeed: this "
+        "shows that the defence stops it elsewhere"
+        if removed
+        else ""
+    )
     return (
         f"<header><h1>sros demo: {good} of {len(rows)} attempts ended as expected</h1>"
-        f"<p>On a real middleware: {', '.join(facts)}. {_sentence(made)}</p>"
-        f'<ul class="tiles">{shown}</ul><p class="soft">{_sentence(why)}</p></header>'
+        f"<p>On a real middleware: {', '.join(facts)}. {_sentence(made)} {_sentence(controls)}</p>"
+        + (f'<ul class="tiles">{shown}</ul></header>' if shown else "</header>")
     )
+
+
+def _demo_open(rows: Sequence[Json]) -> str:
+    """Return a list of what is open, why, and what to do, or ""."""
+    names: dict[tuple[bool, str, str, str], list[str]] = {}
+    for row in rows:
+        if row.get("open_because") and row["observed"] in (row["expected"], _SKIPPED):
+            is_here, accepted = bool(row.get("open_here")), row.get("accepted")
+            known = "accepted if it is open" if accepted else "open"
+            label = "open in this keystore" if is_here else known
+            reason = (not is_here, label, row["open_because"], row.get("remedy", ""))
+            names.setdefault(reason, []).append(row["name"])
+    here_first = sorted(names.items(), key=lambda item: item[0][0])
+    items = "".join(
+        f'<li><span class="chip {"warning" if is_known else "error"}">{label}</span> '
+        f"<b>{escape('; '.join(opened))}</b><br>{_sentence(because)} {_sentence(remedy)}</li>"
+        for (is_known, label, because, remedy), opened in here_first
+    )
+    return f'<ul class="open">{items}</ul>' if items else ""
 
 
 def _demo_vulnerabilities(result: Json) -> str:
@@ -382,9 +412,11 @@ def _demo_scenario(scenario: Json, *, is_only: bool) -> str:
     opened = sum(bool(row.get("open_because")) for row in rows)
     is_good = good == len(rows) and not not_tried
     kind = ("good" if is_good and rows else "") if scenario["as_expected"] else "error"
-    summary = f'<h2>{escape(scenario["title"])}</h2> <span class="chip {kind}">{good} of '
-    summary += f"{len(rows)} as expected</span>"
-    summary += f' <span class="chip warning">{opened} open</span>' if opened else ""
+    title = scenario["title"]
+    summary = f"<h2>{escape(title[:1].upper() + title[1:])}</h2>"
+    if not is_only:
+        summary += f' <span class="chip {kind}">{good} of {len(rows)} as expected</span>'
+        summary += f' <span class="chip warning">{opened} open</span>' if opened else ""
     is_open = " open" if (is_only and len(rows) <= _MOST_OPEN_ROWS) or not is_good else ""
     parts = [f'<section><details class="scenario"{is_open}><summary>{summary}</summary>']
     if scenario.get("cast"):
@@ -428,6 +460,8 @@ def _demo_table(rows: Sequence[Json]) -> str:
 def _demo_row(row: Json) -> Iterator[str]:
     if row["observed"] == _SKIPPED:
         mark = '<span class="chip">skipped</span>'
+    elif row["as_expected"] and (row.get("open_because") or row["observed"] != row["expected"]):
+        mark = '<span class="chip warning">open</span>'
     elif row["as_expected"]:
         mark = '<span class="chip good">ok</span>'
     else:
@@ -436,14 +470,8 @@ def _demo_row(row: Json) -> Iterator[str]:
     if removed := row.get("defence_removed"):
         tried += f' <span class="chip">without {escape(removed)}</span>'
     mechanism = escape(row["mechanism"])
-    because, accepted = row.get("open_because", ""), row.get("accepted")
-    if because or accepted:
-        known = "accepted if it is open" if accepted else "known to be open"
-        opened = "open in this keystore" if row.get("open_here") else known
-        mechanism += (
-            f'<p><span class="chip warning">{opened}</span> {_sentence(because)} '
-            f"{_sentence(row.get('remedy', ''))}</p>"
-        )
+    if row.get("accepted") and not row.get("open_because"):
+        mechanism += ' <span class="chip warning">accepted if it is open</span>'
     seconds = f" ({row['seconds']:g} s)" if row.get("seconds") else ""
     if row.get("detail"):
         mechanism += (

@@ -69,11 +69,11 @@ def test_what_was_not_tried_is_said_and_nothing_of_it_is_green() -> None:
     for scenario in page.cssselect("details.scenario"):
         assert "open" in scenario.attrib
         (summary,) = scenario.cssselect("summary")[:1]
-        assert summary.text_content() == "every way in 1 of 2 as expected"
+        assert summary.text_content() == "Every way in 1 of 2 as expected"
         assert not summary.cssselect(".good")
-    tiles = {tile.text_content(): tile.get("class", "") for tile in page.cssselect("li.tile")}
-    assert "good" not in tiles["1 of 2 attempts ended as expected"]
-    assert {"1 skipped", "3 left out", "4 not tried, but needed for a proof"} <= set(tiles)
+    assert page.cssselect("h1")[0].text_content() == "sros demo: 1 of 2 attempts ended as expected"
+    tiles = {tile.text_content() for tile in page.cssselect("li.tile")}
+    assert {"1 skipped", "3 left out", "4 not tried, but needed for a proof"} == tiles
     text = page.text_content()
     assert f"Not tried, and needed for a proof: a; {HOSTILE[0]}." in text
     assert f"guest /a (why {HOSTILE[0]})" in text
@@ -104,7 +104,8 @@ def test_every_row_is_told_with_what_came_of_it() -> None:
     assert len(texts) == 5
     assert texts[0].startswith("ok an unsecured node listens not heard not heard who cannot")
     assert "without the refusal of strangers heard heard" in texts[1]
-    assert "known to be open Names are in clear. None." in texts[2]
+    assert texts[2].startswith("open names read")
+    assert "4 of 5" not in page and "in 1 of the attempts a defence is removed" in page.lower()
     assert texts[3].startswith("differs something else not heard heard")
     assert texts[4].startswith("skipped")
     assert "3 of 5" in page and "heard 0 of 50; control" in page
@@ -131,6 +132,32 @@ def test_scenarios_are_folded_unless_something_needs_a_look() -> None:
         (False, ["2 of 2 as expected", "1 open"]),
         (True, ["1 of 2 as expected"]),
     ]
+
+
+def test_what_is_open_comes_first_with_what_to_do_and_is_never_green() -> None:
+    known = {"open_because": "names are in clear", "remedy": "keep secrets out of `names`"}
+    page = html.fromstring(
+        render_demo_page(
+            result(
+                row("names read", **known),
+                row("subjects read", **known),
+                row("heard here", **known, open_here=True, as_expected=False),
+                row("closed here", **known, observed="heard", as_expected=False),
+                row("accepted", accepted=True, observed="heard"),
+                row("closed"),
+            ),
+            "",
+        )
+    )
+    what_to_do = "Names are in clear. Keep secrets out of names."
+    assert [item.text_content() for item in page.cssselect("ul.open li")] == [
+        f"open in this keystore heard here{what_to_do}",
+        f"open names read; subjects read{what_to_do}",
+    ]
+    pills = [(pill.text, pill.get("class")) for pill in page.cssselect("td:first-child .chip")]
+    assert [text for text, _ in pills] == ["open", "open", "open", "differs", "open", "ok"]
+    assert [kind for _, kind in pills if "good" in kind] == ["chip good"]
+    assert "1 ended otherwise" in [tile.text_content() for tile in page.cssselect("li.tile")]
 
 
 def test_no_place_of_the_machine_is_told() -> None:
