@@ -33,6 +33,7 @@ exclude_patterns = [".*", "web", "tests", "benchmarks", "build", "dist"]
 myst_heading_anchors = 4
 nitpicky = True
 nitpick_ignore_regex = [("py:.*", ".*")]  # types in signatures, of which most are not on the site
+highlight_language = "none"  # what has no language is a terminal or a log, not Python
 default_role = "code"  # `name` in docstrings
 smartquotes = False  # they would change the dashes of options and the quotes of attributes
 autodoc_member_order = "bysource"
