@@ -244,7 +244,8 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
         sign = signs.get(process.known_by, f"its {process.known_by}")
         state = f"process {process.pid}" + ("" if runs else f", known by {sign}")
     elif runs:
-        state = "started by another command than observed"
+        state = "started by another command than observed, which sros keeps (to change it, watch "
+        state += "the open robot again)"
     else:
         ended = process.enclave in closed.observed.ended
         state = "has ended" if ended else "not running as observed"

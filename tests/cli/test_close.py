@@ -244,6 +244,7 @@ def test_everything_is_prepared_and_nothing_is_closed(robot: Robot) -> None:
     assert "  topic /chatter: /talker -> /listener\n" in ended.out
     assert "/talker: process 4711, known by its process id: --apply restarts talker.s" in ended.out
     assert "/listener: process 4712, known by its process id: by hand\n" in ended.out
+    assert "\nsaw 2 nodes, and 2 processes of this machine\n" in ended.err
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert f"\ncd /opt && sros run {export} /listener -- /opt/run listener\n" in commands
     assert "/talker --" not in commands
@@ -479,6 +480,15 @@ def test_what_systemd_does_not_start_is_done_by_hand(
         ended.err.splitlines()[-1],
     )
     robot.named = False
+    robot.more = (replace(robot.process("/talker", is_secured=True), pid=13, command=("/opt/b",)),)
+    robot.absent = {"/talker"}
+    robot.more += (replace(robot.more[0], pid=14, command=("/opt/c",)),)
+    ended = robot.close()
+    kept = "started by another command than observed, which sros keeps (to change it, watch the op"
+    assert (
+        f"  /talker: {kept}" in ended.out and "sros remembers: cd /opt && /opt/b" not in ended.err
+    )
+    robot.more, robot.absent = (), set()
     for words in ("--apply", "--proof"):
         assert "; next: bring robot/keystore to another machine" in robot.close(words).err
     robot.by_hand, robot.absent = {"/talker"}, {"/listener"}
