@@ -59,7 +59,8 @@ from sros_tool.policy.model import ALLOW, OTHER_SIDE, Enclave, Policy, policy_in
 from sros_tool.policy.patterns import Names, covers
 from sros_tool.policy.rights import Right
 from sros_tool.runtime.log_texts import (
-    LET_ENTER_OR_RESTART,
+    LET_ENTER_EXPORT,
+    LET_ENTER_ORIGINAL,
     NO_ENCLAVE,
     RUNS_OPEN,
     UNKNOWN,
@@ -693,8 +694,9 @@ class _Examiner:
         if meaning.id.startswith("peer-"):
             return self._with_peer_causes(plain, hits)
         path = first.fields.get("path", "")
-        if meaning.id in _ABOUT_FOLDERS and _is_folder(path):
-            advice = self._with_names(LET_ENTER_OR_RESTART, named, first)
+        if meaning.id in _ABOUT_FOLDERS and (place := _keystore_with(path)):
+            text = LET_ENTER_ORIGINAL if is_original_keystore(place) else LET_ENTER_EXPORT
+            advice = self._with_names(_with_name(text, "KEYSTORE", str(place)), named, first)
             if meaning.id != _ABOUT_FOLDERS[0]:
                 advice = f"{advice} {remedy_of}"
             return replace(plain, found=("the folder is here",), checked=True, remedy=advice)
@@ -1057,12 +1059,17 @@ class _Examiner:
         )
 
 
-def _is_folder(path: str) -> bool:
-    """Return whether a path that a log names is a folder here; False if sros cannot see that."""
-    try:
-        return Path(path).is_absolute() and Path(path).is_dir()
-    except (OSError, ValueError):  # the log chooses the path
-        return False
+def _keystore_with(path: str) -> Path | None:
+    """Return the keystore here with the enclave's folder that a log names; None without it.
+
+    The log chooses the path, and the remedy gives the keystore to another user.
+    """
+    place, _, name = path.rpartition("/enclaves/")
+    with suppress(OSError, ValueError, SrosError):
+        is_plain = place.startswith("/") and ".." not in Path(path).parts
+        if is_plain and name and Path(path).is_dir() and is_keystore(Path(place)):
+            return Path(place)
+    return None
 
 
 def _unknown_cause(hits: Iterable[_Hit]) -> str:

@@ -133,13 +133,18 @@ _NO_FOLDER = "rcl does not find the enclave's folder {path}"
 _WHY_NO_FOLDER = (
     "ROS_SECURITY_KEYSTORE or the enclave's name is wrong, or the user of the node cannot enter it"
 )
-_LET_ENTER = (
-    "`namei -l {path}` shows who may enter. If it is in an export, give the export to the user of "
-    "the node: `sudo chown -R USER KEYSTORE`. If it is next to the CA keys, which no node should "
-    "be able to read, export the enclave into a folder of the user."
+_SHOW_MODES = "`namei -l {path}` shows who may enter."
+LET_ENTER_EXPORT = (
+    f"{_SHOW_MODES} Give the export to the user of the node: `sudo chown -R USER KEYSTORE`. If the "
+    "folder was made after the node started, restart the node."
 )
-LET_ENTER_OR_RESTART = f"{_LET_ENTER} If it was made after the node started, restart the node."
-"""The remedy if a folder that rcl did not find is there."""
+"""The remedy if a folder that rcl did not find is there, in an export."""
+LET_ENTER_ORIGINAL = (
+    f"{_SHOW_MODES} It is next to the CA keys, which no node should be able to read: export the "
+    "enclave into a folder of the user of the node. If the folder was made after the node started, "
+    "restart the node."
+)
+"""The same, in a keystore with its CA keys."""
 _SET_DOMAIN = (
     "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env KEYSTORE ENCLAVE --domain ID` prints "
     "the variables."
@@ -193,7 +198,8 @@ _ROS_TEXTS = (
         r"rcl: SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",
         f"{_NO_FOLDER}: {_WHY_NO_FOLDER}",
         "Correct the name: `sros list_enclaves KEYSTORE` shows all names. If the folder is there: "
-        f"{_LET_ENTER}",
+        f"{_SHOW_MODES} Give an export to the user of the node; if the folder is next to the CA "
+        "keys, which no node should be able to read, export the enclave into a folder of the user.",
     ),
     _log_text(
         "runs-unsecured", _ROS, r"SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",

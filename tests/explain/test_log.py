@@ -1063,10 +1063,18 @@ def test_a_folder_that_is_there_has_the_right_name(keystore: Path, tmp_path: Pat
         for begin, unsecured in (("rcl: ", False), ("", True)):
             log.write_text(f"{begin}SECURITY ERROR: directory '{place}' does not exist.\n")
             found = sros("explain", *words, "--log", log).out
-            assert f"`namei -l {place}` shows who may enter. If it is in an export" in found
+            assert f"`namei -l {place}` shows who may enter. " in found
+            gives = f"`sudo chown -R USER {export}`" in found
+            assert gives is (place == exported), "nobody gets the CA keys"
+            assert ("next to the CA keys" in found) is not gives
             assert "the folder is here\n" in found and "restart the node" in found
             assert "Correct the name" not in found and "has to be" not in found
             assert ("RUNS UNSECURED" in found) is ("with `sros run`" in found) is unsecured
+    (other := tmp_path / "other/enclaves/a").mkdir(parents=True)
+    for hostile in ("/", "/etc", other, f"{keystore}/enclaves/../../other", f"{folder}\0"):
+        log.write_text(f"rcl: SECURITY ERROR: directory '{hostile}' does not exist.\n")
+        found = sros("explain", keystore, "--log", log).out
+        assert "Correct the name: " in found and "chown" not in found
 
 
 def test_a_forgotten_remapping_is_shown(keystore: Path, tmp_path: Path) -> None:
