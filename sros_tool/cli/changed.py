@@ -195,10 +195,10 @@ def rights_lines(
 ) -> Iterator[str]:
     """Yield a line for each lost or gained right; the robots of a fleet share a line."""
     from sros_tool.fleet.robots import folded
-    from sros_tool.keystore.fleet import load_fleet
+    from sros_tool.keystore.fleet import fleet_before_change
     from sros_tool.keystore.reader import OpenedKeystore
 
-    fleet = load_fleet(OpenedKeystore(root)) if replaced_rights else None
+    fleet = fleet_before_change(OpenedKeystore(root)) if replaced_rights else None
     together: dict[tuple[str, str], list[str]] = {}
     for rights in replaced_rights:
         for verb, text in (("lose", rights.lost_text(fleet)), ("gain", rights.gained_text(fleet))):

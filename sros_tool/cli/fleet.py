@@ -712,8 +712,8 @@ def _status(
             list_lacking,
         )
     else:
-        listed = advisories is not None or (bool(robots) and on_vulnerabilities)
-        lines = _lines(compared, robots, findings=listed)
+        names_them = advisories is not None or (bool(robots) and on_vulnerabilities)
+        lines = _lines(compared, robots, findings=names_them)
         text = "".join(f"{visible_line(line)}\n" for line in lines)
     if output and not dry_run:
         echo(save(output, text.encode()), err=True)

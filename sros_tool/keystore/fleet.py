@@ -42,8 +42,9 @@ _COMMENT = """\
 # belongs to which robot. To change them, edit that file and run `sros generate_artifacts --fleet`.
 """
 FLEET_REMEDY = (
-    "Take revoked robots out of the fleet file, and write the copy again from it: `sros "
-    "generate_artifacts -k KEYSTORE -p POLICY_FILE --fleet FLEET_FILE`."
+    "Take revoked robots out of the fleet file, and write the copy again from it, with all "
+    "policies of the fleet: `sros generate_artifacts -k KEYSTORE -p POLICY_FILE --fleet "
+    "FLEET_FILE`."
 )
 _SHOWN = 5
 
@@ -106,6 +107,20 @@ def checked_fleet(keystore: OpenedKeystore, without_it: Callable[[], str] = str)
             without_it() + FLEET_REMEDY.replace("KEYSTORE", quote(str(keystore.root))),
         )
     return load_fleet(keystore)
+
+
+def fleet_before_change(keystore: OpenedKeystore) -> Fleet | None:
+    """Return the fleet as `load_fleet` does; None also if an edit made its file unreadable.
+
+    Raises:
+        DocumentError: the fleet file cannot be read, although nobody edited it.
+    """
+    try:
+        return load_fleet(keystore)
+    except SrosError:
+        if edited_fleet(keystore, keystore.ledger_with("what", "fleet")):
+            return None
+        raise
 
 
 def edited_fleet(keystore: OpenedKeystore, ledger: Ledger) -> str:
@@ -277,12 +292,13 @@ def write_fleet(
 ) -> tuple[Fleet, tuple[Entry, ...]]:
     """Stage ``fleet`` as the fleet of the keystore; return the fleet as staged, and ledger entries.
 
-    The staged fleet has the enclave paths of ``fleet``, of the keystore's fleet until now, and
-    ``patterns``.  If it is the same as until now, nothing is staged.
+    The staged fleet has the enclave paths of ``fleet``, of the keystore's fleet until now, unless
+    its file was edited, and ``patterns``.  If it is the same as until now, nothing is staged.
     """
     from sros_tool.fleet.fleet_file import render_fleet
 
-    before = load_fleet(keystore)
+    ledger = keystore.ledger_with("what", "fleet")
+    before = None if edited_fleet(keystore, ledger) else load_fleet(keystore)
     known = (before.enclaves if before else (), fleet.enclaves, patterns)
     paths = dict.fromkeys(sorted(path for paths in known for path in paths))
     fleet = fleet.with_enclaves(tuple(paths))
@@ -294,7 +310,6 @@ def write_fleet(
         )
     _refuse_shared(fleet)
     document = (_COMMENT + render_fleet(fleet)).encode()
-    ledger = keystore.ledger_with("what", "fleet")
     if not _edit_text(ledger, document) and _read(keystore):
         return fleet, ()
     transaction.write(FLEET, document)

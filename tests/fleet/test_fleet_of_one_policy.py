@@ -313,7 +313,7 @@ def test_a_robot_is_not_chosen_without_its_enclaves(made: Path, tmp_path: Path) 
 def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
     """Renewed and revoked by robot; a robot that leaves; a domain that changes; an edit by hand."""
     folder = copied(made, tmp_path)
-    again = ("generate_artifacts", "-k", "ks", "-p", "robot.xml", "--fleet", "fleet.toml")
+    write_again = ("generate_artifacts", "-k", "ks", "-p", "robot.xml", "--fleet", "fleet.toml")
     record = (folder / "ks/fleet.toml").read_bytes()
     ended = sros("renew", "ks", "--robot", "r7", "--robot", "r8", cwd=folder).ok()
     assert ended.out == "".join(
@@ -325,7 +325,7 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
 
     # A robot that leaves keeps its enclaves until they are revoked, as the note says.
     (folder / "fleet.toml").write_text(fleet_file([r for r in ROBOTS if r not in ("r7", "r9")]))
-    ended = sros(*again, cwd=folder).ok()
+    ended = sros(*write_again, cwd=folder).ok()
     assert "created" not in ended.out
     assert "the robot r9 is no longer in the fleet: /r9/base, /r9/lift stay" in ended.err
     assert "sros revoke ks --match '/r9/*'" in ended.err
@@ -344,7 +344,7 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
 
     # Another domain is in all permissions, or refused.
     (folder / "fleet.toml").write_text(fleet_file([r for r in ROBOTS if r not in ("r7", "r9")], 6))
-    ended = sros(*again, cwd=folder)
+    ended = sros(*write_again, cwd=folder)
     assert ended.status == 2
     assert "is in domain 6, but the keystore is for domain 0,5" in ended.err
     (folder / "one.xml").write_text(
@@ -386,10 +386,13 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
         ended = sros("revoke", "ks", "--robot", "r1", cwd=folder)
         assert f"To revoke now, name the enclaves: `sros revoke ks {names}`;" in ended.err
     sros("revoke", "ks", "--match", "/r1/*", "--dry-run", cwd=folder).ok()
-    (folder / "ks/fleet.toml").write_text(text.replace("domain = 5", "domain = 0", 1))
     found = sros("check", "ks", "--include", "keystore.fleet-edited", cwd=folder)
     assert found.status == 1
     (folder / "fleet.toml").write_text(fleet_file())
-    sros("generate_artifacts", "-k", "ks", "-e", "/r7/base", "/r7/lift", "/r9/base", "/r9/lift",
-         "-p", "robot.xml", "--fleet", "fleet.toml", cwd=folder).ok()  # fmt: skip
-    assert (folder / "ks/fleet.toml").read_bytes() == record
+    revoked = ("/r7/base", "/r7/lift", "/r9/base", "/r9/lift")
+    create_again = ("generate_artifacts", "-k", "ks", "-p", "robot.xml", *FLEET, "-e", *revoked)
+    (folder / "ks/fleet.toml").write_text("no fleet")
+    sros(*create_again, "--dry-run", cwd=folder).ok()
+    (folder / "ks/fleet.toml").write_text(other_paths)
+    sros(*create_again, cwd=folder).ok()
+    assert (folder / "ks/fleet.toml").read_bytes() == record, "without the paths of the edit"

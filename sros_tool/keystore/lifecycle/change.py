@@ -28,7 +28,7 @@ from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.fleet.robots import Fleet, enclaves_of
 from sros_tool.keystore.fleet import (
     checked_fleet,
-    load_fleet,
+    fleet_before_change,
     with_routers_of_robots,
     write_fleet,
 )
@@ -289,7 +289,7 @@ class KeystoreChange:
 
         A Zenoh network gets the routers of its robots.
         """
-        before = None if self.is_new else load_fleet(self.keystore)
+        before = None if self.is_new else fleet_before_change(self.keystore)
         fleet, entries = write_fleet(self.transaction, self.keystore, fleet, patterns, self.now)
         self.fleet = fleet
         self.entries += entries

@@ -32,6 +32,7 @@ from sros_tool.keystore.expiry import IF_EXPIRED, ONE_BY_ONE
 from sros_tool.keystore.fleet import (
     EnclaveDomains,
     enclaves_of_robot,
+    fleet_before_change,
     left_enclave_notes,
     load_fleet,
     publish_command,
@@ -479,7 +480,7 @@ def _prepare_change(
     """
     change.begin_issuing(domain)
     if fleet is not None:
-        before = load_fleet(change.keystore)
+        before = fleet_before_change(change.keystore)
         recorded = change.write_fleet(fleet, patterns)
         refuse_stale_domains(
             change.keystore, EnclaveDomains(change.domains, before), recorded, stated
