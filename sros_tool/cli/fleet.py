@@ -685,8 +685,8 @@ def _status(
     def names(robots: Sequence[str]) -> str:
         return _robot_names(robots, status.names, status.groups, len(robots))
 
-    listed = robot_findings(reported, known, names) if html else robot_findings(reported, known)
-    compared = ComparedFleet(moment, status, outdated, list(listed))
+    findings = robot_findings(reported, known, names) if html else robot_findings(reported, known)
+    compared = ComparedFleet(moment, status, outdated, list(findings))
     exit_status = 0 if status.complete and not (outdated and on_vulnerabilities) else 1
     if as_json:
         print_json(compared)

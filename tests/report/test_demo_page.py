@@ -154,7 +154,7 @@ def test_what_is_open_comes_first_with_what_to_do_and_is_never_green() -> None:
         f"open in this keystore heard here{what_to_do}",
         f"open names read; subjects read{what_to_do}",
     ]
-    pills = [(pill.text, pill.get("class")) for pill in page.cssselect("td:first-child .chip")]
+    pills = [(pill.text, str(pill.get("class"))) for pill in page.cssselect("td:first-child .chip")]
     assert [text for text, _ in pills] == ["open", "open", "open", "differs", "open", "ok"]
     assert [kind for _, kind in pills if "good" in (kind or "")] == ["chip good"]
     assert "1 ended otherwise" in [tile.text_content() for tile in page.cssselect("li.tile")]
