@@ -555,6 +555,31 @@ def test_a_hundred_enclaves_and_a_thousand_names_can_be_explored(
         assert "/robot7/part3" in details(page)
 
 
+def test_what_all_names_have_in_common_is_said_once(
+    browser: Browser, robot_page: Path, tmp_path: Path
+) -> None:
+    policy, mixed = tmp_path / "p.xml", tmp_path / "mixed.html"
+    names = (f'/{word}<?sros protect="{word}"?>' for word in ("sign", "encrypt"))
+    policy.write_text(policy_text({"/a": publish(*names)}))
+    sros("view", policy, "-o", mixed).ok()
+    with opened(browser, robot_page, "phone") as page:
+        page.click("#tab-map")
+        summary = page.inner_text("#summary")
+        assert ", all encrypted; left out: " in summary
+        assert summary.endswith("; A: also subscribed by /mobile_robot/recorder")
+        assert page.locator("#map .lock").count() == 0
+        # A line of a name ends after a part of it, and what is tapped is large enough.
+        page.click("#tab-names")
+        assert page.locator("#names .link-button wbr").count() > 50
+        titles = page.locator("#names .group b").all_inner_texts()
+        assert titles[0] == "Moves the robot, by name"
+        assert titles[1:] == sorted(titles[1:]) and len(titles) > 5
+    with opened(browser, mixed, "phone") as page:
+        page.click("#tab-map")
+        assert page.locator("#map .lock").count() > 1
+        assert ", all" not in page.inner_text("#summary")
+
+
 def test_of_equal_robots_it_says_who_drives_and_shows_the_names_of_all(
     browser: Browser, tmp_path: Path
 ) -> None:
@@ -697,7 +722,7 @@ def test_a_group_of_the_table_says_how_much_of_it_is_left_out(
         assert sum(rows for rows, _ in shown) == 400
         said = [
             f"{rows} of {names} name{'s' * (names > 1)}"
-            for (rows, _), names in zip(shown, (256, 255, 1), strict=True)
+            for (rows, _), names in zip(shown, (255, 256, 1), strict=True)
         ]
         assert shown[-1][0] == 0
         assert [text.split(",")[0] for _, text in shown] == said

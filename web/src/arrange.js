@@ -322,7 +322,7 @@ function rewrapped(card, width, slim) {
   const lines = whole.flatMap((text) => wrapped(text, Math.floor((width - around) / letter)));
   const notes = card.notes.flatMap((text) => inWords(text, Math.floor((width - (names && slim ? 34 : 18)) / SIZES.smallLetter)));
   const fit = { ...card, width, slim, lines, notes };
-  return { ...fit, height: Math.max(height(fit), names && slim && card.level !== "unknown" ? 46 : 0) };
+  return { ...fit, height: Math.max(height(fit), names && slim && card.lock ? 46 : 0) };
 }
 
 const sumOf = (numbers) => numbers.reduce((total, number) => total + number, 0);
@@ -392,7 +392,8 @@ function contains(frame, card) {
 function around(frame, cards) {
   const [first, last] = [cards[0], cards.at(-1)];
   const letters = Math.floor((first.width + 4) / SIZES.smallLetter);
-  const title = frame.title.length > letters ? `\u2026${frame.title.slice(1 - letters)}` : frame.title;
+  const short = frame.title.length > letters ? frame.title.split(": ")[0] : frame.title;
+  const title = short.length > letters ? `\u2026${short.slice(1 - letters)}` : short;
   const y = first.y - LEAD;
   return { title, x: first.x - 6, y, width: first.width + 12, height: last.y + last.height + 6 - y };
 }

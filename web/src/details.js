@@ -55,8 +55,9 @@ function longList(items) {
   return el("div", {}, el("ul", { class: "plain" }, items.slice(0, MOST)), more);
 }
 
-// Backticks mark commands.
-export const commands = (text) => text.split("`").map((part, at) => (at % 2 ? el("code", { text: part }) : part));
+// Backticks mark commands; an arrow such as `-publish /x->` is not broken at its hyphens.
+export const commands = (text) => text.split("`").map((part, at) => (at % 2 ? el("code", { text: part }) : unbroken(part)));
+const unbroken = (text) => text.split(/(-(?:>|\w+))/).map((part, at) => (at % 2 ? el("span", { class: "unbroken", text: part }) : part));
 
 // A finding; `enclaves` are all that have this very finding, each with a link.
 export function findingItem(finding, enclaves = [], onEnclave = null) {

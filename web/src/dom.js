@@ -19,6 +19,9 @@ export const el = (tag, properties = {}, ...children) =>
 export const svg = (tag, properties = {}, ...children) =>
   make(document.createElementNS(SVG, tag), properties, children);
 
+// A name, of which a line ends after a part rather than within one.
+export const breakable = (name) => name.split(/(?<=[/_])/).flatMap((part, at) => (at ? [el("wbr"), part] : [part]));
+
 export const byId = (id) => document.getElementById(id);
 
 // A screen without room for columns side by side.

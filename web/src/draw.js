@@ -15,6 +15,15 @@ const LOCKS = {
   sign: "M1.5 12h10M2.5 9.5l1-2.6L9.3 1.2l1.8 1.8L5.2 8.7z",
   none: "M2 6h9v6.5H2zM4 6V3.8a2.5 2.5 0 0 1 4.8-1",
 };
+
+// A lock stands on each name, unless all names have the same.
+export function withLocks(scene) {
+  const levels = new Set(scene.cards.filter((card) => card.role === "names").map((card) => card.level));
+  const lockOf = (card) => (levels.size > 1 && LOCKS[card.level] ? card.level : "");
+  const same = levels.size === 1 ? [...levels][0] : "";
+  return { ...scene, same, cards: scene.cards.map((card) => ({ ...card, lock: lockOf(card) })) };
+}
+
 const TIPS = [
   ["to", "tip", "M0 0.5L8 4L0 7.5z", 8, 7, "auto"],
   ["to1", "tip1", "M1 1L7 4L1 7z", 8, 7, "auto"],
@@ -185,12 +194,12 @@ function drawCard(group, card, problems) {
       .attr("class", "glyph")
       .attr("transform", card.slim ? "translate(7 9)" : "translate(10 9)")
       .attr("d", GLYPHS[card.kind]);
-    if (LOCKS[card.level]) {
+    if (card.lock) {
       group
         .append("path")
-        .attr("class", `lock lock-${card.level}`)
+        .attr("class", `lock lock-${card.lock}`)
         .attr("transform", card.slim ? "translate(7 26)" : `translate(${card.width - 23} 8)`)
-        .attr("d", LOCKS[card.level]);
+        .attr("d", LOCKS[card.lock]);
     }
   }
   const left = card.slim ? (names ? 26 : 8) : names ? 32 : 12;
@@ -205,7 +214,7 @@ function drawCard(group, card, problems) {
     y += 14;
   }
   [...card.tags].reverse().forEach((tag, number) => {
-    const x = card.width - (card.slim ? 6 + 13 * number : (LOCKS[card.level] ? 32 : 12) + 18 * number);
+    const x = card.width - (card.slim ? 6 + 13 * number : (card.lock ? 32 : 12) + 18 * number);
     group.append("text").attr("class", "tag").attr("x", x).attr("y", 19).attr("text-anchor", "end").text(`${tag} `);
   });
   if (problems) {
@@ -247,6 +256,8 @@ function moved(event, card, drawn, { links, stacked }, choose) {
   }
 }
 
+export const onlookerText = ({ right, enclave }) => `${ONLOOKERS[right]} ${enclave.replace(/^:/, "")}`;
+
 // What the symbols of this scene mean, as items of a list.
 export function legend(scene, overlay, equal, make) {
   const items = [];
@@ -258,7 +269,7 @@ export function legend(scene, overlay, equal, make) {
   }
   for (const level of Object.keys(LOCKS)) {
     if (scene.cards.some((card) => card.level === level)) {
-      add(icon(LOCKS[level], `lock lock-${level}`), LEVELS[level]);
+      if (scene.cards.some((card) => card.lock)) add(icon(LOCKS[level], `lock lock-${level}`), LEVELS[level]);
       if (level !== "encrypt") add(icon("M0 6h42", `link ${level}`, true), LEVELS[level]);
     }
   }
@@ -284,9 +295,6 @@ export function legend(scene, overlay, equal, make) {
   if (scene.cards.some((card) => card.notes.some((text) => text.startsWith("own:")))) {
     items.push(make.el("li", {}, make.el("span", { text: "own: names that no other enclave may use" })));
   }
-  for (const onlooker of scene.onlookers) {
-    const tag = make.el("b", { class: "tag", text: onlooker.tag });
-    add(tag, `${ONLOOKERS[onlooker.right]} ${onlooker.enclave.replace(/^:/, "")}`);
-  }
+  for (const onlooker of scene.onlookers) add(make.el("b", { class: "tag", text: onlooker.tag }), onlookerText(onlooker));
   return items;
 }

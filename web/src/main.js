@@ -3,7 +3,7 @@
 import { MOST_BUNDLES, columns, fitted, flowScene } from "./arrange.js";
 import { cardDetails, enclaveDetails, equalDetails, findingItem, nameDetails } from "./details.js";
 import { byId, counted, el, isSmall, svg } from "./dom.js";
-import { drawScene, legend } from "./draw.js";
+import { drawScene, legend, onlookerText, withLocks } from "./draw.js";
 import { headlines } from "./headlines.js";
 import { Model } from "./model.js";
 import { namesTable } from "./table.js";
@@ -66,14 +66,19 @@ function alone() {
 function showMap() {
   const scene = currentScene();
   state.room = roomForMap();
-  state.shown = fitted(scene, state.room);
+  state.shown = fitted(withLocks(scene), state.room);
   state.drawing = drawScene(byId("map"), state.shown, { overlay: model.overlay, problems, choose });
   byId("legend").replaceChildren(...legend(state.shown, model.overlay, model.equal, { el, svg }));
   const why = scene.id === "essential" ? " that every node needs (parameters, log, time)" : "";
+  const { same, onlookers } = state.shown;
+  const all = same && same !== "unknown" ? `, all ${LEVELS[same].replace("protection ", "")}` : "";
   const summary = scene.shown
-    ? `${counted(model.enclaves.length, "enclave")}, ${counted(scene.shown, "name")}${scene.hidden ? `; left out: ${counted(scene.hidden, "name")}${why}` : ""}`
-    : scene.title;
-  byId("summary").textContent = scene.cards.length ? summary : "Nothing fits.";
+    ? `${counted(model.enclaves.length, "enclave")}, ${counted(scene.shown, "name")}${all}${scene.hidden ? `; left out: ${counted(scene.hidden, "name")}${why}` : ""}`
+    : `${scene.title}${all}`;
+  const said = [summary];
+  // On a small screen, the legend is folded.
+  if (isSmall()) said.push(...onlookers.map((onlooker) => `${onlooker.tag}: ${onlookerText(onlooker)}`));
+  byId("summary").textContent = scene.cards.length ? said.join("; ") : "Nothing fits.";
   byId("back").hidden = scene === model.scenes[state.scene];
   byId("hops").hidden = !state.flow;
   if (state.flow) byId("hops-number").textContent = counted(Math.min(state.flow.hops, scene.most), "hop");

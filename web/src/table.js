@@ -1,6 +1,6 @@
 // All names in a table: who may send, who may receive, and what nobody may do.
 
-import { counted, el, isSmall } from "./dom.js";
+import { breakable, counted, el, isSmall } from "./dom.js";
 import { KINDS, LEVELS, RECEIVES, SENDS, noneText } from "./words.js";
 
 export const SHOWN = 4;
@@ -34,7 +34,7 @@ function mentions(row, text) {
 function list(texts, none, all) {
   if (all) return [el("div", { class: "lack", text: all }), ...(texts.length ? list(texts, none) : [])];
   if (!texts.length) return el("span", { class: "soft", text: none });
-  return folded(texts.map((text) => el("div", { class: "mono", text })));
+  return folded(texts.map((text) => el("div", { class: "mono" }, breakable(text))));
 }
 
 function folded(items) {
@@ -45,7 +45,7 @@ function folded(items) {
 
 export function nameButton(kind, name, opens) {
   const open = opens(kind, name);
-  return open ? el("button", { type: "button", class: "link-button", text: name, onclick: open }) : el("code", { text: name });
+  return open ? el("button", { type: "button", class: "link-button", onclick: open }, breakable(name)) : el("code", {}, breakable(name));
 }
 
 // `opens(kind, name)` returns what shows a name, or nothing if only the table has it.
@@ -99,8 +99,7 @@ function reach(row) {
   return row.names.some((name) => /^\/?[^/]*[*?[]/.test(name)) && row.senders.length ? Infinity : row.senders.length;
 }
 
-// Rows that are looked at together: what needs a look, and then each namespace, the one in which
-// most enclaves may send to a name first.
+// Rows that are looked at together: what needs a look, and then each namespace.
 function grouped(rows) {
   const groups = new Map();
   for (const row of rows) {
@@ -108,8 +107,8 @@ function grouped(rows) {
     if (!groups.has(title)) groups.set(title, []);
     groups.get(title).push(row);
   }
-  const most = ([title, some]) => (GROUPS.includes(title) ? Infinity : Math.max(...some.map(reach)));
-  return [...groups].sort((a, b) => most(b) - most(a));
+  const place = ([title]) => GROUPS.indexOf(title) + 1 || GROUPS.length + 1;
+  return [...groups].sort((a, b) => place(a) - place(b) || a[0].localeCompare(b[0]));
 }
 
 function namespaceOf({ names }) {
