@@ -54,6 +54,16 @@ class Rule(NamedTuple):
     publish: tuple[Criteria, ...] = ()
     subscribe: tuple[Criteria, ...] = ()
     relay: tuple[Criteria, ...] = ()
+    order: tuple[str, ...] = ()
+    """The direction of each criteria in the order of the document; () if publish comes first."""
+
+    def criteria_of(self, directions: Sequence[str]) -> Iterator[tuple[str, Criteria]]:
+        """Yield the criteria of these directions, each with its direction, in their order."""
+        criteria = {each: iter(getattr(self, each)) for each in directions}
+        order = self.order or [each for each in directions for _ in getattr(self, each)]
+        for direction in order:
+            if direction in criteria:
+                yield direction, next(criteria[direction])
 
 
 class Grant(NamedTuple):

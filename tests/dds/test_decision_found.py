@@ -15,6 +15,7 @@ from tests.dds.decision_documents import (
     grant,
     permissions,
     publish,
+    subscribe,
     topic_rule,
 )
 
@@ -98,6 +99,20 @@ def test_a_list_without_partitions_is_not_the_default_partition() -> None:
     perms = permissions(grant(allow(empty, publish("rt/b"))))
     assert outcome(Vendor.CYCLONE, perms, governance(), "rt/b") is Outcome.ALLOWED
     assert outcome(Vendor.CYCLONE, perms, governance(), "rt/a") is Outcome.DENIED
+
+
+def test_cyclone_reads_the_criteria_of_a_rule_in_the_order_of_the_document() -> None:
+    """It creates a topic by the first criteria that names it, and crashes on an empty topic."""
+    empty = subscribe("rt/b", "")
+    crashing = permissions(grant(allow(empty, publish("rt/a"))))
+    assert outcome(Vendor.CYCLONE, crashing, governance(), "rt/a") is Outcome.CRASHES
+    for between in (publish("rt/c"), subscribe("rt/c")):
+        sound = permissions(grant(allow(between, publish("rt/a"), empty)))
+        assert outcome(Vendor.CYCLONE, sound, governance(), "rt/a") is Outcome.ALLOWED
+    late = publish("rt/b", "")
+    sound = permissions(grant(allow(subscribe("rt/a"), late)))
+    reads = AccessVerb.SUBSCRIBE
+    assert outcome(Vendor.CYCLONE, sound, governance(), "rt/a", reads) is Outcome.ALLOWED
 
 
 def test_peers_honour_a_default_of_allow() -> None:

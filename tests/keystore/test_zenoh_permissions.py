@@ -148,7 +148,8 @@ def drawn_grant(draw: Random) -> Grant:
         domains = draw.choice(DOMAINS) if odd else DOMAINS[0]
         if odd and draw.random() < 0.1:
             domains = DomainSet((draw.choice(ODD_DOMAINS),))
-        rules.append(Rule(draw.random() < 0.65, domains, *map(tuple, (*both, relay))))
+        out, into, through = map(tuple, (*both, relay))
+        rules.append(Rule(draw.random() < 0.65, domains, out, into, through))
     return granted(*rules)._replace(default_allow=odd and draw.random() < 0.05)
 
 

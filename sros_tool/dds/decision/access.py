@@ -303,17 +303,12 @@ class _GrantRules:
         traits = self._traits
         entries: list[_Entry] = []
         count = 0
-        for index, rule, criteria in (
-            (index, rule, getattr(rule, verb))
-            for index, rule in self._rules
-            for verb in self._verbs
-        ):
-            for criterion in criteria:
+        for index, rule in self._rules:
+            for verb, criterion in rule.criteria_of(self._verbs):
                 count += 1
                 # Fast DDS joins the partitions of all criteria of a verb in a rule.
-                weighed = _partitions(
-                    traits, rule, criteria if traits.topic_decides else (criterion,)
-                )
+                joined = getattr(rule, verb) if traits.topic_decides else (criterion,)
+                weighed = _partitions(traits, rule, joined)
                 entries += [
                     _Entry(count, index, rule.allow, _trimmed(traits, expression), weighed)
                     for expression in criterion.topics

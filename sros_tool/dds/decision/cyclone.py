@@ -438,8 +438,14 @@ def _read_rule(node: _Node) -> Rule:
         tuple(_read_criteria(child) for child in node.all(verb))
         for verb in ("publish", "subscribe")
     )
-    allow = node.tag == "allow_rule"
-    return Rule(allow, _read_domains(node.last("domains")), publish, subscribe)
+    order = tuple(child.tag for child in node.all("publish", "subscribe"))
+    return Rule(
+        node.tag == "allow_rule",
+        _read_domains(node.last("domains")),
+        publish,
+        subscribe,
+        order=() if order == tuple(sorted(order)) else order,
+    )
 
 
 def _read_criteria(node: _Node) -> Criteria:
