@@ -88,14 +88,12 @@ class Window:
         after its validity begins; other programs may make documents that are valid only from
         ``made_at`` on.
         """
-        latest = self.not_before + BACKDATE
-        if latest >= self.not_after:
-            latest = self.not_before
-        if made_at is None or made_at < self.not_before - BACKDATE:
-            begin = latest
-        else:
-            begin = min(max(made_at, self.not_before), latest)
-        return self.not_after - begin
+        length = self.not_after - self.not_before
+        backdated = BACKDATE if length > BACKDATE else timedelta(0)
+        # By differences: a certificate may begin or end where `datetime` does.
+        if made_at is not None and (late := made_at - self.not_before) >= -BACKDATE:
+            return length - min(max(late, timedelta(0)), backdated)
+        return length - backdated
 
     def intersection(self, outer: Window) -> Window:
         """Return the part of this window that is in ``outer``."""

@@ -107,3 +107,11 @@ def test_a_new_document_of_short_validity_does_not_expire_soon() -> None:
     for lifetime in (timedelta(minutes=5), timedelta(days=20), timedelta(days=365)):
         soon_from = Window(made - BACKDATE, made + lifetime).expires_soon_from()
         assert soon_from == made + lifetime - soon_limit(lifetime) > made
+
+
+def test_a_validity_where_dates_end_has_a_lifetime() -> None:
+    first, last = (each.replace(tzinfo=UTC) for each in (datetime.min, datetime.max))
+    hour, now = timedelta(hours=1), datetime(2026, 1, 1, tzinfo=UTC)
+    for begin in (first, last - hour):
+        ends = Window(begin, begin + hour)
+        assert ends.lifetime() == ends.lifetime(now) == hour

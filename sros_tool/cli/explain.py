@@ -412,7 +412,7 @@ def _circumstances(
 
 def _notes_on_past(moment: datetime, keystore: OpenedKeystore | None) -> Iterator[Note]:
     """Yield a note if the moment is in the past, where other files may have been in force."""
-    if moment > now() - timedelta(minutes=1):
+    if now() - moment < timedelta(minutes=1):
         yield from keystore.ledger_file.clock_notes(moment) if keystore else ()
         return
     changes = 0

@@ -1170,11 +1170,12 @@ def _nothing_found(enclave: LoadedEnclave) -> str:
 def _in_ros_terms(denial: Denial) -> tuple[str, str, str]:
     """Return the denied operation (one of `answer.WORDS`, or "use"), the ROS name, and its type.
 
-    A topic or a service of an action counts as the action.
+    A topic or a service of an action counts as the action.  For a topic that belongs to no ROS
+    name, the name is the topic, and the type is "".
     """
     right, name = right_to_use(denial.topic, writes=denial.direction == PUBLISH)
-    if not name.startswith("/"):
-        return denial.direction or "use", denial.topic, "topic"
+    if not right:
+        return denial.direction or "use", name, ""
     action, _ = action_part(name)
     word, kind = _TOLD_AS[right]
     if action:
@@ -1200,6 +1201,8 @@ _WORDS_OF_TYPES = {
 def _questions_to_ask(denial: Denial) -> tuple[Question, ...]:
     """Return the questions to ask `sros explain` about a denied topic; () without a ROS name."""
     right, name, kind = _in_ros_terms(denial)
+    if not kind:
+        return ()
     words = _WORDS_OF_TYPES[kind] if right == "use" else (right,)
     try:
         return tuple(ask(word, name, kind) for word in words)

@@ -413,7 +413,7 @@ def read_policy(
         PolicyError: (or another `DocumentError`, with file and line) the file violates the format,
             a name is not a valid ROS name, or an enclave is defined twice.
     """
-    if content is None and policy_files is None and path.is_dir():
+    if content is None and policy_files is None and os.path.isdir(path):  # noqa: PTH112 - as `_is_there`
         files = list(files_of_policies(path))
         if not files:
             raise PolicyError(

@@ -58,12 +58,13 @@ class Bench:
         digest: hashes.SHA256 | hashes.SHA384 | None = None,
         issuer: tuple[x509.Name, PrivateKey] | None = None,
         common_name: str = "new CA",
+        until: datetime | None = None,
     ) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
         key = ec.generate_private_key(curve or ec.SECP256R1())
         name = name_of(("CN", common_name))
         by, signing = issuer or (name, key)
         builder = x509.CertificateBuilder(
-            by, name, key.public_key(), 4711, self.now - DAY, self.now + 1000 * DAY
+            by, name, key.public_key(), 4711, self.now - DAY, until or self.now + 1000 * DAY
         )
         for extension, critical in extensions:
             builder = builder.add_extension(extension, critical)

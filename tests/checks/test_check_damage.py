@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import shutil
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -100,6 +101,12 @@ PERMISSIONS = (
     (("CN=/base", "nonsense"),),
     (("CN=/base", ""),),
 )  # fmt: skip
+
+
+def test_a_ca_that_is_valid_until_dates_end(bench: Bench) -> None:
+    certificate, _ = bench.new_authority(until=datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC))
+    bench.trust("identity", certificate)
+    assert keystore_findings(OpenedKeystore(bench.root), Circumstances(bench.now))
 
 
 @pytest.mark.parametrize("changes", PERMISSIONS)

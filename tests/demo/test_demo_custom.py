@@ -117,6 +117,7 @@ def test_a_good_file(folder: Path) -> None:
         ('enclave = "/arm/viewer"', 'enclave = "/arm/viewer"\nkeystore = "theirs"', 14,
          "'theirs' is not a keystore; use one of own, foreign"),
         ('policy = "robot.xml"', 'policy = "other.xml"', 2, "other.xml"),
+        ('policy = "robot.xml"', f'policy = "{"x" * 300}"', 2, "does not exist"),
         ('policy = "robot.xml"\n', "", 1, "no policy"),
         (CLAIM, "", 22, "has no claim"),
         ('name = "the viewer sees"', "name = 3", 22, "3, not a string"),

@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import sys
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -217,10 +217,13 @@ def test_expired_at_a_moment_to_come(whole: Path) -> None:
     assert late.status == 1 and "expired at" in late.out and "sros ren" in late.out + "sros ren"
 
 
+def test_a_clock_in_the_first_year(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sros_tool.cli.common._clock", lambda: datetime(1, 1, 1, tzinfo=UTC))
+    assert explain(whole, ENCLAVE, "publish", "/chatter").status == 1
+
+
 def test_the_time_zone_of_the_robot_counts_on_fast_dds(keystore: Path) -> None:
     enclave = Enclave(keystore)
-    from datetime import timedelta
-
     enclave.validity(enclave.now - timedelta(minutes=5), enclave.now + timedelta(days=1))
     asked = (keystore, ENCLAVE, "publish", "/chatter")
     assert explain(*asked).status == 0

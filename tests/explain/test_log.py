@@ -1147,6 +1147,13 @@ def test_a_topic_without_a_ros_name_is_looked_up_in_the_folder_of_the_enclave(
     assert f"`sros inspect {keystore}/enclaves{ENCLAVE}`" in found
 
 
+@pytest.mark.parametrize("topic", ["/x", "rtx"])
+def test_a_topic_without_a_ros_name_is_not_asked_about_in_ros_terms(topic: str) -> None:
+    (found,) = explained(f"{topic} topic not found in allow rule. -> check_create_datawriter")
+    assert f"publish {topic}:" in found.cause
+    assert "no policy in ROS terms can name this topic" in found.remedy
+
+
 def test_an_action_is_no_service(keystore: Path, tmp_path: Path) -> None:
     """Neither the advised command nor a proposed name is about a service."""
     log, policy = tmp_path / "robot.log", tmp_path / "robot.xml"

@@ -328,7 +328,7 @@ def _certificate_findings(
         if isinstance(value, x509.BasicConstraints) and value.ca:
             yield IS_A_CA.found(name, "its BasicConstraints say CA:TRUE", file)
     ca = enclave.state.identity_ca
-    if ca and validity_of(certificate).not_after > validity_of(ca).not_after + _SAME_DAY:
+    if ca and validity_of(certificate).not_after - validity_of(ca).not_after > _SAME_DAY:
         text = (
             f"it expires at {iso(validity_of(certificate).not_after)}, its CA at "
             f"{iso(validity_of(ca).not_after)}"
