@@ -28,6 +28,7 @@ from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import PrivateKey, key_pem
 from sros_tool.runtime.events import EventKind
 from tests.integration.converse import SILENCE, Node, Party
+from tests.integration.vendor_oracle import cyclone_vendor
 from tests.support.children import LATE, PATIENCE, apart
 from tests.support.harness import Ended, copy_of, sros
 
@@ -199,14 +200,14 @@ class Life:
             words += [f"--{role}-ca", file, f"--{role}-key", key]
             words += ["--permissions-key", key] * (name == "sros2")  # one CA for both roles
         self.title += f" {name} {self.kinds or ''}"
-        made = self._run("create_keystore", self.root, *words)
-        if made.status:
+        if self._run("create_keystore", self.root, *words).status:
             return None
         if self._run("create_enclave", self.root, A, B, LOST, "/spare").status:
             return None
-        notes = [each for each in made.err.splitlines() if "portable.revocation-list" not in each]
-        refused = r"Cyclone DDS 0.10.2 refuse|only Fast DDS 2.14 accepts|Cyclone DDS accepts only"
-        return not any(re.search(refused, each) for each in notes)
+        asked = ("join", "--vendor", cyclone_vendor().value, "--domain", "1")
+        joins = [sros("explain", self.root, name, *asked).status for name in (A, B, LOST)]
+        assert joins in ([0] * 3, [1] * 3), (self.title, joins)
+        return not joins[0]
 
     def _revoke(self) -> None:
         self.lost = self._did("revoke", self.root, LOST)
