@@ -20,6 +20,7 @@ import errno
 import os
 import re
 import stat
+import struct
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -108,7 +109,8 @@ class Process:
     namespace; "" is the namespace of this process.  ``enclave`` is the enclave that it names, if it
     asks for security, and ``configuration`` the file that it names for Zenoh.  ``forked_by`` are
     the id and command of the first process of its program, if another one started it.  ``own_pid``
-    is the id that the process itself sees; in a container, it differs from ``pid``.
+    is the id that the process itself sees; in a container, it differs from ``pid``.  ``user`` is
+    the id of the user who runs it, for a set-user-ID program of the user who started it.
     """
 
     pid: int
@@ -473,7 +475,7 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
         environment,
         started,
         libraries,
-        _number(_USER, status),
+        _user(folder, status),
         "" if network == _namespace(Path("/proc/thread-self/ns/net")) else network,
         dds=_mapped_dds(maps),
         forked_by=_forked_by(folder, command),
@@ -674,6 +676,29 @@ _USER = re.compile(rb"^Uid:\s+\d+\s+(\d+)", re.MULTILINE)
 """The effective user id in /proc/PID/status."""
 _OWN_PID = re.compile(rb"^NSpid:(?:\s+\d+)*\s+(\d+)$", re.MULTILINE)
 """The process id in the innermost PID namespace, in /proc/PID/status."""
+
+
+_STARTED_BY, _STARTED_AS = 11, 12
+"""AT_UID and AT_EUID in /proc/PID/auxv (getauxval(3)): real and effective user id at the start."""
+
+
+def _user(folder: int, status: bytes) -> int:
+    """Return the effective user id of a process; for a set-user-ID program, who started it.
+
+    This user chose its words and environment, whatever user ids the program gives itself later.
+
+    Raises:
+        OSError: It has ended, or may not be examined.
+    """
+    auxiliary = _read(folder, "auxv", _MOST_BYTES)
+    length = len(auxiliary) - len(auxiliary) % 16
+    values = dict(struct.iter_unpack("QQ", auxiliary[:length]))
+    if any(name > 0xFFFFFFFF for name in values):  # the words of a process of 32 bits
+        values = dict(struct.iter_unpack("II", auxiliary[:length]))
+    started_by = values.get(_STARTED_BY)
+    if started_by is not None and started_by != values.get(_STARTED_AS):
+        return int(started_by)
+    return _number(_USER, status)
 
 
 def _number(pattern: re.Pattern[bytes], status: bytes) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
@@ -51,6 +52,7 @@ class Proc:
         (folder / "cmdline").write_bytes("\0".join((*command, "")).encode())
         (folder / "environ").write_bytes(environment)
         (folder / "maps").write_text(f"7f00-7f01 r-xp 0 08:01 7 {maps}\n" if maps else "")
+        (folder / "auxv").write_bytes(struct.pack("QQQQ", 11, 7, 12, 7))
         (folder / "status").write_text("Name:\ta\nUid:\t7\t8\t9\t9\nNSpid:\t70\t7\n")
         for link, target in (("ns/net", "net:[1]"), ("cwd", "/"), ("root", str(self.path))):
             (folder / link).unlink(missing_ok=True)
@@ -103,6 +105,16 @@ def test_kernel_threads_and_processes_that_wait_for_a_node_are_none(proc: Proc) 
     assert proc.labels() == ["process 9 (talker)"]
     proc.add(7, "nice", *ROS, maps="/lib/librcl.so")
     assert proc.labels() == ["process 7 (nice)", "process 9 (talker)"]
+
+
+@pytest.mark.parametrize("words", ["8Q", "8I"])
+def test_a_set_user_id_program_counts_as_of_the_user_who_started_it(proc: Proc, words: str) -> None:
+    """Whoever starts ``su`` chooses its words and environment, and could seem to be root's node."""
+    folder = proc.add(7, *ROS)
+    for started_as, user in ((65534, 8), (0, 65534)):
+        values = (6, 4096, 11, 65534, 12, started_as, 13, 65534)
+        (folder / "auxv").write_bytes(struct.pack(words, *values))
+        assert [each.user for each in proc.look().processes] == [user]
 
 
 def test_the_first_of_two_variables_counts_as_for_getenv(proc: Proc) -> None:
