@@ -13,6 +13,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from shlex import quote
 from typing import NamedTuple
 
@@ -24,9 +25,9 @@ from sros_tool.names import (
     expression_problem,
     is_expression,
 )
-from sros_tool.policy.model import DENY, Group, Policy, Profile
+from sros_tool.policy.model import ALLOW, DENY, Group, Policy, Profile
 from sros_tool.policy.patterns import matches
-from sros_tool.policy.rights import Rules, placed_rights, policy_rights
+from sros_tool.policy.rights import Right, Rules, placed_rights, policy_rights
 from sros_tool.wording import enumerated
 
 _RULE = re.compile(r"(?:([A-Za-z_]\w*):)?([^:=]+):=([^:=]+)")
@@ -163,11 +164,13 @@ def remapped_policy(
     """Return a policy with remapped names, and the uses of the rules.
 
     Where a wildcard matches the old name, the new name is added to the wildcard.  The names in
-    ``moved_names``, of any node, are also added to each DENY that matches the old one.
+    ``moved_names``, of any node, are also added to each DENY that matches the old one.  An old name
+    stays denied where a wildcard of its enclave would allow it.
     """
     used: set[UsedRule] = set()
+    wildcards = Rules(right for right in policy_rights(policy) if is_expression(right.name))
 
-    def remapped(profile: Profile) -> Profile:
+    def remapped(enclave: str, profile: Profile) -> Profile:
         renamed = [rule for rule in rules if rule.old == _NODE and rule.node in ("", profile.node)]
         node = renamed[0].new if renamed else profile.node
         of_node = [rule for rule in rules if rule.old != _NODE and rule.node in ("", node)]
@@ -178,10 +181,18 @@ def remapped_policy(
         groups = []
         for group in profile.groups:
             groups.append(_remapped_group(group, of_names, ns, node, used))
-            groups += _denials_of_moved_names(group, groups[-1], moved_names, ns, node)
+            by_wildcards = {
+                name
+                for name in (expand(name, ns, node) for name in group.names)
+                for right, qualifier in group.rights
+                if qualifier is DENY and wildcards.overlaps(Right(enclave, ALLOW, right, name))
+            }
+            groups += _more_denials(group, groups[-1], moved_names, by_wildcards, ns, node)
         return replace(profile, ns=ns, node=node, groups=tuple(groups))
 
-    enclaves = tuple(enclave.with_profiles(remapped) for enclave in policy.enclaves)
+    enclaves = tuple(
+        enclave.with_profiles(partial(remapped, enclave.path)) for enclave in policy.enclaves
+    )
     return replace(policy, enclaves=enclaves), used
 
 
@@ -214,10 +225,18 @@ def _remapped_group(
     return replace(group, names=names, lines=lines)
 
 
-def _denials_of_moved_names(
-    group: Group, remapped: Group, moved_names: Iterable[UsedRule], ns: str, node: str
+def _more_denials(
+    group: Group,
+    remapped: Group,
+    moved_names: Iterable[UsedRule],
+    by_wildcards: Collection[str],
+    ns: str,
+    node: str,
 ) -> Iterator[Group]:
-    """Yield a group of the names that a DENY of ``group`` also has to deny, if there are any."""
+    """Yield a group of the names that a DENY of ``group`` also has to deny, if there are any.
+
+    That is each moved name, and each in ``by_wildcards`` that no node has instead of another now.
+    """
     denials = tuple(right for right in group.rights if right[1] is DENY)
     if not denials:
         return
@@ -229,6 +248,10 @@ def _denials_of_moved_names(
             denying = [index for index, full in enumerate(stated) if matches(full, use.old)]
             for index in denying[:1]:
                 lines.setdefault(use.new, group.source_of(index).line)
+    taken = present.union(use.new for use in moved_names)
+    for index, full in enumerate(stated):
+        if full in by_wildcards and full not in taken:
+            lines.setdefault(full, group.source_of(index).line)
     if lines:
         names = tuple(lines)
         yield replace(group, rights=denials, names=names, lines=tuple(lines.values()))

@@ -125,6 +125,22 @@ def test_a_new_name_of_one_node_stays_denied_to_the_others(
     assert {right.qualifier for right in policy_rights(of_n)} == {ALLOW}
 
 
+@pytest.mark.parametrize(
+    ("rules", "denied"),
+    [
+        (["x:=/left/x"], {"/x", "/left/x"}),
+        (["x:=z", "y:=x"], {"/z"}),  # the name now stands for what was y, and was allowed
+    ],
+)
+def test_a_wildcard_does_not_allow_an_old_name_that_was_denied(
+    rules: list[str], denied: set[str]
+) -> None:
+    """Without its DENY, the old name would be allowed, and another node's may be called so."""
+    policy = one(group("topics", "/*", publish="ALLOW"), group("topics", "x", publish="DENY"))
+    (remapped,), _ = remapped_policies([policy], rules)
+    assert {right.name for right in policy_rights(remapped) if right.qualifier is DENY} == denied
+
+
 def test_a_denial_of_an_old_name_in_the_file_is_told() -> None:
     """What was merged before, such as another node of the same package, does not change."""
     file = one(group("topics", "/*x", publish="DENY"), node="m")
