@@ -332,6 +332,11 @@ def _number(element: etree._Element) -> int:
     return int(text)
 
 
+def size_of_topic(topic: str) -> int:
+    """Return the size of a topic in bytes; those that are no UTF-8 were read as surrogates."""
+    return len(topic.encode(errors="surrogateescape"))
+
+
 # ── the portable profile ───────────────────────────────────────────────────────────────────
 
 _SHOWN = 3
@@ -387,11 +392,11 @@ def portability_problems(
             for rule in grant.rules
             for criteria in (*rule.publish, *rule.subscribe)
             for topic in criteria.topics
-            if len(topic.encode()) > _LONGEST_TOPIC
+            if size_of_topic(topic) > _LONGEST_TOPIC
             and not any(character in topic for character in "*?[")
         ]
         if too_long:
-            name, size = too_long[0][:60], len(too_long[0].encode())
+            name, size = too_long[0][:60], size_of_topic(too_long[0])
             yield "portable.long-name", f"{name}... has {size} bytes"
         allowed = [r for r in grant.rules if r.allow]
         denied = [r for r in grant.rules if not r.allow]

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 from sros_tool.dds.decision.access import Access, AccessVerb, Outcome
+from sros_tool.dds.decision.documents import read_permissions_as
 from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.dds.permissions import Permissions, portability_problems
 from tests.dds.decision_documents import (
     NOW,
     SUBJECT,
@@ -113,6 +117,17 @@ def test_cyclone_reads_the_criteria_of_a_rule_in_the_order_of_the_document() -> 
     sound = permissions(grant(allow(subscribe("rt/a"), late)))
     reads = AccessVerb.SUBSCRIBE
     assert outcome(Vendor.CYCLONE, sound, governance(), "rt/a", reads) is Outcome.ALLOWED
+
+
+def test_the_bytes_of_a_topic_count_even_if_they_are_no_utf_8() -> None:
+    topic = "rt/" + 249 * "\udcac"
+    perms = permissions(grant(allow(publish("rt/X")))).replace(b"rt/X", os.fsencode(topic))
+    found = read_permissions_as(Vendor.CYCLONE, perms)
+    assert isinstance(found, Permissions)
+    assert ("portable.long-name", f"{topic[:60]}... has 252 bytes") in portability_problems(
+        found, 0
+    )
+    assert outcome(Vendor.FAST, EVERYTHING, governance(), topic) is Outcome.PEER_DENIES
 
 
 def test_peers_honour_a_default_of_allow() -> None:

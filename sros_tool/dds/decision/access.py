@@ -29,7 +29,7 @@ from sros_tool.dds.decision.vendors import (
 )
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule
-from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
+from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule, size_of_topic
 from sros_tool.values import shows
 
 if TYPE_CHECKING:
@@ -898,7 +898,7 @@ class Access:
             )
         decision = self._decision_by_rules(verb, topic, partitions)
         longest = traits.longest_topic_name
-        if decision.outcome.ok and longest is not None and len(topic.encode()) > longest:
+        if decision.outcome.ok and longest is not None and size_of_topic(topic) > longest:
             text = f"no peer matches a topic whose name has more than {longest} bytes"
             return decision._replace(
                 outcome=Outcome.PEER_DENIES,
