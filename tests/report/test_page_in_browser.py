@@ -807,7 +807,7 @@ def test_a_robot_of_unknown_names_says_who_may_do_most_and_equal_findings_are_on
 
 def test_only_what_was_checked_is_without_an_error(browser: Browser, tmp_path: Path) -> None:
     source, path = tmp_path / "p.xml", tmp_path / "p.html"
-    source.write_text(policy_text({"/a": publish("/x")}))
+    source.write_text(policy_text({"/a": publish("/left/cmd_vel", "/right/cmd_vel")}))
     rights = policy_rights(read_policy(source))
     picture = compose(PictureSource(SourceTitle("p.xml", "policy"), rights))
     skipped = replace(picture, findings=(PicturedFinding("view.not-checked", "note", "why"),))
@@ -818,7 +818,8 @@ def test_only_what_was_checked_is_without_an_error(browser: Browser, tmp_path: P
     ):
         path.write_text(render_page(each, scenes_of(each), NOW))
         with opened(browser, path) as page:
-            assert said in page.inner_text("#headlines").split("\n")
+            shown = page.inner_text("#headlines").split("\n")
+        assert said in shown and "May publish /left/cmd_vel and 1 more: /a" in shown
 
 
 def test_what_is_violated_comes_first_and_the_map_opens_where_it_is(

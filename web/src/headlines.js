@@ -69,11 +69,11 @@ function drivers(rows, opens, showTable) {
   const few = own.length <= DRIVERS ? own : [];
   const shown = moving.length ? moving : few;
   const said = shown.slice(0, DRIVERS).map((row) => {
-    const [name] = row.names;
+    const [name, ...alike] = row.names;
     const all = [...(row.all_send ? [row.everybody] : []), ...row.senders];
     const more = all.length > SHOWN ? ` and ${all.length - SHOWN} more` : "";
     const who = all.length ? `${all.slice(0, SHOWN).join(", ")}${more}` : noneText(row, row.receivers);
-    return el("p", {}, `May ${SENDS[row.kind]} `, nameButton(row.kind, name, opens), `: ${who}`);
+    return el("p", {}, `May ${SENDS[row.kind]} `, nameButton(row.kind, name, opens), alike.length ? ` and ${alike.length} more` : "", `: ${who}`);
   });
   const left = shown.length - said.length;
   return left ? [...said, el("p", {}, button(`and ${left} more in the table`, showTable))] : said;
