@@ -326,7 +326,7 @@ _S_MIME = ExtendedKeyUsageOID.EMAIL_PROTECTION.dotted_string
 def _purposes(part: der.Value) -> set[str]:
     if part.tag not in (der.SEQUENCE, der.CONTEXT_0):
         return set()
-    return {der.decode_oid(purpose.content) for purpose in der.children(part.content)}
+    return {der.decode_oid(purpose) for purpose in der.children(part.content)}
 
 
 def _sentence(clause: str) -> str:
@@ -484,7 +484,7 @@ def _algorithms(certificate: x509.Certificate) -> tuple[der.Value, der.Value]:
 
 def _signed_algorithm(certificate: x509.Certificate) -> x509.ObjectIdentifier:
     inner, _ = _algorithms(certificate)
-    return x509.ObjectIdentifier(der.decode_oid(der.first_value(inner.content).content))
+    return x509.ObjectIdentifier(der.decode_oid(der.first_value(inner.content)))
 
 
 @lru_cache(maxsize=256)
@@ -598,7 +598,7 @@ def _name_text(name: bytes) -> str:
 def _attribute_text(attribute: der.Value) -> str:
     """Return ``type=value``; the value is hexadecimal if the type is unknown or not a string."""
     oid, value = der.children(attribute.content)
-    dotted = der.decode_oid(oid.content)
+    dotted = der.decode_oid(oid)
     known = short_names().get(dotted)
     encoding = _ENCODINGS.get(value.tag)
     if known is None or encoding is None:

@@ -6,6 +6,7 @@ its verification primitives need.  The writer is for keys that are encrypted by 
 
 from __future__ import annotations
 
+import re
 from typing import NamedTuple
 
 from sros_tool.errors import PkiError
@@ -13,6 +14,7 @@ from sros_tool.errors import PkiError
 BOOLEAN, INTEGER, BIT_STRING, OCTET_STRING, OID, SEQUENCE, SET = 1, 2, 3, 4, 6, 0x30, 0x31
 UTC_TIME, GENERALIZED_TIME = 0x17, 0x18
 CONTEXT_0, CONTEXT_1 = 0xA0, 0xA1
+_SUBIDENTIFIERS = re.compile(rb"(?:(?:[\x81-\xff][\x80-\xff]*)?[\x00-\x7f])+")
 
 
 class Value(NamedTuple):
@@ -189,10 +191,17 @@ def encode_oid(dotted: str) -> bytes:
     return bytes(content)
 
 
-def decode_oid(content: bytes) -> str:
-    """Return the dotted form of an object identifier, given as the content of a DER value."""
+def decode_oid(value: Value) -> str:
+    """Return the dotted form of an object identifier.
+
+    Raises:
+        PkiError: the value is not an object identifier, or one that OpenSSL refuses
+            (ossl_c2i_ASN1_OBJECT).
+    """
+    if value.tag != OID or not _SUBIDENTIFIERS.fullmatch(value.content):
+        raise PkiError("a DER value is not an object identifier")
     numbers = [0]
-    for octet in content:
+    for octet in value.content:
         numbers[-1] = numbers[-1] << 7 | octet & 0x7F
         if not octet & 0x80:
             numbers.append(0)

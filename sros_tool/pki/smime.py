@@ -63,10 +63,9 @@ _SMIME_CAPABILITIES = der.encode_oid("1.2.840.113549.1.9.15")
 _MESSAGE_DIGEST = der.encode_oid("1.2.840.113549.1.9.4")
 _NULL = 0x05
 _ANY_VALUES = (
-    der.SEQUENCE, der.OCTET_STRING, der.OID, der.UTC_TIME, der.GENERALIZED_TIME, _NULL
+    der.SEQUENCE, der.OCTET_STRING, der.UTC_TIME, der.GENERALIZED_TIME, _NULL
 )  # fmt: skip
 """Types of attributes and parameters that OpenSSL re-encodes without changing a byte."""
-_OID = re.compile(rb"(?:(?:[\x81-\xff][\x80-\xff]*)?[\x00-\x7f])+")
 
 
 _DIGESTS: dict[bytes, hashes.HashAlgorithm] = {
@@ -573,11 +572,9 @@ def _issuer_and_serial(identifier: der.Value) -> tuple[tuple[bytes, ...], int]:
 def _check_values(*values: der.Value) -> None:
     """Raise `ValueError` if OpenSSL might read one of the values differently, or refuse it."""
     for value in values:
-        if (
-            value.tag not in _ANY_VALUES
-            or (value.tag == der.OID and not _OID.fullmatch(value.content))
-            or (value.tag == _NULL and value.content)
-        ):
+        if value.tag == der.OID:
+            der.decode_oid(value)  # raises an error if OpenSSL refuses it
+        elif value.tag not in _ANY_VALUES or (value.tag == _NULL and value.content):
             raise ValueError("not a value of an attribute or parameter")
 
 

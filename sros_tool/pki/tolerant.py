@@ -76,7 +76,7 @@ class TolerantName:
             rdns.append(
                 [
                     _Part(
-                        ObjectIdentifier(der.decode_oid(kind.content)),
+                        ObjectIdentifier(der.decode_oid(kind)),
                         value.content.decode("utf-8", "replace"),
                     )
                     for kind, value in pairs
@@ -111,13 +111,11 @@ class _Signed:
         self._data = data
         parts = _sequence(der.first_value(der.normalized(data)))
         signed, algorithm, signature = parts
-        if signature.tag != der.BIT_STRING or not signature.content or signature.content[0] > 7:
-            raise ValueError("its signature is not a BIT STRING")
+        _check_bits(signature)
         self._parts = _sequence(signed)
         self._algorithm = algorithm
         self.signature = signature.content[1:]
-        identifier = _sequence(algorithm)[0]
-        self.signature_algorithm_oid = ObjectIdentifier(der.decode_oid(identifier.content))
+        self.signature_algorithm_oid = _algorithm(algorithm)
 
     @property
     def signature_hash_algorithm(self) -> hashes.HashAlgorithm | None:
@@ -175,7 +173,8 @@ class _TolerantCertificate(_Signed):
             number = der.integer(der.first_value(parts.pop(0).content))
         self.version = x509.Version.v1 if number == 0 else x509.Version.v3
         self.number = number + 1
-        serial, _, issuer, validity, subject, key, *rest = parts
+        serial, algorithm, issuer, validity, subject, key, *rest = parts
+        _algorithm(algorithm)
         self.serial_number = der.integer(serial)
         self.issuer, self.subject = _name(issuer.whole), _name(subject.whole)
         begin, end = _sequence(validity)
@@ -184,8 +183,9 @@ class _TolerantCertificate(_Signed):
         ]
         self.not_valid_before_utc = _date(begin) or datetime.min.replace(tzinfo=UTC)
         self.not_valid_after_utc = _date(end) or datetime.max.replace(tzinfo=UTC)
-        algorithm, _ = _sequence(key)
-        der.decode_oid(_sequence(algorithm)[0].content)  # raises an error if there is none
+        algorithm, bits = _sequence(key)
+        _algorithm(algorithm)
+        _check_bits(bits)
         self._key = _public_key(key.whole)
         while rest and rest[0].tag in _UNIQUE_IDENTIFIERS:
             rest.pop(0)
@@ -222,7 +222,8 @@ class _TolerantList(_Signed):
         parts = self._parts
         if parts[0].tag == der.INTEGER:
             parts.pop(0)
-        _, issuer, begin, *rest = parts
+        algorithm, issuer, begin, *rest = parts
+        _algorithm(algorithm)
         self.issuer = _name(issuer.whole)
         dates = [_date(begin)]
         while rest and rest[0].tag in _TIMES:
@@ -375,6 +376,22 @@ def _sequence(value: der.Value) -> list[der.Value]:
     return der.children(value.content)
 
 
+def _algorithm(value: der.Value) -> ObjectIdentifier:
+    """Return the identifier of an algorithm; its parameters may be anything that is one value."""
+    identifier, *parameters = _sequence(value)
+    if len(parameters) > 1:
+        raise ValueError("not an algorithm")
+    for parameter in parameters:
+        if parameter.tag == der.OID:
+            der.decode_oid(parameter)
+    return ObjectIdentifier(der.decode_oid(identifier))
+
+
+def _check_bits(value: der.Value) -> None:
+    if value.tag != der.BIT_STRING or not value.content or value.content[0] > 7:
+        raise ValueError("not a BIT STRING")
+
+
 def _public_key(data: bytes) -> object:
     try:
         return serialization.load_der_public_key(data)
@@ -504,7 +521,7 @@ def _parts(extension: der.Value) -> tuple[ObjectIdentifier, bool, bytes]:
         raise PkiError("an extension is not an Extension structure")
     if any(len(value.content) != 1 for value in flag):
         raise PkiError("an extension's critical flag is not a BOOLEAN")
-    oid = ObjectIdentifier(der.decode_oid(identifier.content))
+    oid = ObjectIdentifier(der.decode_oid(identifier))
     return oid, any(value.content != b"\0" for value in flag), content.content
 
 
@@ -635,7 +652,7 @@ def _extended_key_usage(content: bytes) -> x509.ExtendedKeyUsage:
     parts = _inside(content)
     if any(part.tag != der.OID for part in parts):
         raise ValueError("not a purpose")
-    return x509.ExtendedKeyUsage(ObjectIdentifier(der.decode_oid(p.content)) for p in parts)
+    return x509.ExtendedKeyUsage(ObjectIdentifier(der.decode_oid(p)) for p in parts)
 
 
 def _name_constraints(content: bytes) -> None:

@@ -6,11 +6,13 @@ import base64
 import random
 import re
 import shutil
+import subprocess
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives.serialization import Encoding
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -19,6 +21,7 @@ from sros_tool.keystore.describe import describe
 from sros_tool.keystore.lifecycle.create import create_enclaves
 from sros_tool.keystore.reader import open_enclave
 from sros_tool.pki import der
+from sros_tool.pki.certificates import load_certificate, load_der_certificate
 from tests.support.children import LONG
 from tests.support.long_form import some
 
@@ -150,3 +153,30 @@ def test_numbers_have_one_form(content: str, number: int | None) -> None:
 )
 def test_object_identifiers(dotted: str, content: str) -> None:
     assert der.encode_oid(dotted).hex() == content
+
+
+DAMAGED_PARTS = {
+    "the signature algorithm": ("2a8648ce3d040302", "2a8648ce3d040382"),
+    "no signature algorithm": ("300a06082a8648ce3d040302", "300a04082a8648ce3d040302"),
+    "the type of an attribute of a name": ("0603550403", "0603550483"),
+    "an extension": ("0603551d13", "0603551d93"),
+    "the algorithm of the key": ("2a8648ce3d0201", "2a8648ce3d0281"),
+    "the curve of the key": ("2a8648ce3d030107", "2a8648ce3d030187"),
+    "unused bits of the key": ("034200", "034245"),
+}
+
+
+@pytest.mark.parametrize("part", DAMAGED_PARTS)
+def test_a_certificate_that_openssl_cannot_read_is_refused(part: str, keystore: Path) -> None:
+    """It makes a document that embeds it unreadable, also if it is not the signer's."""
+    pem = (keystore / "public/permissions_ca.cert.pem").read_bytes()
+    whole = load_certificate(pem, "a CA").public_bytes(Encoding.DER)
+    before, after = map(bytes.fromhex, DAMAGED_PARTS[part])
+    assert before in whole
+    with pytest.raises(PkiError, match="a certificate in it cannot be read"):
+        load_der_certificate(whole.replace(before, after, 1))
+    assert subprocess.run(
+        ["openssl", "x509", "-inform", "DER", "-noout"],
+        input=whole.replace(before, after, 1),
+        capture_output=True,
+    ).returncode

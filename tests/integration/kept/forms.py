@@ -217,7 +217,7 @@ class _Writer:
     def _signature(self, signature: bytes, algorithm: der.Value, *signed: bytes) -> str:
         """Tell which key made a signature, if the algorithm is one that is known here."""
         parts = _children(algorithm)
-        digest = _HASHES.get(der.decode_oid(parts[0].content)) if parts else None
+        digest = _HASHES.get(der.decode_oid(parts[0])) if parts else None
         if digest is None:
             return signature.hex()
         for info, key in sorted(self._keys.items(), key=lambda each: each[0] != self._signer):
