@@ -28,6 +28,7 @@ from sros_tool.runtime.processes import (
     RunningProcesses,
     UnseenProcess,
 )
+from sros_tool.runtime.rmw import RMW
 from sros_tool.terminal import visible
 from tests.checks.zenoh_cases import sound
 from tests.close.test_assignment import process
@@ -86,7 +87,11 @@ def test_the_command_of_a_secured_process_takes_the_place_of_the_observed_one(
 
     A command that starts a node later would otherwise be one that the robot does not use any more.
     """
-    origins = {99: ProcessOrigin("pilot.service", "/new")}
+    origins = {
+        99: ProcessOrigin("pilot.service", "/new"),
+        98: ProcessOrigin("", "/new", ("ros2", "launch", "a")),
+        97: ProcessOrigin("", "/new", (), "c0ffee"),
+    }
     monkeypatch.setattr(
         state, "process_origin", lambda pid: origins.get(pid, ProcessOrigin("", "/new"))
     )
@@ -101,20 +106,24 @@ def test_the_command_of_a_secured_process_takes_the_place_of_the_observed_one(
         observed = ObservedProcesses(0, known)
         now = RunningRobot(robot, RunningProcesses(running)).with_later_processes(observed)
         assert len(now.processes) == len(known)
-        return " ".join(now.processes[0].command), now.processes[0].folder
+        first = now.processes[0]
+        return " ".join(first.command), f"{first.folder} {first.rmw}".rstrip()
 
     assert command_after([before], camera) == ("pilot --camera", "/new")
+    cyclone = replace(camera, environment={RMW: "rmw_cyclonedds_cpp"})
+    assert command_after([before], cyclone) == ("pilot --camera", "/new rmw_cyclonedds_cpp")
     ros2 = replace(camera, command=("/usr/bin/python3", "/opt/ros/bin/ros2", "topic", "echo"))
     for known, running in (
         ([before], (camera, other)),
         ([before], (camera, replace(camera, pid=9, command=("pilot",)))),
         ([before], (replace(camera, user=4321),)),
-        ([before], (replace(camera, pid=99),)),
+        *(([before], (replace(camera, pid=pid),)) for pid in origins),
         ([before], (ros2,)),
         ([before], (replace(camera, enclave=replace(enclave, folders=((1, 1),))),)),
         ([before, before._replace(pid=6)], (camera,)),
         ([before._replace(unit="pilot.service")], (camera,)),
         ([before._replace(launch=("ros2", "launch", "a"))], (camera,)),
+        ([before._replace(container="c0ffee")], (camera,)),
         ([before._replace(shares=("/x",))], (camera,)),
     ):
         assert command_after(known, *running) == ("pilot", "/opt"), (known, running)

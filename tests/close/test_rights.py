@@ -14,11 +14,16 @@ def test_wildcards_and_denials_count_in_what_is_shown(tmp_path: Path) -> None:
         "/a": publish("/odom"),
         "/b": subscribe("/odom"),
         "/look": subscribe("/*"),
+        "/mute": publish("/tf") + publish("/tf").replace("ALLOW", "DENY"),
         "/not": subscribe("/*") + subscribe("/odom").replace("ALLOW", "DENY"),
     })  # fmt: skip
     (tmp_path / "p.xml").write_text(text)
     lines = access_lines(read_policy(tmp_path / "p.xml"), tmp_path)
-    assert lines == ["topic /odom: /a -> /b, /look", "topic /*: in part /a -> /look, /not"]
+    assert lines == [
+        "topic /odom: /a -> /b, /look",
+        "topic /*: in part /a -> /look, /not",
+        "topic /tf: nobody -> /look, /not",
+    ]
 
 
 def test_all_who_may_move_the_robot_are_shown_first(tmp_path: Path) -> None:
