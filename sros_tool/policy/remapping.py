@@ -101,7 +101,8 @@ def remapped_policies(
     rules = [parse_remapping(text) for text in texts]
     policies = tuple(policies)
     moved = {use for policy in policies for use in remapped_policy(policy, rules)[1] if use.kind}
-    remapped = [remapped_policy(policy, rules, moved) for policy in policies]
+    stated = {right for policy in policies for right in policy_rights(policy)}
+    remapped = [remapped_policy(policy, rules, moved, stated) for policy in policies]
     notes = []
     for rule in rules:
         uses = {use for _, of_policy in remapped for use in of_policy if use.rule == rule}
@@ -159,16 +160,20 @@ def _notes_on_old_names(
 
 
 def remapped_policy(
-    policy: Policy, rules: Sequence[Remapping], moved_names: Collection[UsedRule] = ()
+    policy: Policy,
+    rules: Sequence[Remapping],
+    moved_names: Collection[UsedRule] = (),
+    stated: Iterable[Right] = (),
 ) -> tuple[Policy, set[UsedRule]]:
     """Return a policy with remapped names, and the uses of the rules.
 
     Where a wildcard matches the old name, the new name is added to the wildcard.  The names in
     ``moved_names``, of any node, are also added to each DENY that matches the old one.  An old name
-    stays denied where a wildcard of its enclave would allow it.
+    stays denied where a wildcard of its enclave, among the rights ``stated`` by all policies, would
+    allow it.
     """
     used: set[UsedRule] = set()
-    wildcards = Rules(right for right in policy_rights(policy) if is_expression(right.name))
+    wildcards = Rules(right for right in stated if is_expression(right.name))
 
     def remapped(enclave: str, profile: Profile) -> Profile:
         renamed = [rule for rule in rules if rule.old == _NODE and rule.node in ("", profile.node)]

@@ -136,9 +136,11 @@ def test_a_wildcard_does_not_allow_an_old_name_that_was_denied(
     rules: list[str], denied: set[str]
 ) -> None:
     """Without its DENY, the old name would be allowed, and another node's may be called so."""
-    policy = one(group("topics", "/*", publish="ALLOW"), group("topics", "x", publish="DENY"))
-    (remapped,), _ = remapped_policies([policy], rules)
-    assert {right.name for right in policy_rights(remapped) if right.qualifier is DENY} == denied
+    groups = group("topics", "/*", publish="ALLOW"), group("topics", "x", publish="DENY")
+    for stated in ([one(*groups)], [one(each) for each in groups]):
+        remapped, _ = remapped_policies(stated, rules)
+        rights = {right for policy in remapped for right in policy_rights(policy)}
+        assert {right.name for right in rights if right.qualifier is DENY} == denied
 
 
 def test_a_denial_of_an_old_name_in_the_file_is_told() -> None:
