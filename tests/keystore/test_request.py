@@ -24,6 +24,7 @@ from sros_tool.keystore.delivery.archive import MAX_MEMBER, MAX_UNPACKED, pack, 
 from sros_tool.keystore.delivery.robot import create_request, import_answer
 from sros_tool.keystore.delivery.signing import Signed, certify_requests, sign_request
 from sros_tool.keystore.describe import history
+from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.layout import SEAL, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, create_permission
 from sros_tool.keystore.lifecycle.renew import renew
@@ -476,6 +477,22 @@ def test_an_answer_with_a_replaced_ca_needs_force(home: Path, robot: Path, tmp_p
         import_answer(robot, old, now=LATER)
     assert snapshot(robot) == before
     import_answer(robot, old, now=LATER, force=True)
+
+
+def test_an_older_ca_of_a_rotation_is_not_said_to_come_from_a_backup(
+    home: Path, robot: Path, tmp_path: Path
+) -> None:
+    """A robot cannot tell an existing CA, to which the keystore rotates, from a replaced one."""
+    import_answer(robot, sign(home, robot).archive, now=NOW)
+    other = tmp_path / "other"
+    create_keystore(other, template=load_template("production"), now=NOW - timedelta(days=9))
+    existing = {"identity": (other / "public/identity_ca.cert.pem").read_bytes()}
+    key = Keyring(places={"identity": f"file:{other}/private/identity_ca.key.pem"})
+    rotate_ca(home, roles=("identity",), now=LATER, existing=existing, new_keys=key)
+    answer = sign(home, robot, LATER, renew=True).archive
+    with pytest.raises(KeystoreError, match=r"may come from a backup.*If this CA is right"):
+        import_answer(robot, answer, now=LATER)
+    import_answer(robot, answer, now=LATER, force=True)
 
 
 def test_an_answer_with_another_list_of_the_same_number_needs_force(

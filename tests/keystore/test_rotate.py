@@ -326,7 +326,10 @@ def test_no_existing_ca_that_robots_would_take_for_a_replaced_one(
     ca = {"identity": (other / "public/identity_ca.cert.pem").read_bytes()}
     key = Keyring(places={"identity": f"file:{other}/private/identity_ca.key.pem"})
     rotate = partial(rotate_ca, separate, roles=["identity"], now=NOW, existing=ca, new_keys=key)
-    assert rotate(dry_run=True).stage is RotationStage.DISTRIBUTE, "no robot fetches"
+    without_fetching = rotate(dry_run=True)
+    assert without_fetching.stage is RotationStage.DISTRIBUTE
+    (note,) = (note for note in without_fetching.notes if note.id == "rotation.older-ca")
+    assert "the first `sros import` on each robot needs --force" in note.text
     (separate / FLEET_ROOT).parent.mkdir(exist_ok=True)
     (separate / FLEET_ROOT).touch()
     with pytest.raises(KeystoreError, match="is valid from before the identity CA"):

@@ -586,10 +586,12 @@ def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certifica
         if retired := retired_authorities(trusted, sent_cas):
             raise KeystoreError(
                 f"the answer for enclave {answer.name} goes back to an earlier {role} CA",
-                f"A later CA here replaced {authority_text(retired[0])}: the keystore comes from a "
-                "backup. With the earlier CA, what was revoked since would be trusted again.",
-                "Replace the CA again on the keystore machine: docs/howto/keystore_is_lost.md says "
-                "how. Or add --force to go back to the earlier CA.",
+                f"It trusts {authority_text(retired[0])}, which is older than a CA here: the "
+                "keystore may come from a backup. With a CA that was replaced, what was revoked "
+                "since would be trusted again.",
+                "If it comes from a backup, replace the CA again on the keystore machine: "
+                "docs/howto/keystore_is_lost.md says how. If this CA is right, because `sros "
+                "rotate_ca --identity-ca` or --permissions-ca named it, add --force.",
             )
     if older := older_list(*_lists_here_and_sent(place, answer)):
         here, _ = older

@@ -973,13 +973,22 @@ def _make_successor(
     first = validity_of(old[0]).not_before
     if existing := next((wanted.existing[r] for r in roles if r in wanted.existing), b""):
         certificate = _existing_ca(change, roles, existing, key, name)
-        if validity_of(certificate).not_before < first and publish_command(change.root):
-            raise KeystoreError(
+        if validity_of(certificate).not_before < first:
+            older = (
                 f"{authority_text(certificate)} is valid from before the {_ca_name(roles)} that it "
-                "would replace",
-                "Robots that fetch would take it for a CA that was replaced, and refuse it.",
-                "Make a new CA: leave out its certificate.",
+                "would replace"
             )
+            if publish_command(change.root):
+                raise KeystoreError(
+                    older,
+                    "Robots that fetch would take it for a CA that was replaced, and refuse it.",
+                    "Make a new CA: leave out its certificate.",
+                )
+            text = (
+                f"{older}, so robots take it for a CA that was replaced: the first `sros import` "
+                "on each robot needs --force, and the play `deliver` sros_replace_authorities."
+            )
+            change.notes.append(Note("rotation.older-ca", text))
     else:
         later = replace(validity, not_before=max(validity.not_before, first))
         certificate = issue_ca(key, name, later)
