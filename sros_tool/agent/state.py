@@ -24,7 +24,12 @@ from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import COULD_NOT_START
 from sros_tool.keystore.delivery.published import MOST_NUMBER
 from sros_tool.keystore.delivery.release import sealed_robot
-from sros_tool.keystore.layout import RELEASE_SEAL, enclave_names
+from sros_tool.keystore.layout import (
+    RELEASE_SEAL,
+    enclave_names,
+    enclave_path,
+    waits_for_answer,
+)
 from sros_tool.names import check_enclave_name
 from sros_tool.validity import parse_iso
 from sros_tool.values import DryRun, FileChanges, Notes, as_plain, parse_json
@@ -303,9 +308,9 @@ def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStat
 
 def _seen_now(folder: Path, state: AgentState, now: datetime) -> Iterator[str]:
     """Yield sentences on what is wrong with the files now, but not what the last round said."""
-    names = enclave_names(folder)
+    names = [n for n in enclave_names(folder) if not waits_for_answer(enclave_path(folder, n))]
     for name in sorted(state.files.keys() - {*names}):
-        yield f"{name} was here in the last round of the agent, and is missing now."
+        yield f"{name} had a certificate in the last round of the agent, and has none now."
     known = {*state.problems}
     subjects = {text.partition(COULD_NOT_START)[0] for text in known if COULD_NOT_START in text}
     for sentence in installed_sentences(folder, names, now):

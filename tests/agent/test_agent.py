@@ -226,9 +226,12 @@ def test_rounds_follow_what_home_publishes(home: Home, r1: Robot) -> None:
     (folder / "key.pem").chmod(0o644)
     (readable,) = agent_status(r1.folder, now=moment(), oldest=timedelta(days=1)).problems
     assert "enclaves/r1/a/key.pem" in readable
-    shutil.rmtree(folder)
-    (gone,) = agent_status(r1.folder, now=moment(), oldest=timedelta(days=1)).problems
-    assert gone == "/r1/a was here in the last round of the agent, and is missing now."
+    (folder / "key.pem").chmod(0o600)
+    (folder / "request.pem").touch()
+    for remove, path in ((os.remove, folder / "cert.pem"), (shutil.rmtree, folder)):
+        remove(path)
+        (gone,) = agent_status(r1.folder, now=moment(), oldest=timedelta(days=1)).problems
+        assert gone == "/r1/a had a certificate in the last round of the agent, and has none now."
 
 
 def test_a_server_that_refuses_one_certificate_of_the_robot(
