@@ -26,6 +26,7 @@ from sros_tool.keystore import transaction
 from sros_tool.keystore.delivery import publish as publishing
 from sros_tool.keystore.delivery.export import ReleasedEnclave
 from sros_tool.keystore.delivery.export import released_enclave as evaluate
+from sros_tool.keystore.delivery.publish import publish
 from sros_tool.keystore.delivery.published import (
     MetadataExpiry,
     PublishedRelease,
@@ -855,6 +856,56 @@ def test_a_publishing_folder_that_was_lost(publisher: Home) -> None:
     assert all(number > before[robot] for robot, number in numbers(publisher).items())
     assert robot.gets() == publisher.robot().gets()
     assert not publisher.publish(new_folder=True).names("published")
+
+
+def test_two_folders_in_turn(publisher: Home, tmp_path: Path) -> None:
+    """Robots can fetch from each folder that was published, also where the last one is not here."""
+    robot, stick, pub = publisher.robot(), tmp_path / "stick", publisher.pub
+    publish(publisher.root, stick, now=publisher.now, new_folder=True)
+    release = robot.gets(stick)
+    result = publisher.publish()
+    assert (result.names("kept"), result.notes) == (["r1", "r2", "r5"], ())
+    assert robot.gets() == release
+    publisher.run("renew", "ks", "/r1/base")
+    assert publisher.publish().names("published") == ["r1"]
+    pub.rename(tmp_path / "elsewhere")
+    publish(publisher.root, stick, now=publisher.now + LATER)
+    assert robot.gets(stick, now=publisher.now + LATER).number > release.number
+    (tmp_path / "elsewhere").rename(pub)
+    publisher.run("revoke", "ks", "--robot", "r1")
+    assert publisher.publish(2 * LATER).names("removed") == ["r1"]
+    publisher.robot("r2").gets()
+
+
+def test_a_refused_robot_in_another_folder(publisher: Home, tmp_path: Path) -> None:
+    """The metadata names no archive that is not there."""
+    stick = tmp_path / "stick"
+    publish(publisher.root, stick, now=publisher.now, new_folder=True)
+    (publisher.root / "enclaves/r1/base/permissions.p7s").write_bytes(b"x")
+    shutil.rmtree(stick)
+    result = publisher.publish()
+    assert [(robot.robot, robot.number) for robot in result.robots if robot.why] == [("r1", None)]
+    publisher.robot("r1").refuses(FetchProblem.NOT_FOR_ROBOT)
+    publisher.robot("r2").gets()
+
+
+def test_what_the_timestamp_would_lead_to_is_not_there(
+    publisher: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = publisher.robot().gets()
+    publisher.run("renew", "ks", "/r1/base")
+    put = publishing._put_file
+    with monkeypatch.context() as patched:
+        patched.setattr(
+            publishing,
+            "_put_file",
+            lambda folder, path, data: path.endswith(".snapshot.json") or put(folder, path, data),
+        )
+        with pytest.raises(KeystoreError, match=r"lacks metadata/[0-9]+\.snapshot\.json, which"):
+            publisher.publish()
+    assert publisher.robot().gets() == before
+    publisher.publish()
+    assert publisher.robot().gets().number > before.number
 
 
 @pytest.mark.parametrize("backup_published", [False, True])

@@ -967,6 +967,10 @@ def test_a_publishing_folder_that_lost_its_files_is_not_in_order(home: Home) -> 
     status = ("fleet", "status", "ks")
     sros(*status, cwd=home.folder).ok()
     pub, archive = home.folder / "pub", published.robots["r2"].release.path("r2")
+    targets = next((pub / "metadata").glob("*.targets.json"))
+    targets.rename(home.folder / "kept")
+    assert f"lacks metadata/{targets.name}, which" in sros(*status, cwd=home.folder).out
+    (home.folder / "kept").rename(targets)
     publish = ("fleet", "publish", "ks", str(pub))
     command = f"`sros {' '.join(publish)}`"
     (pub / archive).unlink()

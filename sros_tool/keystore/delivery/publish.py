@@ -462,7 +462,11 @@ class _Changed(NamedTuple):
 
 
 class _ReleaseOutcome(NamedTuple):
-    """Outcome of publishing a robot's release; ``published`` is None if it was refused."""
+    """Outcome of publishing a robot's release.
+
+    ``why`` says why it was refused, else it is empty.  ``published`` is the release that the robot
+    has from now on; None if it has none, because the first or the only archive is not there.
+    """
 
     robot: str
     published: PublishedRobot | None
@@ -583,7 +587,10 @@ class _Run:
         self.roots.follow(folder)
         self._has_later_root = len(self.roots.versions) > own
         self._folder = folder
+        self._earlier_folder = self.list.folder
         self.list.folder = os.path.abspath(folder)  # noqa: PTH100 - keeps a link as it is named
+        if self.list.folder != self._earlier_folder:
+            self.list.superseded.clear()
         self._now = now
         self._dry_run = dry_run
         try:
@@ -1003,7 +1010,7 @@ class _Run:
                 changed_robots.append(_Changed(robot, names, state))
             elif not self._has_files_of(robot, before.release):
                 changed_robots.append(_Changed(robot, names, state))
-                self._damaged |= {robot} if robot in self._there else set()
+                self._damaged |= {robot} if self._there.get(robot) == before.release else set()
         known = self.list.robots.keys() | self._there.keys()
         gone = (known if among is None else looked_at) - wanted
         for name in gone:
@@ -1025,12 +1032,24 @@ class _Run:
         """Return whether the folder has the archive of a release, undamaged."""
         return bool(self._read(robot, release))
 
-    def _read(self, robot: str, release: PublishedRelease) -> bytes:
-        """Return the archive of a release; empty if it is missing or damaged."""
+    def _bring_files_of(self, robot: str, release: PublishedRelease) -> bool:
+        """Return whether the folder has a release; it is copied from the earlier folder if not."""
+        if self._has_files_of(robot, release):
+            return True
+        data = self._earlier_folder and self._read(robot, release, Path(self._earlier_folder))
+        if data and not self._dry_run:
+            with Folder(self._folder) as folder:
+                _put_file(folder, release.path(robot), data)
+        return bool(data)
+
+    def _read(self, robot: str, release: PublishedRelease, folder: Path | None = None) -> bytes:
+        """Return the archive of a release; empty if it is missing or damaged.
+
+        ``folder`` is the publishing folder if None is given.
+        """
+        path = (folder or self._folder) / release.path(robot)
         try:
-            data = read_bytes(
-                self._folder / release.path(robot), "archive", max_bytes=release.length
-            )
+            data = read_bytes(path, "archive", max_bytes=release.length)
         except SrosError:
             return b""
         return data if hashlib.sha256(data).hexdigest() == release.sha256 else b""
@@ -1065,6 +1084,7 @@ class _Run:
             self._notes.append(Note("fleet.archive-damaged", text))
         lines = []
         for robot, published, is_new, _, not_valid in self._made:
+            self.list.robots.pop(robot, None)
             if published:
                 self.list.robots[robot] = published
             if published and is_new:
@@ -1087,13 +1107,16 @@ class _Run:
             try:
                 files = evaluator.files(robot.enclaves, before.evaluated if before else None)
             except SrosError as error:
-                yield _ReleaseOutcome(robot.robot, None, why=str(error))
+                kept = (
+                    before if before and self._bring_files_of(robot.robot, before.release) else None
+                )
+                yield _ReleaseOutcome(robot.robot, kept, why=str(error))
                 continue
             content = hashlib.sha256(listed_digests(files.files)).hexdigest()
             if (
                 before
                 and before.content == content
-                and self._has_files_of(robot.robot, before.release)
+                and self._bring_files_of(robot.robot, before.release)
             ):
                 kept = before._replace(files=robot.state, evaluated=files.evaluated)
                 yield _ReleaseOutcome(robot.robot, kept)
@@ -1138,6 +1161,10 @@ class _Run:
         releases = {name: robot.release for name, robot in self.list.robots.items()}
         self._composed = composer.compose(releases)
         self.list.versions = dict(self._composed.versions)
+        self.list.metadata = sorted(
+            f"{_METADATA}/{self.list.versions[name]}.{name}.json"
+            for name in self._composed.expires.keys() - {"timestamp"}
+        )
         self.list.root_until = keys.roots.last.expires
         self.list.until = min(*self._composed.expires.values(), self.list.root_until)
         needed = {release.path(robot) for robot, release in releases.items()}
@@ -1195,6 +1222,13 @@ class _Run:
             for path, data in (*([] if roots_after_timestamp else roots), *files):
                 _put_file(folder, path, data)
             folder.flush_file_system()
+            missing = (path for path in self.list.paths() if not folder.state(path))
+            if path := next(missing, ""):
+                raise KeystoreError(
+                    f"'{self._folder}' lacks {path}, which robots would fetch next",
+                    "Somebody has removed it just now. Robots still find all earlier files.",
+                    "Find out who else changes files there, and publish again.",
+                )
             _put_file(folder, *timestamp)
             for path, data in roots_after_timestamp:
                 _put_file(folder, path, data)
@@ -1212,13 +1246,10 @@ class _Run:
         for robot, kept in self.list.robots.items():
             outcomes[robot] = RobotRelease(robot, "kept", kept.release.number, "")
         for robot, published, is_new, why, _ in self._made:
-            before = self._there.get(robot)
-            if published is None:
-                number = before.number if before else None
-                outcomes[robot] = RobotRelease(robot, "refused", number, why)
-            elif is_new:
-                number = published.release.number
-                outcomes[robot] = RobotRelease(robot, "published", number, "")
+            if is_new or why:
+                number = published.release.number if published else None
+                outcome = "refused" if why else "published"
+                outcomes[robot] = RobotRelease(robot, outcome, number, why)
         path, data = list(self.roots.files())[-1]
         return PublishedFleet(
             self.keystore.root,

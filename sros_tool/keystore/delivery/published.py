@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
@@ -105,8 +105,9 @@ class Published:
 
     ``superseded`` maps paths in the publishing folder that nothing names any more to the time when
     that was first seen.  ``folder`` is the absolute path of the publishing folder, "" if unknown.
-    ``until`` is the first expiry of the metadata: from then on, robots refuse it; ``root_until`` is
-    the expiry of the root metadata.  They are None if nothing was published, or by a release of
+    ``metadata`` has the paths there of the metadata to which the timestamp leads.  ``until`` is the
+    first expiry of the metadata: from then on, robots refuse it; ``root_until`` is the expiry of
+    the root metadata.  These three are empty or None if nothing was published, or by a release of
     sros that did not record them.
     """
 
@@ -114,6 +115,7 @@ class Published:
     versions: dict[str, int] = field(default_factory=dict)
     superseded: dict[str, datetime] = field(default_factory=dict)
     folder: str = ""
+    metadata: Sequence[str] = ()
     until: datetime | None = None
     root_until: datetime | None = None
 
@@ -122,13 +124,17 @@ class Published:
         """The highest number of a release; 0 without one."""
         return max((robot.release.number for robot in self.robots.values()), default=0)
 
+    def paths(self) -> Iterator[str]:
+        """Yield the paths in the publishing folder that robots fetch after the timestamp."""
+        yield from self.metadata
+        yield from (robot.release.path(name) for name, robot in sorted(self.robots.items()))
+
     def lacking(self) -> str:
         """Return the first file that is missing in the publishing folder; "" if none is.
 
         Also "" if the folder is not here, such as one on a disk that is not mounted.
         """
-        releases = sorted(self.robots.items())
-        paths = (_TIMESTAMP, *(robot.release.path(name) for name, robot in releases))
+        paths = (_TIMESTAMP, *self.paths())
         with suppress(OSError):
             if self.folder and Path(self.folder).is_dir():
                 return next((path for path in paths if not Path(self.folder, path).exists()), "")
@@ -145,6 +151,7 @@ class Published:
             "until": iso(self.until) if self.until else None,
             "root_until": iso(self.root_until) if self.root_until else None,
             "versions": dict(sorted(self.versions.items())),
+            "metadata": list(self.metadata),
         }
         return json.dumps({**value, "superseded": superseded, "robots": robots}).encode()
 
@@ -165,6 +172,7 @@ def read_published(keystore: OpenedKeystore) -> Published:
             {name: check_count(version) for name, version in value["versions"].items()},
             {path: parse_iso(time) for path, time in value["superseded"].items()},
             str(value.get("folder", "")),
+            [str(path) for path in value.get("metadata", ())],
             *(
                 parse_iso(end) if (end := value.get(name)) else None
                 for name in ("until", "root_until")

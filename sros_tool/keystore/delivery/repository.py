@@ -376,7 +376,7 @@ class Composer:
         for name, content in targets.items():
             old = self._present.bins.get(name)
             same_key = old is not None and key.keyid in old.signatures
-            if same_key and old and old.signed.targets == content and self._is_valid_for_long(old):
+            if same_key and old and old.signed.targets == content and self._is_current(name, old):
                 self._expires[name] = old.signed.expires
             else:
                 self._add(name, Targets(targets=content), self._signers[_TARGETS][:1])
@@ -400,16 +400,20 @@ class Composer:
             bits = bits if bits > kept + 1 else kept
         return SuccinctRoles([self._signers[_TARGETS][0].public_key.keyid], 1, bits, _BINS)
 
-    def _is_valid_for_long(self, metadata: Metadata[_Content]) -> bool:
-        """Return whether more than half of the validity is left."""
+    def _is_current(self, name: str, metadata: Metadata[_Content]) -> bool:
+        """Return whether this is the last version of ``name``, and half of its validity is left.
+
+        The last version may be in another folder, to which the keystore has published since.
+        """
         signed = metadata.signed
-        return signed.expires - self._now > self._expiry.of(signed.type) / 2
+        lasts = signed.expires - self._now > self._expiry.of(signed.type) / 2
+        return lasts and signed.version == self.versions[name]
 
     def _can_be_kept(self, metadata: Metadata[_Content]) -> bool:
-        """Return whether top-level metadata can stay: it lasts, and each signer has signed it."""
+        """Return whether top-level metadata can stay: also each signer has signed it."""
         signers = self._signers[metadata.signed.type]
         signed = all(signer.public_key.keyid in metadata.signatures for signer in signers)
-        return signed and self._is_valid_for_long(metadata)
+        return signed and self._is_current(metadata.signed.type, metadata)
 
     def _add(self, name: str, content: _Content, signers: Sequence[CryptoSigner]) -> None:
         """Add a file with a new version of the metadata ``name``."""
