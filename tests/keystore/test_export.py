@@ -37,6 +37,7 @@ from sros_tool.keystore.lifecycle.rotation import RotationStage
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import KeystoreLock
+from sros_tool.pki.certificates import digest, load_certificate
 from sros_tool.pki.crl import load_crl
 from sros_tool.policy.document import read_policy
 from tests.support.harness import copy_of, policy_text, publish, snapshot, sros
@@ -201,6 +202,32 @@ def test_a_replaced_ca_does_not_replace_the_one_after_it(fleet: Path, tmp_path: 
     assert all(enclave.loadable for enclave in verify_arrival(robot, now=NOW).enclaves)
     (robot / "enclaves/base/identity_ca.cert.pem").write_text("damaged")
     assert distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True).changes
+
+
+@pytest.mark.parametrize("hours", [-1, 0, 1])
+def test_files_of_another_keystore_are_not_replaced(
+    hours: int, fleet: Path, tmp_path: Path
+) -> None:
+    """Its names are equal, and either may be older: the robot would lose CAs, list and peers."""
+    other, robot = tmp_path / "other", tmp_path / "robot"
+    revoke(fleet, ["/armada"], now=NOW)
+    distribute(OpenedKeystore(fleet), ["/base"], robot, now=NOW)
+    made, late = NOW + timedelta(hours=hours), NOW + timedelta(hours=2)
+    create_keystore(other, template=load_template("production"), now=made)
+    create_enclaves(other, ["/base"], now=made)
+    before = snapshot(robot)
+    for target in (robot, tmp_path / "robot.tar.gz"):
+        if target != robot:
+            distribute(OpenedKeystore(fleet), ["/base"], target, now=NOW)
+        with pytest.raises(KeystoreError) as said:
+            distribute(OpenedKeystore(other), ["/base"], target, now=late, force=True)
+        for keystore in (fleet, other):
+            data = (keystore / "public/identity_ca.cert.pem").read_bytes()
+            assert f"(SHA-256 {digest(load_certificate(data, 'CA'))[:8]})" in said.value.why
+    assert snapshot(robot) == before
+    for path in robot.rglob("*_ca.cert.pem"):
+        path.unlink()  # as the remedy says
+    assert distribute(OpenedKeystore(other), ["/base"], robot, now=late, force=True).changes
 
 
 def test_no_ca_is_trusted_again_after_a_rotation_of_one_role(fleet: Path, tmp_path: Path) -> None:

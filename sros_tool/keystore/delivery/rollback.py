@@ -1,7 +1,7 @@
 """Whether files would take a robot back to earlier CAs, revocation lists or keys: a rollback.
 
 Signatures and numbers do not show one: a keystore that was restored from a backup signs as before,
-and may have issued more since than the lost one.
+and may have issued more since than the lost one.  Files of another keystore are refused, too.
 """
 
 from __future__ import annotations
@@ -126,18 +126,30 @@ def check_rollback(
 ) -> None:
     """Raise `KeystoreError` if enclaves in ``target`` would trust again what they no longer trust.
 
-    ``present`` maps paths in ``target`` to the content of files, at least of CAs and lists.
+    Or if they trust only CAs of another keystore.  ``present`` maps paths in ``target`` to the
+    content of files, at least of CAs and lists.
     """
     if later := _later_authorities(keystore, present, files):
         path, authority = next(iter(later.items()))
         role = ROLES_OF_FILES[path.rpartition("/")[2]]
         raise KeystoreError(
             f"'{target / path}' has a later {role} CA than the keystore's",
-            f"It trusts {authority_text(authority)}, and the keystore is from before that: the "
-            "robot would trust the earlier CA again, and what was revoked since. Nothing was "
-            "changed.",
+            f"It trusts {authority_text(authority)}, and the keystore's CA is "
+            f"{_first_authority(files, path)}, from before that: the robot would trust the earlier "
+            "CA again, and what was revoked since. Nothing was changed.",
             "The keystore may come from a backup: docs/howto/keystore_is_lost.md says how to go "
-            f"on. If the keystore's CA is right, first {_removal_of(target, later)}",
+            "on; or the folder has its files from another keystore. If the keystore's CA is right, "
+            f"first {_removal_of(target, later)}",
+        )
+    if foreign := _foreign_authorities(keystore, present, files):
+        path, authority = next(iter(foreign.items()))
+        raise KeystoreError(
+            f"'{target / path}' trusts no CA that the keystore has or had",
+            f"It trusts {authority_text(authority)}, and the keystore's CA is "
+            f"{_first_authority(files, path)}: the robot could no longer communicate with "
+            "others of its keystore, and its revocation list would go. Nothing was changed.",
+            f"Export from the keystore that these files are from. If '{keystore.root}' is right, "
+            f"first {_removal_of(target, foreign)}",
         )
     if lost := _lost_revocations(keystore, present, files, now):
         path, (what, why) = next(iter(lost.items()))
@@ -168,6 +180,40 @@ def _removal_of(target: Path, paths: Iterable[str]) -> str:
         return f"remove the archive: `rm {quote(str(target))}`."
     files = " ".join(quote(str(target / path)) for path in paths)
     return f"remove the other: `rm {files}`."
+
+
+def _first_authority(files: Mapping[str, bytes], path: str) -> str:
+    return authority_text(load_certificates(files[path], path)[0])
+
+
+def _foreign_authorities(
+    keystore: OpenedKeystore, present: Mapping[str, bytes], files: Mapping[str, bytes]
+) -> Mapping[str, x509.Certificate]:
+    """Map paths of CA files in ``present`` to a CA in them, for enclaves of another keystore.
+
+    Such an enclave trusts, in both roles, only CAs that are neither in the ledger nor in ``files``.
+    A role alone does not show it: the keystore may be a backup whose CA was replaced since.
+    """
+    entries = keystore.ledger_with("what", "ca").entries
+    recorded = {entry.sha256 for entry in entries if entry.what == "ca"}
+    trusted: dict[str, dict[str, Sequence[x509.Certificate]]] = defaultdict(dict)
+    keys: set[str] = set()
+    for path, data in files.items():
+        folder, _, file = path.rpartition("/")
+        if file in ROLES_OF_FILES:
+            keys.update(map(authority_key, load_certificates(data, path)))
+            with suppress(SrosError):  # a damaged file trusts nobody
+                trusted[folder][path] = load_certificates(present.get(path, b""), path)
+    return {
+        path: authorities[0]
+        for of_enclave in trusted.values()
+        if not any(
+            digest(authority) in recorded or authority_key(authority) in keys
+            for authorities in of_enclave.values()
+            for authority in authorities
+        )
+        for path, authorities in of_enclave.items()
+    }
 
 
 def _later_authorities(
