@@ -952,15 +952,49 @@ def test_a_restore_in_which_nothing_shows_what_was_revoked_says_since_when(
     assert not publisher.publish().notes
 
 
+@pytest.mark.parametrize("has_metadata", [False, True])
+def test_a_restored_keystore_publishes_to_no_other_folder(
+    publisher: Home, tmp_path: Path, has_metadata: bool
+) -> None:
+    """The last folder shows that it is older; a change of folder would hide that."""
+    stick = tmp_path / "stick"
+    if has_metadata:
+        publish(publisher.root, stick, now=publisher.now, new_folder=True)
+    publisher.publish()
+    backup = copy_of(publisher.root, publisher.folder / "backup")
+    publisher.run("revoke", "ks", "--robot", "r5")
+    publisher.publish()
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    before = snapshot(publisher.root)
+    for restored in (False, True):
+        with pytest.raises(
+            KeystoreError, match=r"'.*pub' has later releases: r1, r2, up"
+        ) as refused:
+            publish(
+                publisher.root,
+                stick,
+                now=publisher.now,
+                restored=restored,
+                new_folder=not has_metadata,
+            )
+        assert f"`sros fleet publish {publisher.root} {publisher.pub}`" in refused.value.remedy
+    assert snapshot(publisher.root) == before
+    publisher.publish(restored=True)
+    publish(publisher.root, stick, now=publisher.now, new_folder=not has_metadata)
+    publisher.robot("r5").refuses(FetchProblem.NOT_FOR_ROBOT, stick)
+    publisher.robot("r1").gets(stick)
+
+
 def test_all_unknown_releases_in_a_folder_without_metadata_revoke(publisher: Home) -> None:
     """Also if the last one is of another copy of the keystore, which revoked nothing."""
     backup = copy_of(publisher.root, publisher.folder / "backup")
     copy = copy_of(publisher.root, publisher.folder / "copy")
-    publisher.run("revoke", "ks", "--robot", "r5")
-    publisher.publish()
     for _ in range(2):
         publisher.run("renew", copy, "--all")
     publisher.run("fleet", "publish", copy, "other", "--new-folder")
+    publisher.run("revoke", "ks", "--robot", "r5")
+    publisher.publish()
     shutil.copytree(
         publisher.folder / "other/targets", publisher.pub / "targets", dirs_exist_ok=True
     )

@@ -989,6 +989,21 @@ def test_a_publishing_folder_that_lost_its_files_is_not_in_order(home: Home) -> 
     assert "lacks" not in sros(*status, cwd=home.folder).out, "it may be on another disk"
 
 
+def test_messages_that_show_later_releases_refuse_a_new_folder(home: Home) -> None:
+    """A robot that was revoked after the backup would get a release again."""
+    home.run("fleet", "publish", "ks", "pub")
+    later = read_published(OpenedKeystore(home.root)).number + 1
+    home.send("r1", datetime.now(UTC), release=later)
+    home.run("fleet", "collect", "ks", "inbox")
+    (home.folder / "pub").rename(home.folder / "lost")
+    for folder in ("pub", "stick"):
+        publish = ("fleet", "publish", "ks", folder, "--new-folder")
+        refused = sros(*publish, cwd=home.folder)
+        assert refused.status == 2
+        assert "messages of robots show that the keystore 'ks' is older" in refused.err
+    sros(*publish, "--restored", cwd=home.folder).ok()
+
+
 def test_what_was_published_expires(home: Home) -> None:
     """Robots then refuse it: a fleet whose files are all current is not in order."""
     status = ("fleet", "status", "ks")

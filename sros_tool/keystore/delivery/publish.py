@@ -589,7 +589,7 @@ class _Run:
         self._folder = folder
         self._earlier_folder = self.list.folder
         self.list.folder = os.path.abspath(folder)  # noqa: PTH100 - keeps a link as it is named
-        if self.list.folder != self._earlier_folder:
+        if self._is_other_folder:
             self.list.superseded.clear()
         self._now = now
         self._dry_run = dry_run
@@ -627,7 +627,8 @@ class _Run:
 
         With ``restored`` (the keystore comes from a backup), later releases are not refused, and
         the enclaves that they revoke are revoked again.  A folder without any release is refused
-        without ``new_folder``.  In both cases, numbers and versions go on from the seconds since
+        without ``new_folder``, and another folder than last time as long as that one has later
+        releases.  In both cases, numbers and versions go on from the seconds since
         1970, because the numbers that the earlier keystore gave are not known.
 
         Raises:
@@ -644,6 +645,10 @@ class _Run:
             self._check_seals()
         if is_lost and not new_folder:
             raise self._nothing_published_error()
+        if self._is_other_folder:
+            self._check_earlier_folder()
+        if (is_lost or self._is_other_folder) and not restored and self._robots_show_restore():
+            raise self._older_than_robots_error()
         is_later = self._has_later_releases(restored)
         if restored and not (is_later or unknown or new_folder or self._shows_restore()):
             raise self._not_restored_error()
@@ -671,6 +676,10 @@ class _Run:
         known, present = self.list.versions, self._present.versions()
         if self._has_later_root or any(present.get(name, 0) > known[name] for name in known):
             return True
+        return self._robots_show_restore()
+
+    def _robots_show_restore(self) -> bool:
+        """Return whether the ledger or a robot shows that the keystore was restored."""
         entries = self.keystore.ledger_with("what", "release").entries
         last = max((entry.number for entry in entries if entry.what == "release"), default=0)
         if self._learned_after_restore():
@@ -683,6 +692,37 @@ class _Run:
                     if (sent.release or 0) > last or any(OF_SAME_NUMBER in e for e in problems):
                         return True
         return False
+
+    @property
+    def _is_other_folder(self) -> bool:
+        """Whether the keystore published to another folder last."""
+        return self._earlier_folder not in ("", self.list.folder)
+
+    def _check_earlier_folder(self) -> None:
+        """Refuse another folder while the one of the last publication has later releases.
+
+        From then on, nothing would look there, and publishing there would be no evidence any more.
+        """
+        if evidence := later_in_folder(self.keystore):
+            where = f"{quote(str(self.keystore.root))} {quote(self._earlier_folder)}"
+            raise KeystoreError(
+                evidence,
+                f"The keystore was restored from a backup, or is a copy. Publishing to "
+                f"'{self._folder}' would undo later changes, such as a revocation.",
+                f"Restore a later backup. If there is none, first run `sros fleet publish {where}`,"
+                " which says what to do.",
+            )
+
+    def _older_than_robots_error(self) -> KeystoreError:
+        where = quote(str(self.keystore.root))
+        return KeystoreError(
+            f"messages of robots show that the keystore '{self.keystore.root}' is older than they "
+            "are",
+            "The keystore was restored from a backup, or is a copy. Publishing to "
+            f"'{self._folder}' would undo later changes, such as a revocation.",
+            f"Restore a later backup. If there is none, run `sros fleet collect {where} INBOX`, "
+            "revoke again what was revoked, and add --restored.",
+        )
 
     def _learned_after_restore(self) -> bool:
         """Return whether the ledger has learned since its last release what the backup lacks."""
