@@ -399,11 +399,15 @@ def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
         yield f"and {counted(more, 'more request')}, see --json"
 
 
+_IN_WORDS = {"missing": "by hand or without a message"}
+
+
 def _outcome_numbers(numbers: Mapping[str, int], outcomes: Sequence[str], verb_form: str) -> str:
     """Return the number of messages or requests with each outcome, in words."""
     present_outcomes = (outcome for outcome in outcomes if numbers.get(outcome))
     return ", ".join(
-        f"{numbers[name]} {verb_form}{name.replace('_', ' ')}" for name in present_outcomes
+        f"{numbers[name]} {verb_form}{_IN_WORDS.get(name, name.replace('_', ' '))}"
+        for name in present_outcomes
     )
 
 

@@ -994,7 +994,8 @@ def test_messages_that_show_later_releases_refuse_a_new_folder(home: Home) -> No
     home.run("fleet", "publish", "ks", "pub")
     later = read_published(OpenedKeystore(home.root)).number + 1
     home.send("r1", datetime.now(UTC), release=later)
-    home.run("fleet", "collect", "ks", "inbox")
+    ended = sros("fleet", "collect", "ks", "inbox", cwd=home.folder).ok()
+    assert ended.out == "3 robots: 1 kept, 2 by hand or without a message\n"
     (home.folder / "pub").rename(home.folder / "lost")
     for folder in ("pub", "stick"):
         publish = ("fleet", "publish", "ks", folder, "--new-folder")
