@@ -532,7 +532,8 @@ def _names(certificate: x509.Certificate, *, is_leaf: bool) -> Iterator[x509.Gen
     """Yield a certificate's names that constraints apply to; None for a name that is unreadable."""
     subject = certificate.subject
     if subject.rdns:
-        yield x509.DirectoryName(subject)
+        readable_name = isinstance(subject, x509.Name)
+        yield x509.DirectoryName(subject) if readable_name else None
     for text in subject.get_attributes_for_oid(NameOID.EMAIL_ADDRESS):
         readable = _IA5_MAIL in subject.public_bytes() and str(text.value).isascii()
         yield x509.RFC822Name(str(text.value)) if readable else None

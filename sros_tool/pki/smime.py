@@ -70,24 +70,23 @@ _ANY_VALUES = (
 
 _DIGESTS: dict[bytes, hashes.HashAlgorithm] = {
     der.encode_oid(oid): algorithm
-    for algorithm, *oids in (
-        # The second one is of signatures with RSA, which OpenSSL takes for the same hash.
-        (hashes.SHA256(), "2.16.840.1.101.3.4.2.1", "1.2.840.113549.1.1.11"),
-        (hashes.SHA384(), "2.16.840.1.101.3.4.2.2", "1.2.840.113549.1.1.12"),
-        (hashes.SHA512(), "2.16.840.1.101.3.4.2.3", "1.2.840.113549.1.1.13"),
-        (hashes.SHA512_256(), "2.16.840.1.101.3.4.2.6", "1.2.840.113549.1.1.16"),
-        (hashes.SHA3_256(), "2.16.840.1.101.3.4.2.8", "2.16.840.1.101.3.4.3.14"),
-        (hashes.SHA3_384(), "2.16.840.1.101.3.4.2.9", "2.16.840.1.101.3.4.3.15"),
-        (hashes.SHA3_512(), "2.16.840.1.101.3.4.2.10", "2.16.840.1.101.3.4.3.16"),
+    for algorithm, oid in (
+        (hashes.SHA256(), "2.16.840.1.101.3.4.2.1"),
+        (hashes.SHA384(), "2.16.840.1.101.3.4.2.2"),
+        (hashes.SHA512(), "2.16.840.1.101.3.4.2.3"),
+        (hashes.SHA512_256(), "2.16.840.1.101.3.4.2.6"),
+        (hashes.SHA3_256(), "2.16.840.1.101.3.4.2.8"),
+        (hashes.SHA3_384(), "2.16.840.1.101.3.4.2.9"),
+        (hashes.SHA3_512(), "2.16.840.1.101.3.4.2.10"),
         # Read, never written: weak.
-        (hashes.SHA224(), "2.16.840.1.101.3.4.2.4", "1.2.840.113549.1.1.14"),
-        (hashes.SHA512_224(), "2.16.840.1.101.3.4.2.5", "1.2.840.113549.1.1.15"),
-        (hashes.SHA3_224(), "2.16.840.1.101.3.4.2.7", "2.16.840.1.101.3.4.3.13"),
-        (hashes.SHA1(), "1.3.14.3.2.26", "1.2.840.113549.1.1.5"),  # noqa: S303
-        (hashes.MD5(), "1.2.840.113549.2.5", "1.2.840.113549.1.1.4"),  # noqa: S303
+        (hashes.SHA224(), "2.16.840.1.101.3.4.2.4"),
+        (hashes.SHA512_224(), "2.16.840.1.101.3.4.2.5"),
+        (hashes.SHA3_224(), "2.16.840.1.101.3.4.2.7"),
+        (hashes.SHA1(), "1.3.14.3.2.26"),  # noqa: S303
+        (hashes.MD5(), "1.2.840.113549.2.5"),  # noqa: S303
     )
-    for oid in oids
 }
+"""Hashes of a signature.  Some releases of OpenSSL also take the names of signatures with RSA."""
 
 
 def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> bytes:
