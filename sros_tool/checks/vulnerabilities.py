@@ -235,11 +235,13 @@ def _counted_vulnerabilities(advisories: Sequence[Advisory], version: str) -> st
     major = numbers[0] if numbers else ""
     releases = Counter(advisory.fixed_in(numbers) if numbers else "" for advisory in advisories)
     fixes = [
-        f"{number} in {release}" if release else f"{number} in no known release {major}.x"
+        f"{number} fixed in {release}"
+        if release
+        else f"{number} not fixed in any known release {major}.x"
         for release, number in sorted(releases.items(), reverse=True)
     ]
     count = counted(len(advisories), "known vulnerability", "known vulnerabilities")
-    return f"{count} ({'; '.join(needs)}), fixed: {', '.join(fixes)}"
+    return f"{count} ({'; '.join(needs)}), {', '.join(fixes)}"
 
 
 def _unclear(advisories: Sequence[Advisory]) -> str:

@@ -620,7 +620,7 @@ def _status(
     """Compare the files that each robot last confirmed with the files that it should have.
 
     A robot should have the files that an export from KEYSTORE would give it now. A file is current;
-    earlier (issued for this enclave before); another's (issued for another enclave); revoked;
+    earlier (issued for this enclave before); foreign (issued for another enclave); revoked;
     missing; or unknown (never issued by this keystore). Processes use new files only after a
     restart. Confirmations by the Ansible collection and `sros agent` say which restarts are due,
     those by `sros fleet report` only if it saw all processes, or with --restarted. A robot without
@@ -637,10 +637,10 @@ def _status(
 
     Example:
       $ sros fleet status keystore
-      50 robots: 44 current, 1 earlier, 4 never confirmed, 1 another's files
+      50 robots: 44 current, 1 earlier, 4 never confirmed, 1 foreign files
       robot                  state            confirmed  to do         what
       r7                     earlier          3 d ago    deliver       earlier ...
-      r8                     another's files  2 min ago  find out why  10 files of r9
+      r8                     foreign files    2 min ago  find out why  10 files of r9
       r31 to r34 (4)         never confirmed  -          deliver       2 enclaves
       r1 to r6, r9 ... (44)  current          4 min ago
       $ sros fleet status keystore --max-age 7d
@@ -737,7 +737,7 @@ _WORDS = {
     "later": "claims a later release",
     "refused": "message refused",
     "unknown": "unknown files",
-    "another": "another's files",
+    "another": "foreign files",
 }
 """State of a file or robot → its words in the output, if they differ from the state's name."""
 _DIGITS = re.compile(r"(\d+)")
@@ -878,9 +878,13 @@ def _remedies(status: FleetStatus, to_dos: Collection[str]) -> Mapping[str, str]
         "upgrade the DDS": "upgrade the package of the library, which is named below, on the "
         "robot, and restart the robot's processes",
     }
-    return {
+    shown = {
         name: known[name] for name in known if known[name] and any(name in text for text in to_dos)
     }
+    # Other instructions may end with a delivery.
+    if any("deliver" in remedy for remedy in shown.values()):
+        shown["deliver"] = by_hand
+    return shown
 
 
 def _bringing(root: Path, robots: Sequence[RobotStatus]) -> str:

@@ -357,7 +357,8 @@ def _demo_open(rows: Sequence[Json]) -> str:
     here_first = sorted(names.items(), key=lambda item: item[0][0])
     items = "".join(
         f'<li><span class="chip {"warning" if is_known else "error"}">{label}</span> '
-        f"<b>{escape('; '.join(opened))}</b><br>{_sentence(because)} {_sentence(remedy)}</li>"
+        f"<b>{'<br>'.join(map(escape, opened))}</b><br>"
+        f"{_sentence(because)} {_sentence(remedy)}</li>"
         for (is_known, label, because, remedy), opened in here_first
     )
     return f'<ul class="open">{items}</ul>' if items else ""

@@ -233,7 +233,10 @@ def test_a_robot_that_got_the_files_of_another_one(field: Field) -> None:
     assert field.pending("r1") == dict.fromkeys(
         ("certificate", "permissions"), ("another", "deliver")
     )
-    assert "2 files of r2" in field.run("fleet", "status", "ks", status=1).out
+    said = field.run("fleet", "status", "ks", status=1).out
+    assert "2 files of r2" in said and "1 foreign files" in said
+    page = field.run("fleet", "status", "ks", "--html", "--robot", "r1", status=1).out
+    assert "then deliver to both" in page and "<dt>deliver</dt>" in page
 
 
 def test_files_of_another_enclave_of_the_robot_are_none_of_another_robot(field: Field) -> None:
@@ -1457,6 +1460,7 @@ def test_metrics_and_the_page(field: Field) -> None:
     page = field.run("fleet", "status", renamed, "--html", status=1).out
     number = "Fast DDS 2.14.5: 27 known vulnerabilities (15 concern all processes; "
     summary = page.partition(f"<summary>{number}")[2].partition("</summary>")[0]
-    assert summary.endswith("; loaded by processes of r1")
+    fixed = "10 fixed in 2.14.6, 17 not fixed in any known release 2.x"
+    assert summary.endswith(f"), {fixed}; loaded by processes of r1")
     for words in ("--json --html", "--json -o x.json", "--prometheus -o x.txt"):
         field.run("fleet", "status", renamed, *words.split(), status=2)

@@ -152,7 +152,7 @@ def test_what_is_open_comes_first_with_what_to_do_and_is_never_green() -> None:
     what_to_do = "Names are in clear. Keep secrets out of names."
     assert [item.text_content() for item in page.cssselect("ul.open li")] == [
         f"open in this keystore heard here{what_to_do}",
-        f"open names read; subjects read{what_to_do}",
+        f"open names readsubjects read{what_to_do}",
     ]
     pills = [(pill.text, str(pill.get("class"))) for pill in page.cssselect("td:first-child .chip")]
     assert [text for text, _ in pills] == ["open", "open", "open", "differs", "open", "ok"]

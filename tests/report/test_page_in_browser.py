@@ -156,6 +156,7 @@ def test_an_enclave_tells_its_rights_certificate_validity_and_findings(
 
 def test_filters_leave_what_fits(browser: Browser, robot_page: Path) -> None:
     with opened(browser, robot_page) as page:
+        assert "; A: also subscribed by /mobile_robot/recorder" in page.inner_text("#summary")
         everything = lines(page)
         page.select_option("#filter-enclave", "/mobile_robot/velocity_mux")
         few = lines(page)
@@ -601,6 +602,13 @@ def test_of_equal_robots_it_says_who_drives_and_shows_the_names_of_all(
         moving = page.locator("#names .group", has_text="Moves the robot").locator("tbody th")
         shown = moving.all_inner_texts() or page.locator("#names tbody th").all_inner_texts()
         assert not any("cmd_vel" in text and "state" in text for text in shown)
+        # Each robot is found by its own name, also in rows on names of the others.
+        for name, number in (("/r7/CMD", "2 names in 2 rows"), ("r7/base", "1 name in")):
+            page.fill("#search-names", name)
+            assert page.inner_text("#names [role=status]").startswith(number)
+            assert "/{r1…r9}/cmd_vel" in page.inner_text("#names tbody")
+        page.fill("#search-names", "r10")
+        assert page.inner_text("#names [role=status]") == "No name matches."
         page.click("#headlines .link-button >> nth=0")
         assert "9 TOPICS ALIKE" in details(page) and "/r7/cmd_vel" in details(page)
 
@@ -696,8 +704,10 @@ def test_the_table_has_every_name_and_those_that_only_one_side_may_use(
         assert ["/lost" in row for row in rows.all_inner_texts()] == [False, True]
         page.fill("#search-names", "USED")
         assert rows.count() == 1
-        page.fill("#search-names", "")
         page.check("#only-lacking")
+        said = page.inner_text("#names [role=status]")
+        assert said == "A name matches, but not these choices."
+        page.fill("#search-names", "")
         assert "nobody may subscribe" in "".join(rows.all_inner_texts()) and rows.count() == 1
         page.click("#names .link-button")
         assert "nobody may subscribe" in details(page)
@@ -801,6 +811,7 @@ def test_a_robot_of_unknown_names_says_who_may_do_most_and_equal_findings_are_on
         page.click("#headlines .link-button >> nth=0")
         assert "/writer" in details(page)
         page.click("#tab-findings")
+        assert "-topk8" in texts(page, "#findings code .unbroken")
         assert "5 enclaves" in page.inner_text("#findings")
         assert page.locator("#findings .finding").count() < 5
 
@@ -848,8 +859,18 @@ def test_what_is_violated_comes_first_and_the_map_opens_where_it_is(
         assert "may publish /n8/t8" not in " ".join(others)
         assert "No error" not in " ".join(others)
         assert page.evaluate(inside)
-        page.click("#headlines .violated .link-button")
-        assert "/a8: p.xml:1: may publish /n8/t8, but only /mux" in page.inner_text("#findings")
+        broken = "/a8: p.xml:1: may publish /n8/t8, but only /mux"
+        for words, said in (
+            ("1 of 3 requirements", broken),
+            ("/a8 may publish", broken),
+            ("under an assumption", "requirement.assumed"),
+        ):
+            page.click(f"#headlines .link-button:has-text('{words}')")
+            assert said in page.inner_text("#findings .finding:focus")
+            page.click("#tab-map")
+    with opened(browser, path, "phone") as page:
+        page.click("#tab-map")
+        assert page.evaluate(inside)
     policy.write_text(policy_text({**enclaves, "/a8": publish("/z"), "/mux": publish("/n8/t8")}))
     sros("view", policy, "--requirements", wanted, "-o", path, "--force").ok()
     with opened(browser, path, "phone") as page:

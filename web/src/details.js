@@ -55,9 +55,9 @@ function longList(items) {
   return el("div", {}, el("ul", { class: "plain" }, items.slice(0, MOST)), more);
 }
 
-// Backticks mark commands; an arrow such as `-publish /x->` is not broken at its hyphens.
-export const commands = (text) => text.split("`").map((part, at) => (at % 2 ? el("code", { text: part }) : unbroken(part)));
-const unbroken = (text) => text.split(/(-(?:>|\w+))/).map((part, at) => (at % 2 ? el("span", { class: "unbroken", text: part }) : part));
+// Backticks mark commands; options, and an arrow such as `-publish /x->`, are not broken at hyphens.
+export const commands = (text) => text.split("`").map((part, at) => (at % 2 ? el("code", {}, unbroken(part)) : unbroken(part)));
+const unbroken = (text) => text.split(/(-+(?:>|\w[\w-]*))/).map((part, at) => (at % 2 ? el("span", { class: "unbroken", text: part }) : part));
 
 // A finding; `enclaves` are all that have this very finding, each with a link.
 export function findingItem(finding, enclaves = [], onEnclave = null) {
@@ -65,7 +65,7 @@ export function findingItem(finding, enclaves = [], onEnclave = null) {
   const many = links.length > 1;
   return el(
     "li",
-    { class: `finding ${finding.severity}` },
+    { class: `finding ${finding.severity}`, tabindex: "-1" },
     el("span", { class: `chip ${finding.severity}`, text: finding.severity }),
     " ",
     el("code", { text: finding.id }),

@@ -295,6 +295,5 @@ export function legend(scene, overlay, equal, make) {
   if (scene.cards.some((card) => card.notes.some((text) => text.startsWith("own:")))) {
     items.push(make.el("li", {}, make.el("span", { text: "own: names that no other enclave may use" })));
   }
-  for (const onlooker of scene.onlookers) add(make.el("b", { class: "tag", text: onlooker.tag }), onlookerText(onlooker));
   return items;
 }

@@ -1,7 +1,6 @@
 // What the page claims before anything else: its answers, who may drive the robot, or else who may do
 // most, and what permissions do not control.
 
-import { commands } from "./details.js";
 import { counted, el } from "./dom.js";
 import { SHOWN, nameButton, rank, rowsByMotion } from "./table.js";
 import { daysLeft } from "./timeline.js";
@@ -9,16 +8,17 @@ import { SENDS, noneText, sends } from "./words.js";
 
 const DRIVERS = 3;
 const VIOLATED = "requirement.violated";
+const ASSUMED = "requirement.assumed";
 
 function button(text, onclick) {
   return el("button", { type: "button", class: "link-button words", text, onclick });
 }
 
-// `opens(kind, name)` returns what shows a name; `act.enclave` shows an enclave, and `showTab` the
-// names or differences that are only counted.
+// `opens(kind, name)` returns what shows a name; `act.enclave` shows an enclave, `act.finding` the one
+// at a place among those with an id, and `showTab` the names or differences that are only counted.
 export function headlines(model, opens, act, showTab) {
   const showTable = () => showTab("names");
-  const parts = [requirementLines(model, () => showTab("findings")), model.headlines.map((text) => el("p", { text: `${text}.` }))].flat();
+  const parts = [requirementLines(model, act.finding), model.headlines.map((text) => el("p", { text: `${text}.` }))].flat();
   // A focus has its own answer, and in a comparison there are two.
   if (model.overlay) parts.push(differencesLine(model, () => showTab("differences")));
   else if (model.scenes[0].id !== "focus") {
@@ -39,17 +39,17 @@ export function headlines(model, opens, act, showTab) {
 }
 
 // Violations are said in short: the findings say all of each, and what was assumed for the others.
-function requirementLines({ requirements }, showFindings) {
+function requirementLines({ requirements }, showFinding) {
   if (!requirements) return [];
   const { hold, violations, assumed } = requirements;
   const number = violations.length;
   const all = counted(hold + number, "requirement");
   const some = number ? `; ${assumed} of the others hold${assumed === 1 ? "s" : ""}` : `, ${assumed} of them`;
-  const under = assumed ? [`${some} only `, button("under an assumption", showFindings)] : "";
+  const under = assumed ? [`${some} only `, button("under an assumption", () => showFinding(ASSUMED, 0))] : "";
   if (!number) return [el("p", { class: "drivers" }, `${all} hold${hold === 1 ? "s" : ""}`, under)];
-  const lines = violations.slice(0, DRIVERS).map((text) => el("p", { class: "violated" }, commands(text)));
-  if (number > DRIVERS) lines.push(el("p", {}, button(`and ${number - DRIVERS} more`, showFindings)));
-  return [el("p", { class: "drivers" }, el("b", { class: "violated" }, button(`${number} of ${all} violated`, showFindings)), under), ...lines];
+  const lines = violations.slice(0, DRIVERS).map((text, at) => el("p", { class: "violated" }, button(text, () => showFinding(VIOLATED, at))));
+  if (number > DRIVERS) lines.push(el("p", {}, button(`and ${number - DRIVERS} more`, () => showFinding(VIOLATED, DRIVERS))));
+  return [el("p", { class: "drivers" }, el("b", { class: "violated" }, button(`${number} of ${all} violated`, () => showFinding(VIOLATED, 0))), under), ...lines];
 }
 
 function differencesLine({ overlay, differences }, showDifferences) {

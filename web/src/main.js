@@ -75,9 +75,7 @@ function showMap() {
   const summary = scene.shown
     ? `${counted(model.enclaves.length, "enclave")}, ${counted(scene.shown, "name")}${all}${scene.hidden ? `; left out: ${counted(scene.hidden, "name")}${why}` : ""}`
     : `${scene.title}${all}`;
-  const said = [summary];
-  // On a small screen, the legend is folded.
-  if (isSmall()) said.push(...onlookers.map((onlooker) => `${onlooker.tag}: ${onlookerText(onlooker)}`));
+  const said = [summary, ...onlookers.map((onlooker) => `${onlooker.tag}: ${onlookerText(onlooker)}`)];
   byId("summary").textContent = scene.cards.length ? said.join("; ") : "Nothing fits.";
   byId("back").hidden = scene === model.scenes[state.scene];
   byId("hops").hidden = !state.flow;
@@ -88,11 +86,14 @@ function showMap() {
   showViolation();
 }
 
-// What breaks a requirement is in sight.
+// The first line that breaks a requirement, unless something else was asked for.
+const violation = () => (state.flow || state.chosen || filtering() ? null : byId("map").querySelector(".violates"));
+
+// What breaks a requirement is in sight, and so are the headlines.
 function showViolation() {
   const canvas = byId("canvas");
-  const broken = byId("map").querySelector(".violates")?.getBoundingClientRect();
-  if (!broken || state.flow || filtering()) return;
+  const broken = violation()?.getBoundingClientRect();
+  if (!broken) return;
   const room = canvas.getBoundingClientRect();
   canvas.scrollTop += broken.top + broken.height / 2 - room.top - room.height / 2;
 }
@@ -170,6 +171,13 @@ const act = {
   only: (path) => {
     clear();
     setFilter("enclave", path);
+  },
+  finding: (id, at) => {
+    showTab("findings");
+    const item = state.items.get(textOf(model.findings.filter((finding) => finding.id === id)[at]));
+    if (!item?.isConnected) byId("more-findings")?.click();
+    item?.focus();
+    item?.scrollIntoView({ block: "nearest" });
   },
   flow: (kind, name, upstream) => {
     clear();
@@ -302,21 +310,25 @@ function tabKeys(event) {
   next.focus();
 }
 
+// What findings have in common that are shown as one.
+const textOf = ({ enclave, ...finding }) => JSON.stringify(finding);
+
 function fillLists() {
   const order = { error: 0, warning: 1, note: 2 };
   const sorted = [...model.findings].sort((a, b) => order[a.severity] - order[b.severity]);
   const none = el("p", { class: "soft", text: "There are no findings." });
   const same = new Map();
-  for (const { enclave, ...finding } of sorted) {
-    const key = JSON.stringify(finding);
+  for (const finding of sorted) {
+    const key = textOf(finding);
     if (!same.has(key)) same.set(key, { finding, enclaves: [] });
-    if (enclave) same.get(key).enclaves.push(enclave);
+    if (finding.enclave) same.get(key).enclaves.push(finding.enclave);
   }
-  const items = [...same.values()].map(({ finding, enclaves }) => findingItem(finding, enclaves, act.enclave));
+  state.items = new Map([...same].map(([key, { finding, enclaves }]) => [key, findingItem(finding, enclaves, act.enclave)]));
+  const items = [...state.items.values()];
   const list = el("ul", { class: "plain cards" }, items.slice(0, MOST_FINDINGS));
   if (items.length > MOST_FINDINGS) {
     const rest = items.slice(MOST_FINDINGS);
-    const more = el("button", { type: "button", text: `Show ${rest.length} more` });
+    const more = el("button", { type: "button", id: "more-findings", text: `Show ${rest.length} more` });
     more.addEventListener("click", () => more.parentElement.replaceWith(...rest));
     list.append(el("li", {}, more));
   }
@@ -330,7 +342,7 @@ function fillLists() {
   };
   byId("headlines").replaceChildren(...headlines(model, opens, act, showTab));
   byId("headlines").hidden = !byId("headlines").children.length;
-  byId("names").replaceChildren(...namesTable(model.rows, opens));
+  byId("names").replaceChildren(...namesTable(model.rows, model.equal, opens));
   byId("timeline").replaceChildren(...timeline(model.validities, act.enclave));
   byId("tab-differences").hidden = !model.overlay;
   if (!model.overlay) return;
@@ -395,7 +407,9 @@ function start() {
   for (const tab of document.querySelectorAll("[role=tab]")) {
     tab.addEventListener("click", () => {
       showTab(tab.id.replace("tab-", ""));
-      if (isSmall()) tab.parentElement.scrollIntoView();
+      if (!isSmall()) return;
+      tab.parentElement.scrollIntoView();
+      if (tab.id === "tab-map") violation()?.scrollIntoView({ block: "center", inline: "nearest" });
     });
     tab.addEventListener("keydown", tabKeys);
   }

@@ -25,10 +25,19 @@ export function rank(row) {
 
 const GROUPS = ["Moves the robot, by name", "Moves the robot, by name", "Open to everybody"];
 
-function mentions(row, text) {
-  return [row.names, row.senders, row.receivers, row.denied].some((all) =>
-    all.some((name) => name.toLowerCase().includes(text)),
-  );
+// A test whether a row has a name that holds a text.  A label such as {r1…r9} stands for the name
+// of each equal unit; one of others, such as {1 other of r1…r9}, may stand for any of them.
+function mentions(text, equal) {
+  const of = new Map(equal.map(({ label, members }) => [label, new Set(members)]));
+  const units = [...of.values()].flatMap((members) => [...members]);
+  const holds = (name) => name.toLowerCase().includes(text);
+  const ofUnit = (name, unit) => name.replace(/{[^}]*}/g, (label) => (of.get(label)?.has(unit) ?? true ? unit : label));
+  const known = new Map();
+  function isFound(name) {
+    if (!known.has(name)) known.set(name, holds(name) || (name.includes("…") && units.some((unit) => holds(ofUnit(name, unit)))));
+    return known.get(name);
+  }
+  return (row) => [row.names, row.senders, row.receivers, row.denied].some((all) => all.some(isFound));
 }
 
 function list(texts, none, all) {
@@ -48,8 +57,9 @@ export function nameButton(kind, name, opens) {
   return open ? el("button", { type: "button", class: "link-button", onclick: open }, breakable(name)) : el("code", {}, breakable(name));
 }
 
-// `opens(kind, name)` returns what shows a name, or nothing if only the table has it.
-export function namesTable(rows, opens) {
+// `opens(kind, name)` returns what shows a name, or nothing if only the table has it; `equal` are the
+// units that are drawn as one.
+export function namesTable(rows, equal, opens) {
   const lacking = namesIn(rows.filter((row) => row.lacks && !row.common));
   const ordered = rowsByMotion(rows)
     .map((row) => [rank(row), -reach(row), row])
@@ -65,9 +75,8 @@ export function namesTable(rows, opens) {
   const status = el("p", { class: "soft", role: "status" });
   function show() {
     const text = search.value.trim().toLowerCase();
-    const fit = ordered.filter(
-      (row) => (basics.checked || !row.common) && (row.lacks || !only.checked) && (!text || mentions(row, text)),
-    );
+    const found = text ? ordered.filter(mentions(text, equal)) : ordered;
+    const fit = found.filter((row) => (basics.checked || !row.common) && (row.lacks || !only.checked));
     const shown = new Set(fit.slice(0, MOST));
     const table = (some) => el("table", { class: "names" }, el("thead", {}, el("tr", {}, heads())), el("tbody", {}, some.map((row) => line(row, opens, !same))));
     const parts = shown.size > FEW ? grouped(fit) : [];
@@ -79,7 +88,8 @@ export function namesTable(rows, opens) {
     const names = namesIn(fit);
     const shared = names > fit.length ? " (names with the same rights share a row)" : "";
     const first = fit.length > MOST ? `; shown are the first ${MOST}` : "";
-    status.textContent = `${counted(names, "name")} in ${counted(fit.length, "row")}${shared}${first}.${same}`;
+    const none = found.length ? "A name matches, but not these choices." : "No name matches.";
+    status.textContent = text && !fit.length ? none : `${counted(names, "name")} in ${counted(fit.length, "row")}${shared}${first}.${same}`;
   }
   search.addEventListener("input", show);
   only.addEventListener("change", show);
