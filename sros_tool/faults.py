@@ -481,6 +481,8 @@ NEEDS_CA_KEYS = re.compile(
 """The beginning of a command that works only in the keystore that has the CA keys."""
 
 
+NOT_IN_THE_FILE = (Fault.CA_NOT_YET_VALID, Fault.FILE_UNREADABLE, Fault.FILE_NO_FILE)
+"""Faults of a file that stay if a link to the keystore's file replaces the file."""
 FAULTS = {fault.id: fault for fault in Fault}
 """All faults, by id."""
 

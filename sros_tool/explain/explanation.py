@@ -32,19 +32,15 @@ from sros_tool.explain.answer import (
     lines_of_right,
     recorded_policy,
 )
-from sros_tool.faults import FAULTS, REPLACE, Fault, remedy_in_original_keystore
+from sros_tool.faults import FAULTS, NOT_IN_THE_FILE, REPLACE, Fault, remedy_in_original_keystore
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
-    GOVERNANCE_P7S,
-    IDENTITY,
     IDENTITY_CA_FILE,
     LEDGER,
-    PERMISSIONS,
-    PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
-    ca_certificate,
     enclave_path,
     is_original_keystore,
+    is_own_copy,
 )
 from sros_tool.keystore.participant import LoadedEnclave, plan_enclave
 from sros_tool.names import (
@@ -164,13 +160,6 @@ _BY_REASON: dict[str, str | Fault] = {
 }
 """Faults, or remedies, by the reason of a denial that no change of the policy can resolve."""
 
-_SHARED = {
-    GOVERNANCE_FILE: GOVERNANCE_P7S,
-    IDENTITY_CA_FILE: ca_certificate(IDENTITY),
-    PERMISSIONS_CA_FILE: ca_certificate(PERMISSIONS),
-}
-"""Files of an enclave that are normally links to files of the keystore."""
-_NOT_IN_THE_FILE = (Fault.CA_NOT_YET_VALID, Fault.FILE_UNREADABLE, Fault.FILE_NO_FILE)
 _OF_VALIDITY = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_VALID)
 _OF_GOVERNANCE = (Fault.GOVERNANCE_MALFORMED, Fault.GOVERNANCE_DOMAIN)
 
@@ -201,13 +190,13 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
         return remedy_in_original_keystore(_filled_remedy(text, "KEYSTORE", enclave, file))
     if keystore and fault:
         wrong_issuer = fault is Fault.CERTIFICATE_ISSUER
-        if wrong_issuer and _is_own_copy(keystore, enclave, IDENTITY_CA_FILE):
+        if wrong_issuer and is_own_copy(keystore, enclave, IDENTITY_CA_FILE):
             return _filled_remedy(REPLACE, root, enclave, IDENTITY_CA_FILE)
         if (wrong_issuer or fault is Fault.CA_EXPIRED) and _is_rotating(keystore):
             text = _ROTATION
         elif fault in _OF_VALIDITY and not _is_latest(keystore, enclave):
             text = _RIGHTS
-        elif fault not in _NOT_IN_THE_FILE and _is_own_copy(keystore, enclave, file):
+        elif fault not in NOT_IN_THE_FILE and is_own_copy(keystore, enclave, file):
             text = REPLACE
     return _filled_remedy(text, root or "KEYSTORE", enclave, file)
 
@@ -216,12 +205,6 @@ def _filled_remedy(text: str, root: str, enclave: str, file: str) -> str:
     path = enclave_path(Path(root), enclave) / (file or "cert.pem")
     # Quoted, so that text copied into a shell cannot become another command.
     return text.format(root=quote(root), enclave=quote(enclave), path=quote(str(path)))
-
-
-def _is_own_copy(keystore: Path, enclave: str, file: str) -> bool:
-    """Return whether an enclave has its own copy of a file, and no link to the keystore's file."""
-    copy, common = enclave_path(keystore, enclave) / file, keystore / _SHARED.get(file, "")
-    return file in _SHARED and copy.is_file() and common.is_file() and not copy.samefile(common)
 
 
 def _is_rotating(keystore: Path) -> bool:

@@ -128,6 +128,14 @@ def ca_certificate(role: str) -> str:
     return f"{PUBLIC}/{role}_ca.cert.pem"
 
 
+SHARED_FILES = {
+    GOVERNANCE_FILE: GOVERNANCE_P7S,
+    IDENTITY_CA_FILE: ca_certificate(IDENTITY),
+    PERMISSIONS_CA_FILE: ca_certificate(PERMISSIONS),
+}
+"""Maps files of an enclave that are normally links to the files of the keystore."""
+
+
 def ca_key(role: str) -> str:
     """Return the path of the private key of the identity or permissions CA."""
     return f"{PRIVATE}/{role}_ca.key.pem"
@@ -153,6 +161,14 @@ def link_to_list(name: str) -> str:
 def enclave_path(root: Path, name: str) -> Path:
     """Return the folder of an enclave of the keystore ``root``."""
     return root / enclave_folder(name)
+
+
+def is_own_copy(root: Path, name: str, file: str) -> bool:
+    """Return whether an enclave has its own copy of a file, and no link to the keystore's file."""
+    copy, common = enclave_path(root, name) / file, root / SHARED_FILES.get(file, "")
+    return file in SHARED_FILES and (
+        copy.is_file() and common.is_file() and not copy.samefile(common)
+    )
 
 
 def fleet_key(role: str) -> str:

@@ -14,6 +14,8 @@ from cryptography import x509
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.keystores.opened import Circumstances
+from sros_tool.explain.explanation import remedy
+from sros_tool.faults import Fault
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import make_request, pem
@@ -148,6 +150,20 @@ def test_only_the_name_of_another_enclave_is_a_wrong_name(
         each.id for each in keystore_findings(OpenedKeystore(bench.root), Circumstances(bench.now))
     }
     assert ("enclave.name-mismatch" in found) == wrong
+
+
+def test_a_copy_of_the_governance_is_replaced_by_the_link(bench: Bench) -> None:
+    """The file that all enclaves depend on is intact: `explain` gives the same remedy."""
+    path, edited = (
+        bench.path("enclaves/base/governance.p7s"),
+        bench.document("enclaves/governance.p7s"),
+    )
+    path.unlink()
+    path.write_text(edited.replace("_control>true", "_control>false"))
+    found = keystore_findings(OpenedKeystore(bench.root), Circumstances(bench.now))
+    (said,) = {each.remedy for each in found if each.id == "enclave.not-signed"}
+    assert said == remedy(Fault.NOT_SIGNED, str(bench.root), "/base", "governance.p7s")
+    assert f"`rm {path} && sros create_enclave {bench.root} /base`" in said
 
 
 @pytest.mark.parametrize(

@@ -24,19 +24,18 @@ from sros_tool.checks.kind import (
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.permissions import Grant, Rule
 from sros_tool.errors import SrosError
-from sros_tool.faults import VENDOR_FAULTS, Fault
+from sros_tool.faults import NOT_IN_THE_FILE, REPLACE, VENDOR_FAULTS, Fault
 from sros_tool.keystore.known_keys import other_enclave
 from sros_tool.keystore.layout import (
-    IDENTITY,
     IDENTITY_CA_FILE,
     KEY_FILE,
     KEY_URI_FILE,
-    PERMISSIONS,
     PERMISSIONS_CA_FILE,
     REQUEST,
     ROUTER_FILE,
+    SHARED_FILES,
     ZENOH_FILES,
-    ca_certificate,
+    is_own_copy,
     waits_for_answer,
 )
 from sros_tool.keystore.reader import weaknesses
@@ -98,8 +97,10 @@ def fault_remedy(enclave: CheckedEnclave, fault: Fault, name: str) -> str:
     file = enclave.file(name)
     if enclave.keystore.can_issue:
         remedy, root, path = fault.remedy_in(name), "KEYSTORE", quote(file)
-        missing = _SHARED.get(name, "")
-        if missing and not (enclave.keystore.root / missing).exists():
+        missing = SHARED_FILES.get(name, "")
+        if fault not in NOT_IN_THE_FILE and is_own_copy(enclave.keystore.root, enclave.name, name):
+            remedy = REPLACE
+        elif missing and not (enclave.keystore.root / missing).exists():
             remedy = f"Restore {missing} from a backup; every exported enclave has a copy of it."
     else:
         remedy, root = fault.remedy_in_export(name), "KEYSTORE"
@@ -107,12 +108,6 @@ def fault_remedy(enclave: CheckedEnclave, fault: Fault, name: str) -> str:
         path = quoted_path if "`" in remedy else quote(file)
     return remedy.format(root=root, enclave="ENCLAVE", path=path)
 
-
-_SHARED = {
-    IDENTITY_CA_FILE: ca_certificate(IDENTITY),
-    PERMISSIONS_CA_FILE: ca_certificate(PERMISSIONS),
-}
-"""Keystore files that the enclaves link to and that no sros command can create again."""
 
 EXPIRES_SOON = FindingKind(
     "enclave.ends-soon",
