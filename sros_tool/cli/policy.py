@@ -434,7 +434,8 @@ def unanswered_lines(difference: SourcesDifference, fleet: Fleet | None) -> Iter
 
     lines = []
     for right in difference.unanswered:
-        other = OTHER_SIDE[right.right].replace("reply", "serve")
+        other = OTHER_SIDE[right.right]
+        other = {"reply": "serve", "subscribe": "subscribe to"}.get(other, other)
         text = f"{right.enclave} may {right.right} {right.name}, but no enclave may {other} it"
         lines.append((right.enclave, f"! {text} any more"))
     yield from folded(fleet, lines)

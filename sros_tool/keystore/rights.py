@@ -44,13 +44,14 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import FilesReadOnce, OpenedKeystore
-from sros_tool.names import is_expression
+from sros_tool.names import NODE_SERVICES, is_expression
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.policy.document import files_of_policies, read_policy
 from sros_tool.policy.model import (
     DENY,
     OFFERING_SIDE,
+    OTHER_SIDE,
     Policy,
     StatedProtection,
     stated_protections,
@@ -612,8 +613,8 @@ class PolicyDifference(NamedTuple):
     protections: Sequence[DifferentProtection]
     """Protection that only one of two policies demands."""
     unanswered: Sequence[Right]
-    """Rights of B to subscribe, request or call, whose counterpart an enclave of A has, and no
-    enclave of B."""
+    """Rights of B whose counterpart, such as the subscriber, an enclave of A has, and no enclave of
+    B."""
     domains: Sequence[DifferentDomains]
     """Enclaves of both sides whose ROS domains differ; only where both sides state them."""
     enclaves: Sequence[DifferentEnclave]
@@ -789,11 +790,12 @@ def _stated_domains(source: RightsSource) -> dict[str, str]:
 def _unanswered_rights(
     first_rights: Collection[Right], second_rights: Collection[Right], difference: RightsDifference
 ) -> list[Right]:
-    """Return the ``second_rights`` to use a name that enclaves offer only in ``first_rights``.
+    """Return the ``second_rights`` whose other side enclaves have only in ``first_rights``.
 
     For example, a right to subscribe to a topic that no enclave may publish any more, because the
-    right to publish it is gone or denied.  A right to use a wildcard counts if enclaves offer no
-    name any more that it matches.
+    right to publish it is gone or denied, or a right to publish a topic that is not subscribed to.
+    A right to a wildcard counts if the other side has no name any more that it matches.  What every
+    node offers, such as its parameters, needs nobody who uses it.
     """
     reduced = [right for right in difference.only_first if right.qualifier is not DENY]
     reduced += (right for right in difference.only_second if right.qualifier is DENY)
@@ -804,28 +806,33 @@ def _unanswered_rights(
     asked = [
         right
         for right in second_rights
-        if (offering := OFFERING_SIDE.get(right.right)) in touched
+        if (other := OTHER_SIDE[right.right]) in touched
         and right.qualifier is not DENY
-        and touched[offering].meets(right.name)
+        and touched[other].meets(right.name)
+        and (right.right in OFFERING_SIDE or not _is_offered_by_every_node(right.name))
     ]
     if not asked:
         return []
-    names = {(OFFERING_SIDE[e.right], e.name) for e in asked if not is_expression(e.name)}
+    names = {(OTHER_SIDE[e.right], e.name) for e in asked if not is_expression(e.name)}
     before, after = _allowed_pairs(first_rights, names), _allowed_pairs(second_rights, names)
-    offered = unfolded(right for right in second_rights if right.qualifier is not DENY)
-    offers = {
-        word: Names(sorted(right.name for right in offered if right.right == word))
+    present = unfolded(right for right in second_rights if right.qualifier is not DENY)
+    others = {
+        word: Names(sorted(right.name for right in present if right.right == word))
         for word in touched
     }
     lost = before - after
     lost |= {
-        (OFFERING_SIDE[right.right], right.name)
+        (OTHER_SIDE[right.right], right.name)
         for right in asked
         if is_expression(right.name)
-        and right.right in ("subscribe", "request")
-        and not offers[OFFERING_SIDE[right.right]].meets(right.name)
+        and right.right not in ("call", "execute")
+        and not others[OTHER_SIDE[right.right]].meets(right.name)
     }
-    return sorted(right for right in asked if (OFFERING_SIDE[right.right], right.name) in lost)
+    return sorted(right for right in asked if (OTHER_SIDE[right.right], right.name) in lost)
+
+
+def _is_offered_by_every_node(name: str) -> bool:
+    return name in ("/rosout", "/parameter_events") or name.rpartition("/")[2] in NODE_SERVICES
 
 
 def _allowed_pairs(

@@ -124,6 +124,22 @@ def test_a_right_without_its_other_side_is_named(tmp_path: Path) -> None:
     assert f"\n{lost}\n" in sros("diff_policy", "e.xml", "f.xml", cwd=tmp_path).out
 
 
+def test_a_right_that_loses_its_last_user_is_named(tmp_path: Path) -> None:
+    """Nobody hears an emergency stop any more; what every node offers needs no user."""
+    services = "".join(f"<service>{name}</service>" for name in ("/a/set_parameters", "/grab"))
+    offered = publish("/stop", "/rosout") + f'<services reply="ALLOW">{services}</services>'
+    used = subscribe("/stop", "/rosout") + f'<services request="ALLOW">{services}</services>'
+    for name, rights in (("a.xml", used), ("b.xml", publish("/x")), ("c.xml", subscribe("/*"))):
+        (tmp_path / name).write_text(policy_text({"/a": offered, "/b": rights}))
+    lost = [
+        "! /a may reply /grab, but no enclave may request it any more",
+        "! /a may publish /stop, but no enclave may subscribe to it any more",
+    ]
+    for name, expected in (("b.xml", lost), ("c.xml", lost[:1])):
+        said = sros("diff_policy", "a.xml", name, cwd=tmp_path).out.splitlines()
+        assert sorted(line for line in said if line.startswith("!")) == sorted(expected)
+
+
 def test_an_example_is_a_name_of_the_policy(tmp_path: Path) -> None:
     driven = {"/b": subscribe("/f1/cmd_vel", "/f12/scan")}
     (tmp_path / "a.xml").write_text(policy_text(driven))
