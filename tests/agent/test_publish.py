@@ -889,6 +889,19 @@ def test_a_refused_robot_in_another_folder(publisher: Home, tmp_path: Path) -> N
     publisher.robot("r2").gets()
 
 
+def test_a_publishing_folder_that_lost_metadata(publisher: Home) -> None:
+    robot = publisher.robot()
+    next(publisher.pub.glob("metadata/*.targets.json")).unlink()
+    with pytest.raises(KeystoreError, match=r"targets\.json' is missing, which robots") as refused:
+        publisher.publish()
+    assert f"remove '{publisher.pub}/metadata', and publish again with --new-folder" in str(
+        refused.value
+    )
+    shutil.rmtree(publisher.pub / "metadata")
+    publisher.publish(new_folder=True)
+    robot.gets()
+
+
 def test_what_the_timestamp_would_lead_to_is_not_there(
     publisher: Home, monkeypatch: pytest.MonkeyPatch
 ) -> None:

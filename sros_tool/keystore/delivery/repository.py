@@ -256,7 +256,12 @@ def read_present(folder: Path, roots: Roots) -> Present:
     except FileNotFoundError as error:
         if not folder.exists():
             return Present()
-        raise _foreign_folder_error(folder, f"'{error.filename}' is missing") from error
+        raise KeystoreError(
+            f"'{error.filename}' is missing, which robots fetch",
+            "The keystore wrote the metadata that leads there.",
+            "Copy the file back. If the keystore was restored from a backup, first follow "
+            f"docs/howto/keystore_is_lost.md. If the file is lost, {_without_metadata(folder)}.",
+        ) from error
     except OSError as error:
         raise _foreign_folder_error(folder, f"'{error.filename}': {error.strerror}") from error
     except (RepositoryError, ValueError, KeyError, TypeError, AttributeError) as error:
@@ -269,8 +274,13 @@ def _foreign_folder_error(folder: Path, why: str) -> KeystoreError:
         f"{why[:1].upper()}{why[1:].removesuffix('.')}.",
         "Name another folder. If the keystore was restored from a backup, first follow "
         "docs/howto/keystore_is_lost.md. If this keystore published to it before, and it is "
-        f"damaged, remove '{folder / _METADATA}', and publish again with --new-folder.",
+        f"damaged, {_without_metadata(folder)}.",
     )
+
+
+def _without_metadata(folder: Path) -> str:
+    """Return the remedy for damaged metadata, as a clause."""
+    return f"remove '{folder / _METADATA}', and publish again with --new-folder"
 
 
 def _read_present(folder: Folder, roots: Roots) -> Present:
