@@ -120,7 +120,7 @@ def merge_policy(
     """
     from sros_tool.names import check_enclave_name, check_plain_namespace
     from sros_tool.policy.document import read_policy
-    from sros_tool.policy.merge import EditedText, MergedPolicy, merge_all
+    from sros_tool.policy.merge import EditedText, MergedPolicy, counterpart_notes, merge_all
     from sros_tool.policy.model import policy_in_enclave, policy_in_namespace, policy_of_nodes
 
     if in_place and output:
@@ -144,16 +144,16 @@ def merge_policy(
         namespace = check_plain_namespace(namespace)
         additions = [policy_in_namespace(addition, namespace) for addition in additions]
     notes: list[Note] = []
+    present, stated = read_policy(policy, may_be_empty=True), additions
     if remaps:
         from sros_tool.policy.remapping import remapped_policies
 
-        present = read_policy(policy, may_be_empty=True)
         additions, notes = remapped_policies(additions, remaps, present)
     if enclave is not None:
         check_enclave_name(enclave)
         additions = [policy_in_enclave(addition, enclave) for addition in additions]
     merged = merge_all(policy, additions)
-    notes += merged.notes()
+    notes += (*merged.notes(), *counterpart_notes((present, *stated), merged.rights))
     if merged.added and (output is None or output.parent.resolve() == policy.parent.resolve()):
         from sros_tool.graph.learn import with_common_parts
 
@@ -430,14 +430,9 @@ def unanswered_lines(difference: SourcesDifference, fleet: Fleet | None) -> Iter
     Lines that differ only in the robot are merged.
     """
     from sros_tool.fleet.robots import folded
-    from sros_tool.policy.model import OTHER_SIDE
+    from sros_tool.policy.rights import unanswered_text
 
-    lines = []
-    for right in difference.unanswered:
-        other = OTHER_SIDE[right.right]
-        other = {"reply": "serve", "subscribe": "subscribe to"}.get(other, other)
-        text = f"{right.enclave} may {right.right} {right.name}, but no enclave may {other} it"
-        lines.append((right.enclave, f"! {text} any more"))
+    lines = [(right.enclave, f"! {unanswered_text(right)}") for right in difference.unanswered]
     yield from folded(fleet, lines)
 
 

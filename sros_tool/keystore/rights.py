@@ -44,21 +44,23 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import FilesReadOnce, OpenedKeystore
-from sros_tool.names import NODE_SERVICES, is_expression
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.policy.document import files_of_policies, read_policy
 from sros_tool.policy.model import (
-    DENY,
-    OFFERING_SIDE,
-    OTHER_SIDE,
     Policy,
     StatedProtection,
     stated_protections,
 )
 from sros_tool.policy.node_basics import are_basic
-from sros_tool.policy.patterns import Names
-from sros_tool.policy.rights import Right, RightsDifference, Rules, compare, policy_rights, unfolded
+from sros_tool.policy.rights import (
+    Right,
+    RightsDifference,
+    Rules,
+    compare,
+    policy_rights,
+    unanswered_rights,
+)
 from sros_tool.translate import grant_rights
 from sros_tool.values import Words, shows
 from sros_tool.wording import counted, first_few
@@ -674,7 +676,7 @@ def compare_sources(
     scope = compared_enclaves(*((side.kind, side.scope) for side in sides))
     difference = compare(first_source.rights, second_source.rights, scope)
     unanswered = (
-        _unanswered_rights(first_source.rights, second_source.rights, difference)
+        unanswered_rights(first_source.rights, second_source.rights, difference)
         if all(side.scope is None for side in sides)
         else ()
     )
@@ -785,66 +787,6 @@ def _stated_domains(source: RightsSource) -> dict[str, str]:
             else:
                 ranges[enclave] += ((part.first or 0, part.last or 0) for part in domains.ranges)
     return {name: str(DomainSet.of(*of)) for name, of in ranges.items() if name not in unlimited}
-
-
-def _unanswered_rights(
-    first_rights: Collection[Right], second_rights: Collection[Right], difference: RightsDifference
-) -> list[Right]:
-    """Return the ``second_rights`` whose other side enclaves have only in ``first_rights``.
-
-    For example, a right to subscribe to a topic that no enclave may publish any more, because the
-    right to publish it is gone or denied, or a right to publish a topic that is not subscribed to.
-    A right to a wildcard counts if the other side has no name any more that it matches.  What every
-    node offers, such as its parameters, needs nobody who uses it.
-    """
-    reduced = [right for right in difference.only_first if right.qualifier is not DENY]
-    reduced += (right for right in difference.only_second if right.qualifier is DENY)
-    names_of: dict[str, set[str]] = defaultdict(set)
-    for right in reduced:
-        names_of[right.right].add(right.name)
-    touched = {word: Names(sorted(names)) for word, names in names_of.items()}
-    asked = [
-        right
-        for right in second_rights
-        if (other := OTHER_SIDE[right.right]) in touched
-        and right.qualifier is not DENY
-        and touched[other].meets(right.name)
-        and (right.right in OFFERING_SIDE or not _is_offered_by_every_node(right.name))
-    ]
-    if not asked:
-        return []
-    names = {(OTHER_SIDE[e.right], e.name) for e in asked if not is_expression(e.name)}
-    before, after = _allowed_pairs(first_rights, names), _allowed_pairs(second_rights, names)
-    present = unfolded(right for right in second_rights if right.qualifier is not DENY)
-    others = {
-        word: Names(sorted(right.name for right in present if right.right == word))
-        for word in touched
-    }
-    lost = before - after
-    lost |= {
-        (OTHER_SIDE[right.right], right.name)
-        for right in asked
-        if is_expression(right.name)
-        and right.right not in ("call", "execute")
-        and not others[OTHER_SIDE[right.right]].meets(right.name)
-    }
-    return sorted(right for right in asked if (OTHER_SIDE[right.right], right.name) in lost)
-
-
-def _is_offered_by_every_node(name: str) -> bool:
-    return name in ("/rosout", "/parameter_events") or name.rpartition("/")[2] in NODE_SERVICES
-
-
-def _allowed_pairs(
-    rights: Iterable[Right], names: Iterable[tuple[str, str]]
-) -> set[tuple[str, str]]:
-    """Return the pairs of a right and a name that the rights allow to at least one enclave."""
-    rules, enclaves = Rules(rights), {right.enclave for right in rights}
-    return {
-        (word, name)
-        for word, name in names
-        if any(rules.allow(enclave, word, name) for enclave in enclaves)
-    }
 
 
 def _protection_differences(

@@ -14,7 +14,7 @@ import codecs
 import re
 from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -41,11 +41,14 @@ from sros_tool.policy.rights import (
     GroupRights,
     Right,
     Rules,
+    compare,
     folded,
     group_rights,
     order,
     policy_rights,
     profile_rights,
+    unanswered_rights,
+    unanswered_text,
     unfolded,
 )
 from sros_tool.values import DryRun, FileChanges, Notes, shows
@@ -229,6 +232,19 @@ def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
             text = f"{denied} stays, and overrides requested rights: {shown_text}."
             notes.append(Note("merge.still-denied", text))
     return tuple(notes)
+
+
+def counterpart_notes(policies: Iterable[Policy], merged: Collection[Right]) -> Iterator[Note]:
+    """Yield a note on the ``merged`` rights whose counterpart only one of the ``policies`` has.
+
+    A DENY of another policy, or another name, took the counterpart away.
+    """
+    lost: set[Right] = set()
+    for rights in map(policy_rights, policies):
+        lost.update(unanswered_rights(rights, merged, compare(rights, merged)))
+    if lost:
+        text = first_few(list(map(unanswered_text, sorted(lost))), _SHOWN, "; ", ", and ")
+        yield Note("merge.no-counterpart", f"{text}.")
 
 
 _MARKUP = re.compile(

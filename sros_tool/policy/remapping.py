@@ -20,6 +20,7 @@ from typing import NamedTuple
 from sros_tool.errors import Note, UsageError
 from sros_tool.names import (
     ACTION_PARTS,
+    NODE_SERVICES,
     check_namespace,
     expand,
     expression_problem,
@@ -28,12 +29,13 @@ from sros_tool.names import (
 from sros_tool.policy.model import ALLOW, DENY, Group, Policy, Profile
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, Rules, placed_rights, policy_rights
-from sros_tool.wording import enumerated
+from sros_tool.wording import enumerated, first_few
 
 _RULE = re.compile(r"(?:([A-Za-z_]\w*):)?([^:=]+):=([^:=]+)")
 _NODE_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _NODE, _NAMESPACE = "__node", "__ns"
 _EMPTY = Policy(())
+_SHOWN = 3
 
 
 class Remapping(NamedTuple):
@@ -130,7 +132,35 @@ def remapped_policies(
             )
             notes.append(Note("merge.remapped-action", text))
     result = [policy for policy, _ in remapped]
+    notes += _notes_on_requirements(policies, rules)
     return result, [*notes, *_notes_on_old_names(file, result, moved)]
+
+
+def _notes_on_requirements(
+    policies: Iterable[Policy], rules: Iterable[Remapping]
+) -> Iterator[Note]:
+    """Yield a note on the names that no node has any more, but for services of every node.
+
+    A requirement that says who may use such a name holds, whoever may use the new one.  A namespace
+    does not count: `sros check` puts requirements into one, too.
+    """
+    of_names = [rule for rule in rules if rule.old != _NAMESPACE]
+    before, after = (
+        {
+            (right.kind, right.name)
+            for policy in side
+            for right in policy_rights(policy)
+            if right.qualifier is not DENY
+        }
+        for side in (policies, [remapped_policy(policy, of_names)[0] for policy in policies])
+    )
+    gone = {name for _, name in before - after if name.rpartition("/")[2] not in NODE_SERVICES}
+    if gone:
+        text = (
+            f"requirements that name {first_few(sorted(gone), _SHOWN)} do not apply to the new "
+            "name: write it in a copy of them, as docs/howto/package.md says."
+        )
+        yield Note("merge.requirements-of-old-names", text)
 
 
 def _notes_on_old_names(

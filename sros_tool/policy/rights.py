@@ -25,6 +25,7 @@ from sros_tool.names import (
 from sros_tool.policy.model import (
     ALLOW,
     DENY,
+    OFFERING_SIDE,
     OTHER_SIDE,
     RIGHTS,
     Enclave,
@@ -511,3 +512,70 @@ def nodes_from_text(text: str) -> tuple[NodeName, ...]:
     """Parse the text that `nodes_as_text` returns."""
     pairs = (node.partition(" ") for node in text.split(", ") if node)
     return tuple(NodeName(ns, name) for ns, _, name in pairs)
+
+
+def unanswered_rights(
+    first_rights: Collection[Right], second_rights: Collection[Right], difference: RightsDifference
+) -> list[Right]:
+    """Return the ``second_rights`` whose other side enclaves have only in ``first_rights``.
+
+    For example, a right to subscribe to a topic that no enclave may publish any more, because the
+    right to publish it is gone or denied, or a right to publish a topic that is not subscribed to.
+    A right to a wildcard counts if the other side has no name any more that it matches.  What every
+    node offers, such as its parameters, needs nobody who uses it.
+    """
+    reduced = [right for right in difference.only_first if right.qualifier is not DENY]
+    reduced += (right for right in difference.only_second if right.qualifier is DENY)
+    names_of: dict[str, set[str]] = defaultdict(set)
+    for right in reduced:
+        names_of[right.right].add(right.name)
+    touched = {word: Names(sorted(names)) for word, names in names_of.items()}
+    asked = [
+        right
+        for right in second_rights
+        if (other := OTHER_SIDE[right.right]) in touched
+        and right.qualifier is not DENY
+        and touched[other].meets(right.name)
+        and (right.right in OFFERING_SIDE or not _is_offered_by_every_node(right.name))
+    ]
+    if not asked:
+        return []
+    names = {(OTHER_SIDE[e.right], e.name) for e in asked if not is_expression(e.name)}
+    before, after = _allowed_pairs(first_rights, names), _allowed_pairs(second_rights, names)
+    present = unfolded(right for right in second_rights if right.qualifier is not DENY)
+    others = {
+        word: Names(sorted(right.name for right in present if right.right == word))
+        for word in touched
+    }
+    lost = before - after
+    lost |= {
+        (OTHER_SIDE[right.right], right.name)
+        for right in asked
+        if is_expression(right.name)
+        and right.right not in ("call", "execute")
+        and not others[OTHER_SIDE[right.right]].meets(right.name)
+    }
+    return sorted(right for right in asked if (OTHER_SIDE[right.right], right.name) in lost)
+
+
+def _is_offered_by_every_node(name: str) -> bool:
+    return name in ("/rosout", "/parameter_events") or name.rpartition("/")[2] in NODE_SERVICES
+
+
+def _allowed_pairs(
+    rights: Iterable[Right], names: Iterable[tuple[str, str]]
+) -> set[tuple[str, str]]:
+    """Return the pairs of a right and a name that the rights allow to at least one enclave."""
+    rules, enclaves = Rules(rights), {right.enclave for right in rights}
+    return {
+        (word, name)
+        for word, name in names
+        if any(rules.allow(enclave, word, name) for enclave in enclaves)
+    }
+
+
+def unanswered_text(right: Right) -> str:
+    """Return the text on one of the `unanswered_rights`."""
+    other = OTHER_SIDE[right.right]
+    other = {"reply": "serve", "subscribe": "subscribe to"}.get(other, other)
+    return f"{right.enclave} may {right.right} {right.name}, but no enclave may {other} it any more"

@@ -17,7 +17,7 @@ from benchmarks.inputs import enclaves_policy, topics_policy
 from sros_tool.files import policies_dir, replace_file
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
-from tests.support.harness import policy_text, publish, snapshot, sros, with_includes
+from tests.support.harness import policy_text, publish, snapshot, sros, subscribe, with_includes
 from tests.support.long_form import sometimes
 
 DENY = '<topics publish="DENY"><topic>cmd_vel</topic></topics>'
@@ -97,6 +97,23 @@ def test_the_names_of_a_merged_policy_are_remapped(folder: Path) -> None:
     assert [right["name"] for right in json.loads(ended.out)["added"]] == ["/front/image"]
     ended = sros(*words, "imag:=/front/image", cwd=folder)
     assert (ended.status, "no policy to merge has this name" in ended.err) == (2, True), ended
+
+
+def test_a_merge_that_takes_a_counterpart_away_says_so(folder: Path) -> None:
+    """By another name, or by a DENY; twin: the merge that leaves the name."""
+    (folder / "cam.xml").write_text(policy_text({"/cam": publish("/image")}))
+    (folder / "own.xml").write_text(policy_text({"/b": subscribe("/image")}))
+    (folder / "both.xml").write_text(sros("merge_policy", "own.xml", "cam.xml").ok().out)
+    denial = publish("/image").replace("ALLOW", "DENY")
+    (folder / "deny.xml").write_text(policy_text({"/cam": denial}))
+    lost = "note [merge.no-counterpart]: /b may subscribe /image, but no enclave may publish it any"
+    for words, said in (
+        (("own.xml", "cam.xml", "--remap", "image:=/front/image"), True),
+        (("both.xml", "deny.xml"), True),
+        (("own.xml", "cam.xml"), False),
+        (("both.xml", "cam.xml", "--remap", "image:=/front/image"), False),
+    ):
+        assert (lost in sros("merge_policy", *words).ok().err) == said, words
 
 
 def test_many_rights_of_a_merge_are_folded_by_enclave(folder: Path) -> None:

@@ -25,6 +25,8 @@ from sros_tool.policy.remapping import parse_remapping, remapped_policies, remap
 from sros_tool.policy.rights import Right, policy_rights
 from tests.policy.drawn_policies import PATHS, effective, meant, policies
 
+OF_REQUIREMENTS = "merge.requirements-of-old-names"
+
 
 def one(*groups: Group, node: str = "n") -> Policy:
     return Policy((Enclave("/a", (Profiles((Profile("/", node, groups),)),)),))
@@ -148,13 +150,14 @@ def test_a_denial_of_an_old_name_in_the_file_is_told() -> None:
     file = one(group("topics", "/*x", publish="DENY"), node="m")
     camera = one(group("topics", "x", publish="ALLOW"))
     _, notes = remapped_policies([camera], ["x:=/mux/speed"], file)
-    assert [note.id for note in notes] == ["merge.old-name-denied"]
-    assert "/a DENY publish topic /*x at" in notes[0].text
+    assert [note.id for note in notes] == [OF_REQUIREMENTS, "merge.old-name-denied"]
+    assert "/a DENY publish topic /*x at" in notes[1].text
     for others, rule in (
         ([], "x:=/front/x"),
         ([one(group("topics", "/mux/*", publish="DENY"), node="m")], "x:=/mux/speed"),
     ):
-        assert remapped_policies([camera, *others], [rule], file)[1] == []
+        _, notes = remapped_policies([camera, *others], [rule], file)
+        assert [note.id for note in notes] == [OF_REQUIREMENTS]
 
 
 def test_names_that_are_exchanged_are_denied_as_before() -> None:
@@ -173,12 +176,13 @@ def test_what_nodes_remap_otherwise_is_noted() -> None:
     for texts, ids, told in (
         (
             ["plan:=/arm/plan"],
-            ["merge.remapped-action"],
+            ["merge.remapped-action", OF_REQUIREMENTS],
             f"earlier versions with `--ros-args {rules}`.",
         ),
         (["__node:=x"], ["merge.remapped-nodes"], "name to the nodes hand and n. Choose the node"),
         (["n:__node:=x"], [], ""),
         (["__ns:=/left"], [], ""),
+        (["/plan:=/y"], ["merge.remapped-action", OF_REQUIREMENTS], "that name /plan do not apply"),
     ):
         _, notes = remapped_policies(nodes, texts)
         assert [note.id for note in notes] == ids
