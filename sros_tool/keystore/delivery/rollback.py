@@ -144,12 +144,13 @@ def check_rollback(
     if foreign := _foreign_authorities(keystore, present, files):
         path, authority = next(iter(foreign.items()))
         raise KeystoreError(
-            f"'{target / path}' has no CA that the keystore has or had",
+            f"'{target / path}' has no CA that the keystore has, or had by its ledger",
             f"It trusts {authority_text(authority)}, and the keystore's CA is "
             f"{_first_authority(files, path)}: the robot could no longer communicate with "
             "others of its keystore, and its revocation list would go. Nothing was changed.",
             f"Export from the keystore that these files are from. If '{keystore.root}' is right, "
-            "such as in place of a lost one (docs/howto/keystore_is_lost.md), first "
+            "such as in place of a lost one (docs/howto/keystore_is_lost.md), or if a rotation is "
+            "missing in its ledger, first "
             f"{_removal_of(target, foreign)}",
         )
     if lost := _lost_revocations(keystore, present, files, now):
