@@ -118,10 +118,14 @@ def read_name(name: x509.Name) -> None:
 def read_name_der(name: bytes) -> None:
     """Parse every part of a distinguished name in DER, as `read_name` does."""
     canonical_der(name)
-    for part in der.children(der.first_value(name).content):
+    whole = der.first_value(name)
+    parts = der.children(whole.content)
+    if whole.tag != der.SEQUENCE or any(part.tag != der.SET for part in parts):
+        raise ValueError("not the structure of a name")
+    for part in parts:
         for attribute in der.children(part.content):
             oid, value = der.children(attribute.content)
-            if (part.tag, attribute.tag, oid.tag) != (der.SET, der.SEQUENCE, der.OID):
+            if (attribute.tag, oid.tag) != (der.SEQUENCE, der.OID):
                 raise ValueError("not the structure of a name")
             if value.tag not in _IN_NAMES:
                 raise ValueError(f"a value of a name has the ASN.1 type {value.tag}")

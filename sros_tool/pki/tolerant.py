@@ -32,6 +32,7 @@ _DIGITS = {der.UTC_TIME: 12, der.GENERALIZED_TIME: 14}
 _FIRST_YEAR = 1950
 """The first year of a UTCTime (RFC 5280, 4.1.2.5.1)."""
 _CONTEXT_2 = 0x82
+_CONTEXT_3 = 0xA3
 _UNIQUE_IDENTIFIERS = (0x81, _CONTEXT_2)
 
 
@@ -170,12 +171,12 @@ class _TolerantCertificate(_Signed):
         parts = self._parts
         number = 0
         if parts[0].tag == der.CONTEXT_0:
-            number = der.integer(der.first_value(parts.pop(0).content))
+            number = _integer(_only(parts.pop(0)))
         self.version = x509.Version.v1 if number == 0 else x509.Version.v3
         self.number = number + 1
         serial, algorithm, issuer, validity, subject, key, *rest = parts
         _algorithm(algorithm)
-        self.serial_number = der.integer(serial)
+        self.serial_number = _integer(serial)
         self.issuer, self.subject = _name(issuer.whole), _name(subject.whole)
         begin, end = _sequence(validity)
         self.unread_dates = [
@@ -187,9 +188,10 @@ class _TolerantCertificate(_Signed):
         _algorithm(algorithm)
         _check_bits(bits)
         self._key = _public_key(key.whole)
-        while rest and rest[0].tag in _UNIQUE_IDENTIFIERS:
-            rest.pop(0)
-        values = _sequence(der.first_value(rest.pop(0).content)) if rest else []
+        for identifier in _UNIQUE_IDENTIFIERS:
+            if rest and rest[0].tag == identifier:
+                rest.pop(0)
+        values = _sequence(_only(rest.pop(0))) if rest and rest[0].tag == _CONTEXT_3 else []
         if rest:
             raise ValueError("its signed part has extra fields that a certificate does not have")
         self.extensions = _read(values, _parse_in_certificate, _LOOSE_OF_CERTIFICATES)
@@ -233,7 +235,7 @@ class _TolerantList(_Signed):
         self.last_update_utc = dates[0]
         self.next_update_utc = dates[1] if len(dates) == 2 else None
         entries = _sequence(rest.pop(0)) if rest and rest[0].tag == der.SEQUENCE else []
-        values = _sequence(der.first_value(rest.pop(0).content)) if rest else []
+        values = _sequence(_only(rest.pop(0))) if rest and rest[0].tag == der.CONTEXT_0 else []
         if rest:
             raise ValueError(
                 "its signed part has extra fields that a revocation list does not have"
@@ -390,6 +392,18 @@ def _algorithm(value: der.Value) -> ObjectIdentifier:
 def _check_bits(value: der.Value) -> None:
     if value.tag != der.BIT_STRING or not value.content or value.content[0] > 7:
         raise ValueError("not a BIT STRING")
+
+
+def _integer(value: der.Value) -> int:
+    if value.tag != der.INTEGER:
+        raise ValueError("not an INTEGER")
+    return der.integer(value)
+
+
+def _only(value: der.Value) -> der.Value:
+    """Return the value in one with an explicit tag."""
+    (inner,) = der.children(value.content)
+    return inner
 
 
 def _public_key(data: bytes) -> object:

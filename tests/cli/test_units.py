@@ -110,10 +110,12 @@ def test_a_validity_that_is_too_short_for_the_daily_job(
 
 def test_files_with_a_shorter_validity_than_the_settings_choose(tmp_path: Path) -> None:
     root = tmp_path / "ks"
-    sros("create_keystore", root, "--ca-validity", "4d").ok()
+    sros("create_keystore", root, "--ca-validity", "100h").ok()
     sros("create_enclave", root, "/a").ok()
     said = sros("units", root, "--job", "renew", tmp_path / "units").ok().err
-    assert "files of /a are valid for 4 d, and count as expiring soon only in the last 1 d" in said
+    assert (
+        "files of /a are valid for 4 d 4 h, and count as expiring soon only in the last 1 d" in said
+    )
 
 
 def test_messages_are_collected_and_releases_published(made: Path, tmp_path: Path) -> None:

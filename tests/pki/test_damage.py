@@ -167,6 +167,10 @@ DAMAGED_PARTS = {
     "the algorithm of the key": ("2a8648ce3d0201", "2a8648ce3d0281"),
     "the curve of the key": ("2a8648ce3d030107", "2a8648ce3d030187"),
     "unused bits of the key": ("034200", "034245"),
+    "the tag of the version": ("a003020102", "a003040102"),
+    "the tag of the extensions": ("a366", "a466"),
+    "the tag of the list of extensions": ("a3663064", "a3663164"),
+    "the tag of the type of an attribute": ("0603550403", "0403550403"),
 }
 
 
