@@ -529,6 +529,7 @@ def units(
       $ sros units /etc/sros/keystore --job agent units  # on a robot
     """
     from sros_tool.runtime.units import (
+        SIGNING_JOBS,
         WrittenUnits,
         job_units,
         unit_changes,
@@ -542,7 +543,7 @@ def units(
     if not rest or not (rest[1:] or several or jobs):
         raise UsageError("units takes a keystore, enclaves or --job, and a folder")
     folder = PATH.convert(rest[-1], None, None)
-    if passphrase is not None and not {Job.RENEW, Job.COLLECT}.intersection(jobs):
+    if passphrase is not None and not SIGNING_JOBS.intersection(jobs):
         raise UsageError("--passphrase-file is only for --job renew and --job collect")
     if {inbox is not None, publishing is not None} != {Job.COLLECT in jobs}:
         raise UsageError("--job collect needs --inbox INBOX and --publish PUB; no other job does")
@@ -588,8 +589,11 @@ def units(
         raise UsageError("COMMAND is for nodes, and no enclave is named")
     if passphrase:
         notes = [*notes, *passphrase_file_notes(Path(passphrase))]
-    if Job.RENEW in jobs:
-        notes = [*notes, *_late_renewal_notes(OpenedKeystore(root))]
+    if signing := SIGNING_JOBS.intersection(jobs):
+        keystore = OpenedKeystore(root)
+        _ = keystore.authority_files  # raises an error for an export
+        if Job.RENEW in signing:
+            notes = [*notes, *_late_renewal_notes(keystore)]
     for job in jobs:
         files |= job_units(
             Job(job),

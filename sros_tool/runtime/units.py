@@ -99,7 +99,7 @@ _SPREAD = {
     Job.FLEET: "30s",
     Job.COLLECT: "30s",
 }
-_SIGNING = frozenset({Job.RENEW, Job.COLLECT})
+SIGNING_JOBS = frozenset({Job.RENEW, Job.COLLECT})
 """The jobs that need the keys of the CAs."""
 
 
@@ -313,7 +313,7 @@ def job_units(
     if job is Job.COLLECT:
         _check_path(inbox, "the inbox")
         _check_path(publishing, "the publishing folder")
-    if passphrase and job in _SIGNING:
+    if passphrase and job in SIGNING_JOBS:
         _check_path(passphrase, "the file")
         own_lines += [
             f"LoadCredential=ca-passphrase:{passphrase}",

@@ -118,6 +118,17 @@ def test_files_with_a_shorter_validity_than_the_settings_choose(tmp_path: Path) 
     )
 
 
+@pytest.mark.parametrize(
+    "verb", ["units {0} --job renew {0}/units", "renew {0} --all-expiring soon"]
+)
+def test_an_export_is_never_renewed(verb: str, made: Path, tmp_path: Path) -> None:
+    sros("distribute_key", made, "--all", tmp_path / "export").ok()
+    words = verb.format(tmp_path / "export").split()
+    ended = sros(*words)
+    assert ended.status == 2 and "has no identity CA" in ended.err, ended
+    assert not (tmp_path / "export/units").exists()
+
+
 def test_messages_are_collected_and_releases_published(made: Path, tmp_path: Path) -> None:
     folders = ("--inbox", tmp_path / "in", "--publish", tmp_path / "pub")
     sros(

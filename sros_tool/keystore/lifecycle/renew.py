@@ -90,6 +90,7 @@ def renew(
                 text = f"short-lived, and renewed only if named: {first_few(short_lived, 3)}"
                 change.notes.append(Note("renew.short-lived", text))
         if not wanted:  # no CA key is asked for
+            _ = change.keystore.authority_files  # raises an error for an export, never renewed
             change.notes += change.keystore.ledger_file.clock_notes(change.now)
             with suppress(SrosError):
                 change.notes += change.edit_notes()
