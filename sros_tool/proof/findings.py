@@ -134,7 +134,8 @@ class Decided:
     ``assumed`` are requirements that hold only with the assumed protection of the default template,
     each with a name whose protection the policy does not state.  ``kept`` are requirements that
     hold, each with a use that does not pass between Zenoh routers.  ``unnamed`` are requirements
-    that hold, each with its names that no right states.
+    that hold, each with its names that no right states.  ``unjudged`` are enclaves that an export
+    lacks, and that have to have rights.
     """
 
     violations: tuple[Violation, ...]
@@ -142,6 +143,7 @@ class Decided:
     assumed: tuple[tuple[Requirement, str], ...] = ()
     kept: tuple[tuple[Requirement, KeptUse], ...] = ()
     unnamed: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
+    unjudged: tuple[str, ...] = ()
 
 
 def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
@@ -153,7 +155,12 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
     violations, vacuous, assumed, kept, unnamed = [], [], [], [], []
     limit = SearchLimit(MOST_STEPS)
     worlds = Worlds(system.worlds)
+    known = {enclave for world in system.worlds for enclave in world.enclaves}
+    demanded = [r.enclave for r in requirements if isinstance(r, Must) and r.enclave not in known]
+    unjudged = tuple(dict.fromkeys(demanded)) if system.is_export else ()
     for requirement in requirements:
+        if isinstance(requirement, Must) and requirement.enclave in unjudged:
+            continue
         verdicts = list(worlds.decide(requirement, limit))
         broken = [(world, verdict.witness) for world, verdict in verdicts if verdict.witness]
         if broken:
@@ -161,7 +168,6 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
             steps = tuple(_step(use, world, system) for use in witness.uses)
             titles = tuple(world.title for world, _ in broken)
             titles = () if len(broken) == len(system.worlds) else titles
-            known = {enclave for world in system.worlds for enclave in world.enclaves}
             missing = next(
                 (enclave for enclave in witness.enclaves if enclave and enclave not in known), ""
             )
@@ -184,7 +190,9 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
         ):
             assumed.append((requirement, assumed_names[0]))
         kept += [(requirement, verdict.kept) for _, verdict in verdicts if verdict.kept][:1]
-    return Decided(tuple(violations), tuple(vacuous), tuple(assumed), tuple(kept), tuple(unnamed))
+    return Decided(
+        tuple(violations), tuple(vacuous), tuple(assumed), tuple(kept), tuple(unnamed), unjudged
+    )
 
 
 def _step(use: Use, world: World, system: System) -> Step:
@@ -261,6 +269,8 @@ def decided_findings(
     findings += [_not_crossing_finding(*kept_use) for kept_use in decided.kept]
     if system.is_export:
         text = "only the enclaves in this export were judged: others of its keystore may be missing"
+        if decided.unjudged:
+            text += f", such as {first_few(decided.unjudged, _SHOWN)}, which should have rights"
         findings.append(OF_EXPORT.found(system.file, text, system.file))
     if system.left_out:
         error = system.left_out

@@ -169,6 +169,12 @@ def test_an_export_is_judged_without_the_enclaves_that_it_lacks(tmp_path: Path) 
     assert "[requirement.of-export]" in ended.out and "nothing found" not in ended.err
     assert "Check the keystore that the export comes from." in ended.out
     assert "of-export" not in sros("check", "ks", *asked, cwd=tmp_path).out
+    demand = '[[must]]\nenclave = "%s"\npublish = ["/cmd_vel"]\n'
+    (tmp_path / "required.toml").write_text(demand % "/web")
+    ended = sros("check", "robot", *asked, cwd=tmp_path).ok()
+    assert "may be missing, such as /web, which should have rights" in ended.out
+    (tmp_path / "required.toml").write_text(demand % "/gone")
+    assert "/gone: does not exist" in sros("check", "ks", *asked, cwd=tmp_path).out
 
 
 def test_a_policy_that_zenoh_cannot_carry_out(folder: Path, tmp_path: Path) -> None:
