@@ -112,7 +112,7 @@ class KeystoreSet:
         return self.enclave(party.identity) if party.identity.keystore is not None else ""
 
     def shorten(self, identity: Identity, lifetime: int, elapsed: float) -> float:
-        """Issue a certificate for an identity's enclave that expires soon; return the seconds left.
+        """Replace an enclave's certificate by one that expires soon; return the seconds left.
 
         ``lifetime`` is its validity in seconds, and ``elapsed`` the time since the keystores were
         made. The result can differ from ``lifetime``, because certificates have whole seconds.

@@ -243,7 +243,7 @@ class _Case:
         self.talker = record.parties.get(claim.talker, self.subject)
 
     def result(self, holds: bool, detail: str) -> _Finding:
-        """Return the finding that the claim's relation ``holds``, or that it does not."""
+        """Return the finding of a claim whose relation ``holds`` or does not hold."""
         return _Finding(OUTCOMES[self.claim.relation][holds], detail)
 
     def messages_sent(self, party: PartyRecord) -> list[Event]:

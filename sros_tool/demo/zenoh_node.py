@@ -202,7 +202,7 @@ class _ZenohNode:
         self._keep(graph.declare_subscriber(f"@ros2_lv/{self._domain}/**", change, history=True))
 
     def publications(self) -> Sequence[str]:
-        """Return topics of publishers and services of servers that are there, as in tokens."""
+        """Return the topics that have a publisher and the services that have a server now."""
         tokens = [token for token in tuple(self._graph) if _kind_of(token) in ("MP", "SS")]
         return [token.split("/")[9] for token in tokens]
 

@@ -107,7 +107,7 @@ class DistributionAnswer(NamedTuple):
 
     @property
     def measured(self) -> bool:
-        """Whether the decision is by rules that were tested with this release."""
+        """Whether the rules that decide were tested with this release of the DDS."""
         return self.shipped.tested
 
     @property

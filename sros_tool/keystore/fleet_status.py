@@ -1109,7 +1109,7 @@ class _KeystoreRecords:
         return tuple(sorted(name for name in names if not self._keystore.has_enclave(name)))
 
     def short_lived(self, first: Mapping[str, _Expiring]) -> tuple[str, ...]:
-        """Return the short-lived enclaves of the files ``first``, which expire first."""
+        """Return the short-lived enclaves in ``first``, the first file of each kind to expire."""
         names = {file.enclave for file in first.values() if file.enclave}
         template = self._keystore.template
         return tuple(sorted(name for name in names if template.longest_validity(name) is not None))

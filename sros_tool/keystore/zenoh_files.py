@@ -481,7 +481,7 @@ def zenoh_documents(
         existing: the enclaves of the keystore; None searches for them.
         only_enclaves: the enclaves whose configurations are made, and that count as existing; ()
             for all.
-        among: the enclaves whose rights these configurations have; () for all.
+        among: the enclaves whose rights are written into these configurations; () for all.
     """
     root = keystore.root
     of_network = _domains(network, domains, keystore)

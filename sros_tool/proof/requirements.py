@@ -147,9 +147,9 @@ class AtMost(RightsRequirement):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Widest(RightsRequirement):
-    """Wildcards may give the enclaves these rights only to these names; to none if none is listed.
+    """The only names for which the enclaves may have these rights by a wildcard; none if empty.
 
-    A name that an enclave may use because a right states exactly that name does not count.
+    Rights that state a name exactly are not restricted.
     """
 
     KIND = "widest"

@@ -214,8 +214,8 @@ class PicturedEnclave:
     """An enclave in a picture; ``group`` is its host or its namespace.
 
     ``subject``, ``issuer``, ``serial`` and ``key`` describe its certificate; "" without one.
-    ``problems`` keep a process from using it.  In an overlay of use, an enclave that was not
-    ``observed`` counts as neither used nor unused.  ``note`` stands on its card.
+    ``problems`` keep a process from using it.  If the picture also shows which rights were used, an
+    enclave that was not ``observed`` counts as neither.  ``note`` stands on its card.
     """
 
     path: str
@@ -433,9 +433,9 @@ class EqualUnits(NamedTuple):
 
 
 class UnreadUnits(NamedTuple):
-    """Units of a large keystore of which only the text of their permissions was compared.
+    """Units of a large keystore whose permissions were compared as text, but not parsed.
 
-    That text equals the text of the unit ``like``, except for the names.  ``enclaves`` is the
+    The text equals that of the unit ``like``, except for the names.  ``enclaves`` is the
     number of enclaves of the ``members``.
     """
 

@@ -290,7 +290,7 @@ _MOST_COMMON = 4096
 
 
 class TooManyExpressions(Exception):  # noqa: N818 - the caller makes an error of it
-    """The common keys of two key expressions take too many key expressions."""
+    """Too many key expressions would be needed for the keys that two key expressions share."""
 
 
 def common(first: str, second: str) -> list[str]:

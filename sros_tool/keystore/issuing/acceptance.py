@@ -205,7 +205,7 @@ def _stopped_enclaves(
 
 
 def refusals(name: str, files: Files, now: datetime) -> dict[Vendor, str]:
-    """Map each tested vendor that refuses an enclave with these files to the reason.
+    """Return the tested vendors that refuse an enclave with these files, each with the reason.
 
     ``files`` has the content of the files by name.  The private key is assumed to belong to the
     certificate.
