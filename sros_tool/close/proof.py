@@ -38,6 +38,7 @@ from sros_tool.graph.observation import (
 )
 from sros_tool.keystore.layout import list_enclaves
 from sros_tool.names import expand, is_expression
+from sros_tool.proof.requirements import Must, read_requirements
 from sros_tool.runtime.environment import ROS_ARGS, named_enclave
 from sros_tool.runtime.variables import ENCLAVE
 from sros_tool.wording import counted, enumerated, first_few
@@ -147,17 +148,25 @@ def _errors_text(robot: LocalRobot) -> str:
 def _proof_of_requirements(robot: LocalRobot) -> Iterator[Proof]:
     """Decide the requirements for the enclaves that the processes use.
 
-    With processes on other machines, also for the enclaves of the keystore, or of the policy.
+    With processes on other machines, or a demand for an enclave that the export does not have, also
+    for the enclaves of the keystore, or of the policy.
     """
     if not robot.requirements.exists():
         return
     needed = ("--requirements", str(robot.requirements), "--include", "requirement.*")
-    places = [robot.export, *[robot.rights_source] * bool(robot.not_here)]
-    statuses = [robot.shell.check(str(place), *needed) for place in places]
+    statuses = [robot.shell.check(str(robot.export), *needed)]
+    if robot.not_here or (statuses != [2] and _demands_more_enclaves(robot)):
+        statuses.append(robot.shell.check(str(robot.rights_source), *needed))
     status = 1 if 1 in statuses else max(statuses)
     reasons = {0: "all of them", 1: "one is violated", 2: "sros could not check them"}
     holds = {0: True, 1: False}.get(status)
     yield Proof("the requirements hold", holds, f"{reasons[status]}: {robot.requirements}")
+
+
+def _demands_more_enclaves(robot: LocalRobot) -> bool:
+    required = read_requirements(robot.requirements)
+    demanded = {requirement.enclave for requirement in required if isinstance(requirement, Must)}
+    return not demanded.issubset(list_enclaves(robot.export))
 
 
 def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) -> Proof:

@@ -394,7 +394,7 @@ def _with_requirements(
         decided_findings,
         short_text,
     )
-    from sros_tool.proof.requirements import demand, read_requirements
+    from sros_tool.proof.requirements import Must, demand, read_requirements
     from sros_tool.proof.system import load_system
 
     if len(drawing.sources) > 1:
@@ -422,7 +422,12 @@ def _with_requirements(
     assumed = tuple(
         f"{demand(requirement)}: {assumption_text(name)}" for requirement, name in decided.assumed
     )
-    requirements = Requirements(len(stated) - len(violations), violations, assumed)
+    judged = [
+        requirement
+        for requirement in stated
+        if not (isinstance(requirement, Must) and requirement.enclave in decided.unjudged)
+    ]
+    requirements = Requirements(len(judged) - len(violations), violations, assumed)
     paths = {enclave.path for enclave in picture.enclaves}
     pictured = tuple(_pictured_finding(finding, paths) for finding in findings)
     picture = replace(picture, findings=(*picture.findings, *pictured))

@@ -173,6 +173,8 @@ def test_an_export_is_judged_without_the_enclaves_that_it_lacks(tmp_path: Path) 
     (tmp_path / "required.toml").write_text(demand % "/web")
     ended = sros("check", "robot", *asked, cwd=tmp_path).ok()
     assert "may be missing, such as /web, which should have rights" in ended.out
+    viewed = sros("view", "robot", *asked[2:], "--json", cwd=tmp_path).ok()
+    assert json.loads(viewed.out)["requirements"]["hold"] == 0
     (tmp_path / "required.toml").write_text(demand % "/gone")
     assert "/gone: does not exist" in sros("check", "ks", *asked, cwd=tmp_path).out
 

@@ -79,19 +79,42 @@ def test_a_moved_node_is_left_alone_if_nobody_is_at_its_new_name() -> None:
     ],
 )
 def test_requirements_hold_if_they_hold_here_and_elsewhere(
-    statuses: tuple[int, ...], holds: bool | None
+    statuses: tuple[int, ...], holds: bool | None, tmp_path: Path
 ) -> None:
     """The first status is of the export, the second of the enclaves of other machines, too."""
     answers = iter(statuses)
+    required = tmp_path / "required.toml"
+    (tmp_path / "enclaves").mkdir()
+    (tmp_path / "enclaves" / "governance.p7s").touch()
+    required.write_text('[[nobody]]\npublish = ["/cmd_vel"]\n')
     robot: Any = SimpleNamespace(
-        requirements=Path(__file__),
-        export="export",
+        requirements=required,
+        export=tmp_path,
         rights_source="keystore",
         not_here=["/laptop"] * (len(statuses) > 1),
         shell=SimpleNamespace(check=lambda *_: next(answers)),
     )
     (proof,) = _proof_of_requirements(robot)
     assert proof.holds is holds
+
+
+def test_a_demand_for_an_enclave_that_the_export_lacks_is_judged_by_the_keystore(
+    tmp_path: Path,
+) -> None:
+    required = tmp_path / "required.toml"
+    (tmp_path / "enclaves").mkdir()
+    (tmp_path / "enclaves" / "governance.p7s").touch()
+    required.write_text('[[must]]\npublish = ["/cmd_vel"]\nenclave = "/pendant"\n')
+    answers = {f"{tmp_path}": 0, "keystore": 1}
+    robot: Any = SimpleNamespace(
+        requirements=required,
+        export=tmp_path,
+        rights_source="keystore",
+        not_here=[],
+        shell=SimpleNamespace(check=lambda place, *_: answers[place]),
+    )
+    (proof,) = _proof_of_requirements(robot)
+    assert proof.holds is False
 
 
 def test_a_node_that_others_do_not_see_on_zenoh_needs_its_enclave_in_its_command() -> None:
