@@ -117,7 +117,8 @@ def _check_folder(robot: LocalRobot) -> None:
             f"the keystore '{robot.keystore}' is not there, and '{robot.export}' was exported "
             "from it",
             "A new keystore would have other CAs.",
-            "Bring the keystore back to change the robot; --proof and --undo need only the export.",
+            "Bring the keystore back to change the robot; --proof and --undo need only the export, "
+            f"and '{robot.commands_file}' has the commands of processes that you start by hand.",
         )
     results = (robot.observation_file, robot.policy, robot.keystore, robot.export)
     if robot.folder.is_dir() and [*robot.folder.iterdir()] and not any(map(Path.exists, results)):

@@ -385,7 +385,11 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     assert len(robot.restarts) == 2  # they run in their enclaves already
     (robot.folder / "robot/keystore").rename(robot.folder / "home")
     assert "yes: everything that talked can still talk: 2 nodes" in robot.close("--proof").out
-    assert "A new keystore would have other CAs." in robot.close("--apply", status=2).err
+    refused = robot.close("--apply", status=2).err
+    assert "A new keystore would have other CAs." in refused
+    assert (
+        "'robot/start/commands.txt' has the commands of processes that you start by hand" in refused
+    )
     (robot.folder / "home").rename(robot.folder / "robot/keystore")
     refuse_undo_of_others(robot)
     undone = robot.close("--undo")
