@@ -565,8 +565,8 @@ def units(
     files: dict[str, str] = {}
     notes: list[Note] = []
     names: Sequence[str] = ()
+    keystore = OpenedKeystore(root)
     if rest[1:] or several:
-        keystore = OpenedKeystore(root)
         names = chosen_enclaves(keystore, rest[:-1], patterns, robots)
         place = target or Path(INSTALLED)
 
@@ -590,7 +590,6 @@ def units(
     if passphrase:
         notes = [*notes, *passphrase_file_notes(Path(passphrase))]
     if signing := SIGNING_JOBS.intersection(jobs):
-        keystore = OpenedKeystore(root)
         _ = keystore.authority_files  # raises an error for an export
         if Job.RENEW in signing:
             notes = [*notes, *_late_renewal_notes(keystore)]

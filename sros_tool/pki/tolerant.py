@@ -401,7 +401,7 @@ def _integer(value: der.Value) -> int:
 
 
 def _only(value: der.Value) -> der.Value:
-    """Return the value in one with an explicit tag."""
+    """Return the only value inside a value with an explicit tag."""
     (inner,) = der.children(value.content)
     return inner
 

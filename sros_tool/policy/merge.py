@@ -62,8 +62,8 @@ _SHOWN = 3
 class Contradiction:
     """A right that the policy file allows and a merged policy denies, or the reverse.
 
-    Or a merged policy allows it to a node, and denies it to another node of the same enclave.  The
-    right may be denied in part.  The denial always decides.
+    It is also one if a merged policy allows the right to a node, and denies it to another node of
+    the same enclave.  The right may be denied in part.  The denial always decides.
     """
 
     denied: Right

@@ -245,7 +245,7 @@ def robots_left_out(system: System, namespaces: Sequence[str]) -> list[Finding]:
     others = sorted(robot.name for robot in robots if robot.namespace not in above)
     if not others:
         return []
-    text = f"of the robots, {first_few(others, _SHOWN)} are in no namespace that was named"
+    text = f"in none of the namespaces that were named: {first_few(others, _SHOWN)}"
     return [ROBOTS_LEFT_OUT.found(system.file, text, system.file)]
 
 

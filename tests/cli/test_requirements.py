@@ -472,7 +472,7 @@ def test_a_robot_in_no_namespace_that_was_named_is_told(tmp_path: Path) -> None:
     (tmp_path / "r.toml").write_text('[[only]]\npublish = ["cmd_vel"]\nenclaves = ["/mux"]\n')
     asked = ("check", "p.xml", "--fleet", "fleet.toml", "--requirements", "r.toml")
     ended = sros(*asked, "--namespace", "/red", cwd=tmp_path)
-    assert "of the robots, blue, reddish are in no namespace that was named" in ended.out
+    assert "in none of the namespaces that were named: blue, reddish" in ended.out
     every = ("/red/left", "/reddish", "/hall/blue")
     named = [word for namespace in every for word in ("--namespace", namespace)]
     assert "robots-left-out" not in sros(*asked, *named, cwd=tmp_path).out

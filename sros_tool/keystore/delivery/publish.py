@@ -988,8 +988,8 @@ class _Run:
                 "Another keystore published them, or this keystore was restored from a backup from "
                 "before its permissions CA was replaced: publishing would undo later changes, such "
                 "as a revocation.",
-                "If the keystore was restored, first follow docs/howto/keystore_is_lost.md. Name "
-                "an empty folder.",
+                "If the keystore was restored, first follow docs/howto/keystore_is_lost.md. "
+                "Otherwise, name an empty folder.",
             )
 
     def _unknown_error(self, unknown: Sequence[Release]) -> KeystoreError:
@@ -1266,7 +1266,7 @@ class _Run:
             if path := next(missing, ""):
                 raise KeystoreError(
                     f"'{self._folder}' lacks {path}, which robots would fetch next",
-                    "Somebody has removed it just now. Robots still find all earlier files.",
+                    "Somebody has removed it. Robots still find all earlier files.",
                     "Find out who else changes files there, and publish again.",
                 )
             _put_file(folder, *timestamp)

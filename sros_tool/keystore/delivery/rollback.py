@@ -124,10 +124,10 @@ def check_rollback(
     files: Mapping[str, bytes],
     now: datetime,
 ) -> None:
-    """Raise `KeystoreError` if enclaves in ``target`` would trust again what they no longer trust.
+    """Raise `KeystoreError` if an export would undo a revocation or a rotation in ``target``.
 
-    Or if they trust only CAs of another keystore.  ``present`` maps paths in ``target`` to the
-    content of files, at least of CAs and lists.
+    It is also refused if the enclaves in ``target`` trust only CAs of another keystore.
+    ``present`` maps paths in ``target`` to the content of files, at least of CAs and lists.
     """
     if later := _later_authorities(keystore, present, files):
         path, authority = next(iter(later.items()))
@@ -181,7 +181,7 @@ def _removal_of(target: Path, paths: Iterable[str]) -> str:
     if target.name.endswith(SUFFIXES):
         return f"remove the archive: `rm {quote(str(target))}`."
     files = " ".join(quote(str(target / path)) for path in paths)
-    return f"remove the other: `rm {files}`."
+    return f"remove these files: `rm {files}`."
 
 
 def _first_authority(files: Mapping[str, bytes], path: str) -> str:
