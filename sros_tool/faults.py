@@ -468,7 +468,7 @@ def remedy_in_original_keystore(remedy: str) -> str:
 
     A remedy that goes on after the export is not done in the keystore alone.
     """
-    if "export the enclave again" in remedy.removesuffix("export the enclave again."):
+    if "export the enclave again" in remedy.lower().removesuffix("export the enclave again."):
         return f"{remedy} KEYSTORE is the {ORIGINAL_KEYSTORE}."
     then = "" if remedy.endswith("export the enclave again.") else " Then export the enclave again."
     return f"In the {ORIGINAL_KEYSTORE}: {remedy}{then}"

@@ -66,7 +66,7 @@ from sros_tool.runtime.environment import (
 from sros_tool.runtime.processes import Process, ProcessEnclave, RunningProcesses, plain
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW, vendor_of
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
-from sros_tool.validity import Window, iso, parse_iso
+from sros_tool.validity import Window, elapsed, iso, parse_iso
 from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.document import ZenohEndpoint
@@ -171,7 +171,8 @@ def _file_findings(process: Process, *, now: datetime, zone: tzinfo) -> Iterator
         yield PROCESS_NOT_SEEN.found(process.label, text)
         return
     newer = list(newer_files(process, enclave))
-    loaded = _loaded_files(enclave, newer, process.started)
+    changed = () if order_unknown(process) else newer  # most likely, it loaded these files
+    loaded = _loaded_files(enclave, changed, process.started)
     if revoked := loaded.revoked:
         yield PROCESS_REVOKED.found(process.label, f"the certificate of {name} was {revoked}")
     elif not enclave.is_there or len(enclave.lacking) == len(_required_files(enclave)):
@@ -181,7 +182,7 @@ def _file_findings(process: Process, *, now: datetime, zone: tzinfo) -> Iterator
             yield PROCESS_WITHOUT_FILES.found(process.label, f"{text}{unknown}")
         return
     elif newer:
-        text = f"it started at {iso(process.started)}; {', '.join(newer)} of {name} changed later"
+        text = _changed_text(process, f"{', '.join(newer)} of {name}")
         yield PROCESS_OUTDATED.found(process.label, text)
     ends = {
         document: window.not_after
@@ -200,6 +201,19 @@ def _file_findings(process: Process, *, now: datetime, zone: tzinfo) -> Iterator
         path = _plain_path(str(enclave_path(Path(enclave.keystore), enclave.name) / KEY_FILE))
         yield PROCESS_KEY_READABLE.found(process.label, f"the mode of '{path}' is {mode:04o}")
     yield from _unread_file_findings(process, enclave)
+
+
+def _changed_text(process: Process, files: str) -> str:
+    """Return that files changed since a process started, or may have, as a clause."""
+    if why := order_unknown(process):
+        return f"{why}, so it is not known whether {files} changed after its start"
+    return f"it started at {iso(process.started)}; {files} changed later"
+
+
+def order_unknown(process: Process) -> str:
+    """Return why times of files do not tell what changed since the start; "" if they do."""
+    advanced = process.clock_advanced
+    return f"the clock was set forward by {elapsed(advanced)} while it ran" if advanced else ""
 
 
 def _required_files(enclave: ProcessEnclave) -> Sequence[str]:
@@ -805,8 +819,8 @@ def zenoh_findings(process: Process) -> Iterator[Finding]:
         and configuration.changed > process.started
         and not process.asks_for_security
     ):
-        text = f"it started at {iso(process.started)}; {_plain_path(configuration.name)} "
-        yield PROCESS_OUTDATED.found(process.label, f"{text}changed later")
+        text = _changed_text(process, _plain_path(configuration.name))
+        yield PROCESS_OUTDATED.found(process.label, text)
 
 
 def _is_open(environment: Mapping[str, str]) -> bool:

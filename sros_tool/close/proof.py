@@ -58,25 +58,7 @@ def prove(robot: LocalRobot) -> CloseState:
     robot.check_rmw()
     state = current_state(robot, robot.read_policy())
     proofs = proofs_of(robot, state, _START_SECONDS)
-    fails = any(proof.fails for proof in proofs)
-    if not fails and robot.policy.exists() and (changed := _enclaves_changed(robot)):
-        where = "" if robot.keystore.exists() else ", where the keystore is,"
-        robot.shell.say(
-            f"'{robot.policy}' differs from the signed permissions of "
-            f"{first_few(changed, MOST_NAMES)}: `{robot.close_command}`"
-            f"{where} checks and signs it"
-        )
     return state._replace(proofs=proofs)
-
-
-def _enclaves_changed(robot: LocalRobot) -> list[str]:
-    """Return the enclaves whose signed rights differ from the policy."""
-    only = ("--include", STALE.id, "--json")
-    words = ("check", str(robot.export), "--policy", str(robot.policy), *only)
-    _, output, _ = robot.shell.run(words, False)
-    stale = [finding["subject"] for finding in json.loads(output)["findings"]]
-    unsigned = robot.policy_enclaves() - robot.not_here - {*list_enclaves(robot.export)}
-    return sorted({*stale} | unsigned)
 
 
 def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Proof]:
@@ -130,7 +112,29 @@ def _proof_of_files(robot: LocalRobot) -> Proof:
                 number = counted(len(changes), "file")
                 reason = f"{number} of '{robot.keystore}' would change there, such as {changes[0]}"
                 holds, reason = False, f"{reason}; `{robot.close_command}` exports them"
-    return Proof("the files are accepted", holds, f"{reason}: {robot.export}")
+    unsigned = _unsigned_policy_text(robot) if status == 0 else ""
+    return Proof("the files are accepted", holds, f"{reason}: {robot.export}{unsigned}")
+
+
+def _unsigned_policy_text(robot: LocalRobot) -> str:
+    """Return a clause on the enclaves whose signed rights differ from the policy; "" if none do."""
+    if not robot.policy.exists():
+        return ""
+    only = ("--include", STALE.id, "--json")
+    words = ("check", str(robot.export), "--policy", str(robot.policy), *only)
+    _, output, _ = robot.shell.run(words, False)
+    stale = [finding["subject"] for finding in json.loads(output)["findings"]]
+    unsigned = robot.policy_enclaves() - robot.not_here - {*list_enclaves(robot.export)}
+    changed = sorted({*stale} | unsigned)
+    if not changed:
+        return ""
+    remedy = f"`{robot.close_command}` checks and signs it"
+    if not robot.keystore.exists():
+        remedy = "bring the policy here that was signed, or sign this one where the keystore is"
+    return (
+        f"; '{robot.policy}' differs from the signed permissions of "
+        f"{first_few(changed, MOST_NAMES)}, which the processes use: {remedy}"
+    )
 
 
 def _errors_text(robot: LocalRobot) -> str:

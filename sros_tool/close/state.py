@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-from sros_tool.checks.processes import newer_files, zenoh_findings
+from sros_tool.checks.processes import newer_files, order_unknown, zenoh_findings
 from sros_tool.close.processes import (
     ClosedProcess,
     ObservedProcesses,
@@ -164,6 +164,8 @@ class RunningRobot:
             f"KEYSTORE {enclave.name} --new-key --revoke-old`, otherwise chmod 600; "
         )
         warning = readable if mode & 0o077 else ""
+        if clock := order_unknown(process):
+            return f"{warning}{clock}, and {newer} may have changed after the start of"
         return f"{warning}{newer} changed, or got another mode, after the start of"
 
     def with_later_processes(self, observed: ObservedProcesses) -> ObservedProcesses:

@@ -71,6 +71,8 @@ _SCRIPTS_OF_SROS = ("sros", "sros_tool")
 
 _LOADING = timedelta(milliseconds=20)
 """Shortest time from a process's start (known in steps of 10 ms) to loading its enclave."""
+_CLOCK_TOLERANCE = timedelta(seconds=1)
+"""Longest time by which the clock of a process's folder can be behind without having been set."""
 _MOST_BYTES = 4 * 1024 * 1024
 _MOST_MAPS = 32 * 1024 * 1024
 _MOST_TRIES = 3
@@ -103,7 +105,10 @@ class MappedLibrary(NamedTuple):
 class Process:
     """A running process that uses ROS 2, DDS or Zenoh.
 
-    ``started`` is the earliest moment at which it can have loaded its files.  ``libraries`` are the
+    ``started`` is the earliest moment at which it can have loaded its files, by the clock of that
+    moment; ``clock_advanced`` is how far the clock was set forward since, as far as that is known:
+    then ``started`` is a moment before which it cannot have started, and no better one is known.
+    ``libraries`` are the
     names of the libraries of ROS 2, DDS and Zenoh that it has mapped, such as "libddsc", and
     ``dds`` the DDS libraries with their versions.  ``network`` names its network
     namespace; "" is the namespace of this process.  ``enclave`` is the enclave that it names, if it
@@ -125,6 +130,7 @@ class Process:
     dds: tuple[MappedLibrary, ...] = ()
     forked_by: tuple[int, tuple[str, ...]] = (0, ())
     own_pid: int = 0
+    clock_advanced: timedelta = timedelta()
 
     @property
     def program(self) -> tuple[int, tuple[str, ...]]:
@@ -299,7 +305,7 @@ class ProcessTable:
 
         ``now`` is the time on the clock of this machine.
         """
-        begin = now - timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME)) + _LOADING
+        uptime = timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME))
         self._reader.begin()
         before, self._looked = self._looked, {}
         processes: list[Process] = []
@@ -310,7 +316,7 @@ class ProcessTable:
                 continue
             try:
                 with self._opened(pid) as folder:
-                    looked = self._look(pid, folder, before.get(pid), begin)
+                    looked = self._look(pid, folder, before.get(pid), now, uptime)
                     if looked is None:
                         continue
                     self._looked[pid] = looked
@@ -341,11 +347,17 @@ class ProcessTable:
             os.close(handle)
 
     def _look(
-        self, pid: int, folder: int, before: _ProcessData | None, begin: datetime
+        self,
+        pid: int,
+        folder: int,
+        before: _ProcessData | None,
+        now: datetime,
+        uptime: timedelta,
     ) -> _ProcessData | None:
         """Return the data of a process; None if it has ended or runs no program.
 
-        ``begin`` is the time from which the kernel counts the start times of processes.
+        The kernel counts the start times of processes from when the machine started: ``uptime``
+        ago.
         """
         for _ in range(_MOST_TRIES):
             stat = _stat(folder)
@@ -356,10 +368,14 @@ class ProcessTable:
             command: tuple[str, ...] = ()
             try:
                 command = tuple(_words(folder, "cmdline"))
-                started = begin + timedelta(seconds=stat.ticks / self._ticks)
+                age = uptime - timedelta(seconds=stat.ticks / self._ticks) - _LOADING
+                advanced = _clock_advanced(folder, now - age)
+                started = now - age - (advanced and advanced + age)
                 if before and before.process and before.stat.identity == stat.identity:
-                    started = before.process.started  # the same, whatever the clock is set to
+                    # The same, whatever the clock is set to.
+                    started, advanced = before.process.started, before.process.clock_advanced
                 process = _examine(pid, folder, command, started)
+                process = process and replace(process, clock_advanced=advanced)
                 unseen = None
             except (PermissionError, _TooLongError) as error:
                 why = error.strerror or "the operating system refuses it"
@@ -680,6 +696,18 @@ _OWN_PID = re.compile(rb"^NSpid:(?:\s+\d+)*\s+(\d+)$", re.MULTILINE)
 
 _STARTED_BY, _STARTED_AS = 11, 12
 """AT_UID and AT_EUID in /proc/PID/auxv (getauxval(3)): real and effective user id at the start."""
+
+
+def _clock_advanced(folder: int, started: datetime) -> timedelta:
+    """Return how far the clock was set forward since somebody first looked at a process; 0 if not.
+
+    ``started`` is its start by the present clock.  The kernel gives /proc/PID the time at which
+    somebody (systemd, ps, sros) first looks there (Linux, ``fs/proc/base.c``), which is after the
+    start, unless another clock told it.
+    """
+    first_look = _moment(os.fstat(folder).st_ctime_ns)
+    advanced = started - first_look
+    return advanced if advanced > _CLOCK_TOLERANCE else timedelta()
 
 
 def _user(folder: int, status: bytes) -> int:

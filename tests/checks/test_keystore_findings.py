@@ -6,19 +6,21 @@ import json
 import os
 import shutil
 import subprocess
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
-from sros_tool.checks.keystores.issued import OLD_PERMISSIONS
+from sros_tool.checks.keystores.documents import TIME_WINDOW
+from sros_tool.checks.keystores.issued import OLD_PERMISSIONS, OLDER_LIST
 from sros_tool.checks.keystores.keystore import keystore_findings, with_joined_findings
 from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.kind import NOTE, Finding
 from sros_tool.dds.decision.vendors import FAST_DDS, joined_titles
+from sros_tool.faults import remedy_in_original_keystore
 from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.lifecycle.create import create_keystore
-from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import key_pem, load_key
@@ -96,6 +98,24 @@ def test_a_remedy_that_needs_ca_keys_is_for_the_original_keystore(bench: Bench) 
     assert told.endswith("Then export the enclave again.")
     (bench.checked / "enclaves/base/permissions.xml").write_text("<dds/>")
     assert remedy("enclave.xml-differs") == "Delete permissions.xml: no export has this file."
+
+
+def test_a_remedy_that_is_an_export_says_so_once() -> None:
+    told = remedy_in_original_keystore(OLDER_LIST.remedy)
+    assert told.lower().count("export the enclave again") == 1
+
+
+def test_dates_that_expire_early_in_the_east_are_not_backdated(bench: Bench) -> None:
+    permissions = open_enclave(bench.path("enclaves/base"), now=bench.now).permissions
+    assert permissions
+    end = permissions.grants[0].validity.not_after
+    options = {"now": end - timedelta(hours=13), **bench.options}
+    found = keystore_findings(OpenedKeystore(bench.checked), Circumstances(**options))
+    remedies = [each.remedy for each in found if each.id == TIME_WINDOW.id]
+    assert remedies
+    for remedy in remedies:
+        assert "not_before" not in remedy
+        assert "--set permissions.validity=2d --allow-looser`" in remedy, remedies
 
 
 @pytest.mark.parametrize("expected", some([*CASES], 60))

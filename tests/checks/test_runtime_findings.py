@@ -252,6 +252,17 @@ def test_what_keeps_the_enclave_from_loading_is_found_too(sound_one: RuntimeStat
     assert "permissions.p7s (removed)" in outdated.text
 
 
+def test_a_process_whose_start_the_clock_does_not_tell(
+    sound_one: RuntimeState, bench: Bench
+) -> None:
+    set_forward = {"started": datetime(2000, 1, 1, tzinfo=UTC), "clock_advanced": 25 * DAY / 24}
+    (found,) = runtime_findings(changed(0, **set_forward)(sound_one, bench))
+    assert found.id == "runtime.process-outdated"
+    assert found.text.startswith(
+        "the clock was set forward by 1 d 1 h while it ran, so it is not known whether "
+    )
+
+
 def test_a_process_of_a_revoked_enclave_whose_files_are_gone(bench: Bench) -> None:
     """Where the keystore is, its ledger tells what the process has loaded."""
     state = sound_state(bench)

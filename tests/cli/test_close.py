@@ -384,6 +384,14 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     robot.close("--apply")
     assert len(robot.restarts) == 2  # they run in their enclaves already
     (robot.folder / "robot/keystore").rename(robot.folder / "home")
+    policy = robot.folder / "robot/policy.xml"
+    signed = policy.read_text()
+    policy.write_text(signed.replace("chatter", "old/chatter", 1))
+    proved = robot.close("--proof", status=1).out
+    assert "no: everything that talked can still talk: denied: /listener subscribe /ch" in proved
+    differs = "differs from the signed permissions of /listener, which the processes use: bring"
+    assert f"finds no error: robot/export; 'robot/policy.xml' {differs} the policy" in proved
+    policy.write_text(signed)
     assert "yes: everything that talked can still talk: 2 nodes" in robot.close("--proof").out
     refused = robot.close("--apply", status=2).err
     assert "A new keystore would have other CAs." in refused
@@ -680,6 +688,11 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     assert f"the processes of /talker (process {PID['/talker']}); restart them\n" in said
     robot.outdated, robot.absent = set(), {"/talker"}
     talker = robot.process("/talker", is_secured=True)
+    long_ago = talker.started - timedelta(days=400)
+    robot.more = (replace(talker, started=long_ago, clock_advanced=timedelta(days=2)),)
+    said = robot.close("--proof", status=1).out
+    assert "its enclave: the clock was set forward by 2 d while it ran, and " in said
+    assert " may have changed after the start of the processes of /talker (process 4711); " in said
     lax = {**talker.environment, "ROS_SECURITY_STRATEGY": "Permissive"}
     for changed, why in (
         (replace(talker, environment=lax), "no ROS_SECURITY_STRATEGY=Enforce in"),
@@ -758,8 +771,8 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     policy.write_text(policy.read_text().replace("chatter", "old/chatter", 1))
     ended = robot.close("--proof", "--partial")
     assert (
-        "policy.xml' differs from the signed permissions of /listener: `sros close robot` checks"
-        in ended.err
+        ": robot/export; 'robot/policy.xml' differs from the signed permissions of /listener, "
+        "which the processes use: `sros close robot` checks and signs it\n" in ended.out
     )
     assert (
         "not checked: every process was started in its enclave: processes: process 9 (?) may be a "
@@ -1425,7 +1438,7 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     assert needed in ended.err
     said = "1 enclave, and no open process in domain 0; of other machines: /listener\n"
     assert said in ended.out
-    assert "differs from the signed permissions" not in ended.err
+    assert "differs from the signed permissions" not in ended.out
     assert "talk: 2 nodes with 36 endpoints as before (types are not compared)\n" in ended.out
     robot.remaining = (TALKER,)
     said = robot.close("--proof", status=1).out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
@@ -238,6 +239,22 @@ def test_only_what_changed_is_read_again_and_another_process_is_another(proc: Pr
     (process,) = proc.look(table).processes
     assert process.domain == "5"
     assert process.started > first.processes[0].started
+
+
+def test_a_clock_that_was_set_forward_makes_no_process_newer_than_it_is(proc: Proc) -> None:
+    """Files have stamps of the old clock, and the kernel tells starts by the new one."""
+    table, machine_starts = ProcessTable(proc.path), timedelta(seconds=-1)
+    before = proc.add(7, *ROS, start="0").stat().st_ctime
+    now = datetime.fromtimestamp(before, UTC)
+    uptime = timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME))
+    (first,) = table.look(now + uptime + machine_starts).processes
+    assert first.clock_advanced == timedelta()
+    later = now + uptime + timedelta(hours=1)
+    (known,) = table.look(later).processes
+    assert known == first
+    (process,) = ProcessTable(proc.path).look(later).processes
+    assert timedelta(minutes=59) < process.clock_advanced < timedelta(minutes=61)
+    assert process.started < now, "its first look was not before its start"
 
 
 @pytest.mark.parametrize(

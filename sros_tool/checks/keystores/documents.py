@@ -137,8 +137,10 @@ TIME_WINDOW = FindingKind(
     "Fast DDS reads the dates of permissions in the host's local time: they begin up to 12 hours "
     "late in the west, and expire up to 14 hours early in the east.",
     "Fast DDS 2.6 to 3.6 (mktime); tested in Los Angeles and Tokyo.",
-    "Sign permissions with a not_before at least 14 hours in the past, as sros does, and renew "
-    "them in time.",
+    "Let the hosts run in UTC, or renew the enclave at least 14 hours before its permissions "
+    "expire (`sros renew KEYSTORE ENCLAVE`). If its permissions are valid for less than a day, "
+    "lengthen that first, with `sros update_keystore KEYSTORE --set permissions.validity=2d "
+    "--allow-looser`.",
     vendors=FAST_DDS,
 )
 LOCAL_TIME = FindingKind(
@@ -221,6 +223,7 @@ _SUBJECT = re.compile(
     r"(?:,CN=/)?\Z"
 )
 _LAST_YEAR = 2262
+_BACKDATE = "Write a not_before at least 12 hours in the past, as sros does, and sign it again."
 _WEST, _EAST = timedelta(hours=12), timedelta(hours=14)
 _DIRECTIONS = ("publish", "subscribe")
 
@@ -334,9 +337,11 @@ def _validity_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iter
         accepted = enclave.accepts_expiry if now.timestamp() > end else ""
         yield LOCAL_TIME.found(enclave.name, f"{text}, and {utc_dates}", file, accepted=accepted)
     elif now - _WEST < window.not_before or now + _EAST > window.not_after:
-        accepted = enclave.accepts_expiry if now - _WEST >= window.not_before else ""
+        is_early = now - _WEST < window.not_before
+        accepted = "" if is_early else enclave.accepts_expiry
         text = f"{text}, and now it is {iso(now)}"
-        yield TIME_WINDOW.found(enclave.name, text, file, accepted=accepted)
+        remedy = _BACKDATE if is_early else ""
+        yield TIME_WINDOW.found(enclave.name, text, file, remedy=remedy, accepted=accepted)
 
 
 def _utc(seconds: float) -> str:
