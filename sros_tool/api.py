@@ -832,6 +832,7 @@ def check_requirements(
     now: datetime | None = None,
     zone: tzinfo = UTC,
     namespaces: Sequence[str] = ("/",),
+    remaps: Sequence[str] = (),
 ) -> tuple[Finding, ...]:
     """Return a finding for each requirement that a policy or a keystore breaks, for all names.
 
@@ -855,6 +856,8 @@ def check_requirements(
         namespaces: Namespaces such as "/left", in each of which the requirements have to hold: the
             enclaves of the requirements, and their names without a "/" or "*" at the beginning, are
             below it.
+        remaps: Remappings of names in the requirements, as nodes were remapped in the policy, such
+            as "image:=/front/image" or "gripper:__node:=front".
 
     Returns:
         Findings with ``subject``, ``text``, ``file`` and ``line``, and in ``related`` the other
@@ -864,7 +867,8 @@ def check_requirements(
         DocumentError: A file cannot be read, or there are too many wildcards to decide a
             requirement.
         InvalidNameError: A namespace is not valid, or has a wildcard.
-        UsageError: There is no such vendor or distribution, or ``domain`` is not a domain id.
+        UsageError: There is no such vendor or distribution, ``domain`` is not a domain id, or a
+            remapping is not valid, or changes no requirement.
 
     Example:
         >>> for finding in sros_tool.check_requirements("robot.xml", "robot.requirements.toml"):
@@ -875,6 +879,7 @@ def check_requirements(
     from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.keystore.template import load_template
     from sros_tool.names import check_plain_namespace
+    from sros_tool.policy.remapping import parse_remapping_of_names
     from sros_tool.proof.findings import requirement_findings, robots_left_out
     from sros_tool.proof.requirements import read_all_requirements
     from sros_tool.proof.system import WORLDS, load_system
@@ -895,7 +900,8 @@ def check_requirements(
         load_template(fspath(template)) if template else None,
     )
     places = [check_plain_namespace(namespace) for namespace in namespaces] or ["/"]
-    wanted = read_all_requirements(map(Path, files), system.fleet, places)
+    rules = [parse_remapping_of_names(remap) for remap in remaps]
+    wanted = read_all_requirements(map(Path, files), system.fleet, places, rules)
     findings = [*requirement_findings(wanted, system), *robots_left_out(system, places)]
     return tuple(
         finding for finding in findings if finding.severity > NOTE or finding.kind.prominent

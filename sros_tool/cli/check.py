@@ -154,6 +154,14 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
     "hold in each namespace.",
 )
 @click.option(
+    "--remap",
+    "remaps",
+    metavar="[NODE:]FROM:=TO",
+    multiple=True,
+    help="With --requirements: remap a name of the file, as `sros merge_policy --remap` did in the "
+    "policy; also NODE:__node:=NAME.  Can be repeated.",
+)
+@click.option(
     "--template",
     metavar="TEMPLATE",
     shell_complete=complete_template,
@@ -225,6 +233,7 @@ def check(
     requirements: tuple[Path, ...],
     earlier: tuple[Path, ...],
     namespaces: tuple[str, ...],
+    remaps: tuple[str, ...],
     template: str | None,
     suggest: bool,
     vendor: str | None,
@@ -350,9 +359,10 @@ def check(
         raise UsageError("--template is for --requirements and --suggest", "", "Leave it out.")
     if earlier and not requirements:
         raise UsageError("--requirements-before needs --requirements", "", "Name the new file.")
-    if namespaces and not requirements:
-        raise UsageError("--namespace is for --requirements", "", "Leave it out.")
-    decide = _requirements(family, paths, requirements, earlier, namespaces)
+    for option, given in (("--namespace", namespaces), ("--remap", remaps)):
+        if given and not requirements:
+            raise UsageError(f"{option} is for --requirements", "", "Leave it out.")
+    decide = _requirements(family, paths, requirements, earlier, namespaces, remaps)
     with progress("checking"):
         findings = [*_findings(family, paths, at), *_stated_differences(paths, at)]
         if decide:
@@ -379,6 +389,7 @@ def _requirements(
     files: tuple[Path, ...],
     earlier: tuple[Path, ...],
     namespaces: tuple[str, ...],
+    remaps: tuple[str, ...],
 ) -> Callable[[Callable[[Sequence[Path]], System]], list[Finding]] | None:
     """Return a function that checks the requirements of files; None without files.
 
@@ -387,20 +398,30 @@ def _requirements(
     if not files:
         return None
     from sros_tool.names import check_plain_namespace
+    from sros_tool.policy.remapping import parse_remapping_of_names
     from sros_tool.proof.findings import requirement_findings, robots_left_out
-    from sros_tool.proof.requirements import dropped_findings, read_all_requirements
+    from sros_tool.proof.requirements import (
+        dropped_findings,
+        read_all_requirements,
+        read_requirements,
+    )
 
     paths_of = _paths_of_systems(family, paths, "--requirements")
     places = [check_plain_namespace(namespace) for namespace in namespaces]
+    rules = [parse_remapping_of_names(remap) for remap in remaps]
 
     def decide(load: Callable[[Sequence[Path]], System]) -> list[Finding]:
         findings: list[Finding] = []
         for system in map(load, paths_of):
-            wanted = read_all_requirements(files, system.fleet, places)
+            wanted = read_all_requirements(files, system.fleet, places, rules)
             findings += requirement_findings(wanted, system)
             findings += robots_left_out(system, places)
             if earlier:
-                before = read_all_requirements(earlier, system.fleet, places)
+                before = [
+                    requirement
+                    for path in earlier
+                    for requirement in read_requirements(path, system.fleet, places, rules)
+                ]
                 findings += dropped_findings(before, wanted, str(files[0]))
         return [*dict.fromkeys(findings)]
 

@@ -116,6 +116,22 @@ def _paths_option(name: str, help_text: str) -> Callable[[Decorated], Decorated]
 @_paths_option("policy", "A policy, or a folder of policies, of the robot or fleet.")
 @_paths_option("requirements", "A file of requirements on the policies and keystores.")
 @click.option(
+    "--namespace",
+    "namespaces",
+    metavar="NS",
+    multiple=True,
+    help="Put the requirements into this namespace, as `sros check --namespace` does.  Can be "
+    "repeated, or name several on separate lines.",
+)
+@click.option(
+    "--remap",
+    "remaps",
+    metavar="[NODE:]FROM:=TO",
+    multiple=True,
+    help="Remap a name of the requirements, as `sros check --remap` does.  Can be repeated, or "
+    "name several on separate lines.",
+)
+@click.option(
     "--fleet",
     default="",
     metavar="PATH",
@@ -194,6 +210,8 @@ def review(
     head: str,
     policy: tuple[tuple[str, ...], ...],
     requirements: tuple[tuple[str, ...], ...],
+    namespaces: tuple[str, ...],
+    remaps: tuple[str, ...],
     fleet: str,
     template: str,
     keystore: tuple[tuple[str, ...], ...],
@@ -232,6 +250,8 @@ def review(
     something could not be decided.
     """
     from sros_tool.keystore.expiry import parse_threshold
+    from sros_tool.names import check_plain_namespace
+    from sros_tool.policy.remapping import parse_remapping_of_names
     from sros_tool.proof.commit_files import checked_path
     from sros_tool.proof.repository import Repository
     from sros_tool.proof.review import ReviewRequest
@@ -251,6 +271,13 @@ def review(
     )
     if not policies and not keystores:
         raise UsageError("no policy and no keystore is named", "", "Add --policy or --keystore.")
+    places, rules = (
+        [line.strip() for text in texts for line in text.splitlines() if line.strip()]
+        for texts in (namespaces, remaps)
+    )
+    for option, given in (("--namespace", places), ("--remap", rules)):
+        if given and not requirement_files:
+            raise UsageError(f"{option} is for --requirements", "", "Leave it out.")
     repository = Repository(folder.resolve())
     threshold = parse_threshold(renew_within)
     outputs = _Outputs(repository, (*policies, *keystores)[0], summary, sarif, annotations)
@@ -262,6 +289,8 @@ def review(
             repository.head_commit(head),
             policies,
             requirement_files,
+            tuple(map(check_plain_namespace, places)),
+            tuple(map(parse_remapping_of_names, rules)),
             checked_path(fleet) if fleet else "",
             keystores,
             new_access == "allow",
@@ -408,9 +437,10 @@ def _sentence(result: Review, step: ReviewStep) -> str:
         RightsChange,
     )
 
+    place = f" {result.place}" if result.place and step.kind.startswith("requirements") else ""
     match step.content:
         case ChosenFindings() as chosen:
-            return chosen.summary()
+            return f"{chosen.summary()}{place}"
         case AccessChange(growth=growth, dropped=dropped):
             return access_summary(growth, dropped)
         case RightsChange(compared=compared, absolute=absolute, relative=relative):
@@ -430,7 +460,7 @@ def _sentence(result: Review, step: ReviewStep) -> str:
             return ", ".join(clauses)
         case DroppedRequirements(count=count, chosen=chosen):
             kind = f"{counted(count, 'requirement')} dropped or changed"
-            return f"{kind}, checked as before the change: {chosen.summary()}"
+            return f"{kind}, checked as before the change: {chosen.summary()}{place}"
         case ExpiryCheck(due=due, unreadable=unreadable, lasting=count) as expiry:
             unread = f", {len(unreadable)} cannot be read" if unreadable else ""
             left_out = expiry.short_lived_text()

@@ -89,6 +89,46 @@ def parse_remapping(text: str) -> Remapping:
     return Remapping(node, old, new)
 
 
+def parse_remapping_of_names(text: str) -> Remapping:
+    """Return the rule in a text, for names that are of no single node, as in requirements.
+
+    Raises:
+        UsageError: (or another error of `parse_remapping`) it is not such a rule.
+    """
+    rule = parse_remapping(text)
+    problem = remedy = ""
+    if rule.old == _NAMESPACE:
+        problem, remedy = "It is for a namespace.", "Name the namespace with --namespace."
+    elif rule.old == _NODE or rule.old.startswith("~"):
+        if not rule.node:
+            problem, remedy = "It does not say for which node.", f"Write it as NODE:{rule}."
+    elif rule.node:
+        problem = f"Other nodes than {rule.node} may keep the name."
+        remedy = f"Write {rule._replace(node='')} if it is for all nodes, or edit the requirements."
+    if problem:
+        raise UsageError(f"requirements cannot be remapped by {rule}", problem, remedy)
+    return rule
+
+
+def remapped_name(name: str, ns: str, rules: Iterable[Remapping]) -> list[str]:
+    """Return the names for a full name of any node in a namespace, by `parse_remapping_of_names`.
+
+    A wildcard that matches an old name stays, and the new name is added.
+    """
+    rules = tuple(rules)
+    for rule in rules:
+        own = expand("~", ns, rule.node)
+        if rule.old == _NODE and f"{name}/".startswith(f"{own}/"):
+            name = expand("~", ns, rule.new) + name.removeprefix(own)
+            break
+    new_names: dict[str, str] = {}
+    for rule in rules:
+        if rule.old != _NODE and matches(name, old := expand(rule.old, ns, rule.node)):
+            new_names.setdefault(old, expand(rule.new, ns, rule.node))
+    kept = [name] if is_expression(name) or not new_names else []
+    return [*kept, *new_names.values()]
+
+
 def remapped_policies(
     policies: Iterable[Policy], texts: Iterable[str], file: Policy = _EMPTY
 ) -> tuple[list[Policy], list[Note]]:
@@ -158,7 +198,9 @@ def _notes_on_requirements(
     if gone:
         text = (
             f"requirements that name {first_few(sorted(gone), _SHOWN)} do not apply to the new "
-            "name: write it in a copy of them, as docs/howto/package.md says."
+            "name: check them with the same --namespace and --remap, as in `sros check POLICY "
+            "--requirements FILE "
+            f"{' '.join(f'--remap {quote(str(rule))}' for rule in of_names)}`."
         )
         yield Note("merge.requirements-of-old-names", text)
 

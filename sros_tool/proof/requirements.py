@@ -10,6 +10,7 @@ A requirement is a table of the file, such as::
 Names are ROS names, with the wildcards of policies; enclaves are names or patterns, as for
 ``--match``, and ``!`` before a name excepts an enclave from a list.  A file can be read for a
 namespace: then all enclaves, and the names without ``/`` or ``*`` at their beginning, are below it.
+It can also be read with remappings of names, as nodes are started with.
 The class of each kind says what such a requirement demands.
 
 Names and enclaves can have the placeholders of policies, which a fleet fills in.  A table with
@@ -33,7 +34,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from sros_tool.checks.kind import Finding, RelatedPlace
 from sros_tool.checks.requirements import DROPPED
-from sros_tool.errors import DocumentError
+from sros_tool.errors import DocumentError, UsageError
 from sros_tool.files import read_toml
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.names import expand, expression_problem, is_expression
@@ -46,6 +47,7 @@ from sros_tool.policy.placeholders import (
     parts_of,
     placeholders_of,
 )
+from sros_tool.policy.remapping import Remapping, remapped_name
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.values import shows
 from sros_tool.wording import counted, first_few, shortened
@@ -60,6 +62,8 @@ EXCEPT = "!"
 """Prefix of an enclave that is excepted from a list of enclaves."""
 _WORDS = ("name", "why")
 """Keys with words, which are in every table."""
+_NO_NAMES = (*_WORDS, "enclave", "enclaves", "from", "to", "through", "level")
+"""Keys whose values are no names of topics, services or actions."""
 _LEVELS = {"sign": Level.SIGN, "encrypt": Level.ENCRYPT}
 
 
@@ -81,8 +85,9 @@ class Requirement:
     """Base class of requirements: place of its table in the file, its name and reason (or "").
 
     ``robot`` is the robot whose values its placeholders have, or "".  ``as_written`` says whether
-    its names are those in the file, and not of a robot or namespace.  ``elsewhere`` is the
-    requirement in any other namespace; None if the file was read for a namespace.
+    its names are those in the file, and not of a robot or namespace; ``is_relative`` says whether
+    one of the names moves with the namespace.  ``elsewhere`` is the requirement in any other
+    namespace; None if the file was read for a namespace.
     """
 
     KIND: ClassVar[str]
@@ -93,6 +98,7 @@ class Requirement:
     robot: str = ""
     of_robots: tuple[RobotNames, ...] = field(default=(), compare=False, repr=False)
     as_written: bool = field(default=True, compare=False, repr=False)
+    is_relative: bool = field(default=False, compare=False, repr=False)
     elsewhere: Requirement | None = field(default=None, compare=False, repr=False)
 
     def __str__(self) -> str:
@@ -284,11 +290,15 @@ def _no_fleet() -> None:
 
 
 def read_requirements(
-    path: Path, fleet: FleetSource = _no_fleet, namespaces: Sequence[str] = ()
+    path: Path,
+    fleet: FleetSource = _no_fleet,
+    namespaces: Sequence[str] = (),
+    remaps: Sequence[Remapping] = (),
 ) -> tuple[Requirement, ...]:
     """Return the requirements in a TOML file, in their order, for the robots of a fleet.
 
-    With ``namespaces``, each requirement is returned once for each namespace; else for ``/``.
+    With ``namespaces``, each requirement is returned once for each namespace; else for ``/``.  Its
+    names are remapped there by ``remaps``, of `parse_remapping_of_names`.
 
     Raises:
         DocumentError: the file cannot be read, or a part of it is not valid; the error has file and
@@ -296,20 +306,39 @@ def read_requirements(
         SrosError: as ``fleet`` raises it.
     """
     data = read_bytes(path, "requirements file", max_bytes=1024 * 1024)
-    return parse_requirements(data, str(path), fleet, namespaces)
+    return parse_requirements(data, str(path), fleet, namespaces, remaps)
 
 
 def read_all_requirements(
-    paths: Iterable[Path], fleet: FleetSource = _no_fleet, namespaces: Sequence[str] = ()
+    paths: Iterable[Path],
+    fleet: FleetSource = _no_fleet,
+    namespaces: Sequence[str] = (),
+    remaps: Sequence[Remapping] = (),
 ) -> tuple[Requirement, ...]:
-    """Return the requirements in several TOML files, for each of the ``namespaces``.
+    """Return the requirements in several TOML files, as `read_requirements` does for one.
 
     Raises:
         SrosError: as `read_requirements`.
+        UsageError: a rule of ``remaps`` changes no requirement.
     """
-    return tuple(
-        requirement for path in paths for requirement in read_requirements(path, fleet, namespaces)
-    )
+    paths = tuple(paths)
+
+    def read(rules: Sequence[Remapping]) -> tuple[Requirement, ...]:
+        return tuple(
+            requirement
+            for path in paths
+            for requirement in read_requirements(path, fleet, namespaces, rules)
+        )
+
+    requirements, rules = read(remaps), tuple(dict.fromkeys(remaps))
+    for rule in rules:
+        if read([other for other in rules if other != rule]) == requirements:
+            raise UsageError(
+                f"--remap {rule}: no requirement names this",
+                "",
+                "Write the name as the requirements do, or leave --remap out for these files.",
+            )
+    return requirements
 
 
 def parse_requirements(
@@ -317,8 +346,9 @@ def parse_requirements(
     file: str,
     fleet: FleetSource = _no_fleet,
     namespaces: Sequence[str] = (),
+    remaps: Sequence[Remapping] = (),
 ) -> tuple[Requirement, ...]:
-    """Return the requirements in a TOML document, for each of the ``namespaces``.
+    """Return the requirements in a TOML document, for each of the ``namespaces``, remapped.
 
     ``file`` is its name in errors and sources.
 
@@ -327,7 +357,7 @@ def parse_requirements(
     """
     unfilled_tables = _stated_tables(data, file)
     filled = (
-        replace(table, namespace=namespace)
+        replace(table, namespace=namespace, remaps=remaps)
         for unfilled in unfilled_tables
         for table in _filled_tables(unfilled, fleet)
         for namespace in dict.fromkeys(namespaces or ("/",))
@@ -337,7 +367,7 @@ def parse_requirements(
     for table in filled:
         requirement = _READERS[table.kind](table)
         if not namespaces:
-            moved = _READERS[table.kind](replace(table, namespace=ELSEWHERE))
+            moved = _READERS[table.kind](replace(table, namespace=ELSEWHERE, remaps=()))
             requirement = replace(requirement, elsewhere=moved)
         requirements.append(requirement)
         if len(requirements) > _MOST_FILLED:
@@ -445,6 +475,7 @@ class _Table:
     robot: str = ""
     of_robots: tuple[RobotNames, ...] = ()
     namespace: str = "/"
+    remaps: Sequence[Remapping] = ()
 
     def known(self, *keys: str) -> dict[str, Any]:
         """Return the arguments that all requirements have.
@@ -462,8 +493,11 @@ class _Table:
                 )
         texts = {key: self.text(key) if key in self.values else "" for key in _WORDS}
         robots = {"robot": self.robot, "of_robots": self.of_robots}
-        as_written = not self.robot and self.namespace == "/"
-        return {"source": self.source, "as_written": as_written, **robots, **texts}
+        as_written = not self.robot and self.namespace == "/" and not self.remaps
+        values = [value for key, value in self.values.items() if key not in _NO_NAMES]
+        names = (name for name in _names_in(values) if not name.startswith(("/", "*")))
+        written = {"as_written": as_written, "is_relative": any(names)}
+        return {"source": self.source, **written, **robots, **texts}
 
     def text(self, key: str) -> str:
         value = self.values.get(key)
@@ -493,7 +527,7 @@ class _Table:
         return tuple(dict.fromkeys(value))
 
     def names(self, key: str, *, least: int = 1) -> tuple[str, ...]:
-        """Return a list of names, perhaps with wildcards, in absolute form."""
+        """Return a list of names, perhaps with wildcards, in absolute form and remapped."""
         names = self.texts(key, least=least)
         for name in names:
             problem = expression_problem(name)
@@ -503,9 +537,13 @@ class _Table:
                 problem = "It is a namespace."
             if problem:
                 raise self.error(key, f"{shortened(name)} is not valid in {key}", problem)
-        return tuple(
+        full = (
             name if name.startswith("*") else expand(name, self.namespace, "") for name in names
         )
+        remapped = (
+            new for name in full for new in remapped_name(name, self.namespace, self.remaps)
+        )
+        return tuple(dict.fromkeys(remapped))
 
     def enclaves(self, key: str) -> tuple[str, ...]:
         """Return a list of enclave names and patterns; excepted enclaves begin with ``!``."""
@@ -786,7 +824,7 @@ def _not_both_from(table: _Table) -> NotBoth:
             )
         line = table.lines.get(key, table.source.line)
         place = Source(table.source.file, line)
-        inner = _Table(f"not_both.{key}", value, place, {}, namespace=table.namespace)
+        inner = replace(table, kind=f"not_both.{key}", values=value, source=place, lines={})
         rights.append(inner.rights())
     return NotBoth(**common, first=rights[0], second=rights[1])
 
@@ -883,9 +921,15 @@ class DroppedRequirement:
                 "the new file demands less in another namespace (`sros check --namespace`): a name "
                 "moves with the namespace in only one of the files"
             )
+        text = f"the new file demands less: {'; '.join(self.now)}"
         if not self.kept:
-            return "the new file has no such requirement"
-        return f"the new file demands less: {'; '.join(self.now)}"
+            text = "the new file has no such requirement"
+        if isinstance(self.requirement, Only | AtMost):
+            kept = {*_single_rights(right for e in self.kept for right in getattr(e, "rights", ()))}
+            if gone := [one for one in _single_rights(self.requirement.rights) if one not in kept]:
+                retired = _rights_text(tuple(gone))
+                text += f" (if nobody is to {retired} any more, write so in [[nobody]])"
+        return text
 
 
 def dropped_requirements(
@@ -1003,7 +1047,9 @@ def _single_enclaves(enclaves: Sequence[str]) -> Iterator[tuple[str, ...]]:
     yield from ((enclave, *excepted) for enclave in enclaves if not enclave.startswith(EXCEPT))
 
 
-def _single_rights(rights: RightNames) -> Iterator[tuple[str, tuple[str, ...]]]:
+def _single_rights(
+    rights: Iterable[tuple[str, tuple[str, ...]]],
+) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield pairs of a right and a single name."""
     yield from ((right, (name,)) for right, names in rights for name in names)
 

@@ -66,6 +66,7 @@ from sros_tool.names import expand
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Policy, Profile
 from sros_tool.policy.patterns import ELSEWHERE
+from sros_tool.policy.remapping import Remapping
 from sros_tool.policy.rights import (
     NodeName,
     PlacedRight,
@@ -90,7 +91,7 @@ from sros_tool.proof.commit_files import (
     users_of,
 )
 from sros_tool.proof.decide import restricted_enclaves
-from sros_tool.proof.findings import requirement_findings
+from sros_tool.proof.findings import requirement_findings, robots_left_out
 from sros_tool.proof.growth import DroppedDenial, Growth, compare_access, undenied_name
 from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
 from sros_tool.proof.requirements import (
@@ -99,12 +100,13 @@ from sros_tool.proof.requirements import (
     Requirement,
     dropped_findings,
     dropped_requirements,
+    read_all_requirements,
     read_requirements,
 )
 from sros_tool.proof.sources import AccessSource, load_policies, load_side
 from sros_tool.proof.system import System, load_system
 from sros_tool.values import Words
-from sros_tool.wording import first_few
+from sros_tool.wording import enumerated, first_few
 
 Value = TypeVar("Value")
 _HEAD, _BASE = "HEAD", "BASE"
@@ -149,6 +151,7 @@ class ReviewRequest:
     """The input of a review; paths are relative to the top of the repository.
 
     ``head`` is the commit to review, ``base`` the commit to compare with ("": none). With
+    ``namespaces`` and ``remaps``, the requirements are read for these; with
     ``allow_new_access``, new access and unreviewed policies are shown but do not make the review
     fail; with ``allow_dropped_requirements``, neither do requirements that HEAD drops or weakens.
     The review fails if an enclave expires within ``renew_within``.  ``left_out`` are files and
@@ -161,6 +164,8 @@ class ReviewRequest:
     head: str
     policies: tuple[str, ...]
     requirements: tuple[str, ...]
+    namespaces: tuple[str, ...]
+    remaps: tuple[Remapping, ...]
     fleet: str
     keystores: tuple[str, ...]
     allow_new_access: bool
@@ -255,6 +260,8 @@ class ReviewStep:
 class Review:
     """The steps of a review, and clauses on what was not reviewed.
 
+    ``place`` is a clause with the namespaces for which requirements were decided.
+
     ``base`` and ``head`` are full ids of commits; ``base`` is "" if nothing was compared. The files
     were read in ``head_folder`` and ``base_folder``, whose paths `with_shown_paths` removes.
     """
@@ -263,6 +270,7 @@ class Review:
     head: str
     steps: tuple[ReviewStep, ...]
     left_out: tuple[str, ...]
+    place: str
     head_folder: Path
     base_folder: Path
 
@@ -360,6 +368,7 @@ def review(request: ReviewRequest, folder: Path) -> Review:
         request.head,
         steps_done,
         tuple(dict.fromkeys(steps.left_out())),
+        steps.place(),
         folder / _HEAD,
         folder / _BASE,
     )
@@ -372,6 +381,8 @@ class _Review:
     base: CommitFiles | None
     robots: dict[str, Fleet | None] = field(default_factory=dict)
     """Map the subject of a step to the fleet of the policy or keystore that it examines."""
+    is_relative: bool = False
+    """Whether a requirement has a name that moves with the namespace."""
 
     def _allows(self, kind: str) -> bool:
         """Return whether the request, or the kind itself, allows what steps of a kind find."""
@@ -835,6 +846,11 @@ class _Review:
             yield "no policy is named"
         if not asked.requirements:
             yield "no requirements are named"
+        if self.is_relative and not asked.namespaces:
+            yield (
+                "requirements with names without '/' at the beginning were decided only in the "
+                "namespace / (another: --namespace)"
+            )
         if not self.base:
             yield "nothing is compared with an earlier commit, as the options say"
         if asked.allow_new_access:
@@ -980,7 +996,7 @@ class _Review:
                 policies, self._circumstances(fleet), self._template()
             )
         if not systems:
-            yield from _read(files, lambda: fleet)
+            yield from self._read(files, lambda: fleet, self.request.remaps)
         for subject, load in systems.items():
             try:
                 system = load()
@@ -988,8 +1004,9 @@ class _Review:
             except (SrosError, OSError) as error:
                 yield _undecided("requirements", subject, error)
                 continue
-            wanted = yield from _read(files, system.fleet)
-            earlier = yield from _read(
+            wanted = yield from self._read(files, system.fleet, self.request.remaps)
+            self.is_relative |= any(requirement.is_relative for requirement in wanted)
+            earlier = yield from self._read(
                 base_files, partial(_without_left_robots, before, system.fleet)
             )
             rights: frozenset[Right] = frozenset()
@@ -999,11 +1016,47 @@ class _Review:
             yield from self._step_result(
                 "requirements",
                 subject,
-                partial(_decided_requirements, wanted, system, rights),
+                partial(self._decided, wanted, system, rights),
                 only_with_result=bool(files),
             )
             decide = partial(self._dropped_step, earlier, wanted, system, moved.get(subject))
             yield from self._step_result("requirements-before", subject, decide)
+
+    def _read(
+        self, files: Mapping[str, Path], fleet: FleetSource, used: Sequence[Remapping] = ()
+    ) -> Generator[ReviewStep, None, list[Requirement]]:
+        """Return the requirements of files, by path; yield the steps that cannot read them.
+
+        The remappings ``used`` have to change a requirement.
+        """
+        read = yield from _read_each(
+            "requirements",
+            files,
+            lambda path: read_requirements(
+                files[path], fleet, self.request.namespaces, self.request.remaps
+            ),
+        )
+        if used and read.keys() == files.keys():
+            places = self.request.namespaces
+            all_of = partial(read_all_requirements, files.values(), fleet, places, used)
+            yield from _read_each("requirements", files, lambda _: all_of() and None)
+        return [requirement for requirements in read.values() for requirement in requirements]
+
+    def _decided(
+        self, requirements: Sequence[Requirement], system: System, before: Iterable[Right]
+    ) -> tuple[int, ChosenFindings]:
+        """Return the step on requirements, also on the robots that have another namespace."""
+        findings = [
+            *requirement_findings(requirements, system, before),
+            *robots_left_out(system, self.request.namespaces),
+        ]
+        chosen = FindingFilter().choose(findings)
+        return _status(chosen), chosen
+
+    def place(self) -> str:
+        """Return a clause with the namespaces of the requirements; "" without any."""
+        namespaces = self.request.namespaces
+        return f"in {enumerated(namespaces)}" if namespaces else ""
 
     def _template(self) -> Template | None:
         """Return the named keystore template, as HEAD has it; None without one.
@@ -1207,13 +1260,6 @@ def _status(chosen_findings: ChosenFindings) -> int:
     return _FOUND if chosen_findings.fails(WARNING) else _OK
 
 
-def _decided_requirements(
-    requirements: Sequence[Requirement], system: System, before: Iterable[Right]
-) -> tuple[int, ChosenFindings]:
-    chosen = FindingFilter().choose(requirement_findings(requirements, system, before))
-    return _status(chosen), chosen
-
-
 def _requirements_left(
     requirements: Sequence[Requirement], before: AccessSource, after: AccessSource
 ) -> Iterator[Finding]:
@@ -1285,13 +1331,3 @@ def _read_each(
             if value is not None:
                 values[path] = value
     return values
-
-
-def _read(
-    files: Mapping[str, Path], fleet: FleetSource
-) -> Generator[ReviewStep, None, list[Requirement]]:
-    """Return the requirements of files, by path; yield the steps that cannot read them."""
-    read = yield from _read_each(
-        "requirements", files, lambda path: read_requirements(files[path], fleet)
-    )
-    return [requirement for requirements in read.values() for requirement in requirements]

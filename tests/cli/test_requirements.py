@@ -492,7 +492,45 @@ def test_requirements_of_a_package_in_two_namespaces(tmp_path: Path) -> None:
     both = ("--requirements-before", "r.toml", "--namespace", "/left", "--namespace", "/right")
     ended = sros(*less, *both, cwd=tmp_path)
     for side in ("left", "right"):
-        dropped = f"only /{side}/mux may publish /{side}/cmd: the new file has no such requirement"
+        dropped = (
+            f"only /{side}/mux may publish /{side}/cmd: the new file has no such requirement "
+            f"(if nobody is to publish /{side}/cmd any more, write so in [[nobody]])"
+        )
         assert f"{dropped}\n" in ended.out
     assert sros(*asked, "--namespace", "/r*", cwd=tmp_path).status == 2
     assert sros("check", "p.xml", "--namespace", "/left", cwd=tmp_path).status == 2
+
+
+def test_requirements_are_remapped_as_the_policy(tmp_path: Path) -> None:
+    """A requirement on the old name holds, whoever may request the new one."""
+    served = '<services reply="ALLOW"><service>~/close</service></services>'
+    asks = '<services request="ALLOW"><service>{}</service></services>'
+    gripper = policy_text({"/gripper": served}).replace('node="n"', 'node="gripper"')
+    (tmp_path / "gripper.xml").write_text(gripper)
+    (tmp_path / "own.xml").write_text(
+        policy_text(
+            {"/left/planner": asks.format("/left/gripper/close"), "/base": asks.format("/g")}
+        )
+    )
+    (tmp_path / "r.toml").write_text(
+        '[[only]]\nrequest = ["gripper/close"]\nenclaves = ["/planner"]\n'
+    )
+    places, rule = ("--namespace", "/left"), ("--remap", "gripper:~/close:=/g")
+    merge = ("merge_policy", "own.xml", "gripper.xml", *places, *rule, "-o", "robot.xml")
+    said = "`sros check POLICY --requirements FILE --remap 'gripper:~/close:=/g'`"
+    assert said in sros(*merge, cwd=tmp_path).ok().err
+    asked = ("check", "robot.xml", *ONLY[2:], "--requirements", "r.toml", *places)
+    sros(*asked, cwd=tmp_path).ok()
+    ended = sros(*asked, *rule, cwd=tmp_path)
+    assert ended.status == 1
+    assert "/base: may request /g, but only /left/planner may request /g" in ended.out
+    for words, problem in (
+        (("--remap", "close:=/g"), "--remap close:=/g: no requirement names this"),
+        (("--remap", "~/close:=/g"), "Write it as NODE:~/close:=/g."),
+        (("--remap", "__node:=x"), "Write it as NODE:__node:=x."),
+        (("--remap", "__ns:=/x"), "Name the namespace with --namespace."),
+        (("--remap", "a:close:=/g"), "Other nodes than a may keep the name."),
+    ):
+        ended = sros(*asked, *words, cwd=tmp_path)
+        assert (ended.status, problem in ended.err) == (2, True), ended
+    assert sros("check", "robot.xml", *rule, cwd=tmp_path).status == 2

@@ -21,7 +21,13 @@ from sros_tool.policy.model import (
     Profiles,
     policy_in_namespace,
 )
-from sros_tool.policy.remapping import parse_remapping, remapped_policies, remapped_policy
+from sros_tool.policy.remapping import (
+    parse_remapping,
+    parse_remapping_of_names,
+    remapped_name,
+    remapped_policies,
+    remapped_policy,
+)
 from sros_tool.policy.rights import Right, policy_rights
 from tests.policy.drawn_policies import PATHS, effective, meant, policies
 
@@ -158,6 +164,20 @@ def test_a_denial_of_an_old_name_in_the_file_is_told() -> None:
     ):
         _, notes = remapped_policies([camera, *others], [rule], file)
         assert [note.id for note in notes] == [OF_REQUIREMENTS]
+
+
+def test_a_name_of_no_single_node_is_remapped() -> None:
+    for name, texts, names in (
+        ("/l/a", ["a:=/b"], ["/b"]),
+        ("/l/a", ["a:=a"], ["/l/a"]),
+        ("/l/a", ["a:=b", "b:=/c", "/a:=/d"], ["/l/b"]),
+        ("/l/*", ["a:=/b"], ["/l/*", "/b"]),
+        ("*/a", ["a:=/x/a"], ["*/a", "/x/a"]),
+        ("/l/n/a", ["n:__node:=m", "m:~/a:=/b"], ["/b"]),
+        ("/l/n/*", ["n:__node:=m"], ["/l/m/*"]),
+        ("/l/nn/a", ["n:__node:=m"], ["/l/nn/a"]),
+    ):
+        assert remapped_name(name, "/l", map(parse_remapping_of_names, texts)) == names
 
 
 def test_names_that_are_exchanged_are_denied_as_before() -> None:

@@ -1258,3 +1258,22 @@ def test_objects_are_what_their_hashes_say(
         naive = error.stdout.decode()
     assert "/x" not in naive.rpartition("/y")[2]
     assert named.review("--policy", "robot.xml").status == status
+
+
+def test_requirements_of_a_package_are_decided_in_a_namespace(change: Change) -> None:
+    """In the namespace / they hold, because nobody there has their names."""
+    only = '[[only]]\npublish = ["x"]\nenclaves = ["/a"]\n'
+    robot = policy_text({"/a": publish("/x"), "/b": publish("/l/x")})
+    change.base = change.commit({"robot.xml": robot, "robot.toml": only})
+    change.commit({"other": "1"})
+    asked = ("--policy", "robot.xml", "--requirements", "robot.toml")
+    ended = change.review(*asked).ok()
+    assert "were decided only in the namespace / (another: --namespace)" in ended.out
+    ended = change.review(*asked, "--namespace", "/l", "--namespace", "/")
+    assert ended.status == 1 and "decided only" not in ended.out, ended
+    assert "requirements robot.xml: 1 error, 1 warning in /l and /" in ended.out, ended
+    assert "/b: may publish /l/x, but only /l/a may publish /l/x" in ended.out
+    ended = change.review(*asked, "--namespace", "/l", "--remap", "x:=/x")
+    assert "/a: may publish /x, but only /l/a may" in ended.out and "/l/x" not in ended.out, ended
+    ended = change.review(*asked, "--remap", "z:=/x")
+    assert (ended.status, "no requirement names this" in ended.out) == (2, True), ended
