@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         fleet_status,
         generate,
         load_template,
+        merge_policies,
         new_access,
         open_keystore,
         policy_rights,
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.create import Creation
     from sros_tool.keystore.lifecycle.revoke import Revocation
     from sros_tool.keystore.template import Template
+    from sros_tool.policy.merge import Merged
     from sros_tool.policy.model import Policy
     from sros_tool.policy.rights import Right
     from sros_tool.proof.growth import Growth
@@ -69,6 +71,7 @@ __all__ = [
     "Growth",
     "Keystore",
     "KeystoreError",
+    "Merged",
     "Policy",
     "PolicyError",
     "Revocation",
@@ -85,6 +88,7 @@ __all__ = [
     "fleet_status",
     "generate",
     "load_template",
+    "merge_policies",
     "new_access",
     "open_keystore",
     "policy_rights",
@@ -99,6 +103,7 @@ _ELSEWHERE = {
     "Finding": "sros_tool.checks.kind",
     "FleetStatus": "sros_tool.keystore.fleet_status",
     "Growth": "sros_tool.proof.growth",
+    "Merged": "sros_tool.policy.merge",
     "Policy": "sros_tool.policy.model",
     "Revocation": "sros_tool.keystore.lifecycle.revoke",
     "Right": "sros_tool.policy.rights",

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.revoke import Revocation
     from sros_tool.keystore.participant import JoinContext
     from sros_tool.keystore.template import Template
+    from sros_tool.policy.merge import Merged
     from sros_tool.policy.model import Policy
     from sros_tool.policy.rights import Right
     from sros_tool.proof.growth import Growth
@@ -307,6 +308,49 @@ def policy_rights(policy: AnyPath | Policy) -> tuple[Right, ...]:
     from sros_tool.policy import rights
 
     return tuple(sorted(rights.policy_rights(_policy(policy)), key=rights.order))
+
+
+@_checked
+def merge_policies(
+    policy: AnyPath,
+    *others: AnyPath | Policy,
+    namespace: str | None = None,
+    remaps: Sequence[str] = (),
+    enclave: str | None = None,
+    nodes: Sequence[str] = (),
+) -> Merged:
+    """Return the policy file ``policy`` with the rights of other policies added; write nothing.
+
+    Args:
+        policy: A policy file, which can be without enclaves (``<enclaves/>``).
+        others: The policies whose rights are added.
+        namespace: A namespace such as "/left" for the enclaves and nodes of the others, with all
+            names that do not begin with "/".
+        remaps: Remappings of names in the others, as their nodes are started with, such as
+            "image:=/front/image" or "__node:=front"; they apply after ``namespace``.
+        enclave: The enclave for all nodes of the others: one process composes them.
+        nodes: The only nodes that are taken from the others, by name; all by default.
+
+    Returns:
+        The ``document`` (bytes) for the folder of ``policy``, whose includes it keeps; the rights
+        that were ``added``; and ``notes``, for instance on a DENY that wins.
+
+    Raises:
+        PolicyError: (or another `DocumentError`) A policy cannot be read, or rights cannot be added
+            to it.
+        InvalidNameError: A namespace or an enclave is not valid.
+        UsageError: A remapping is not valid, or no policy has its name; or no policy has a node.
+
+    Example:
+        >>> merged = sros_tool.merge_policies("own.xml", "gripper.xml", namespace="/left")
+        >>> for note in merged.notes:
+        ...     print(note)
+        >>> pathlib.Path("robot.xml").write_bytes(merged.document)
+    """
+    from sros_tool.graph import learn
+
+    additions = list(map(_policy, others))
+    return learn.merge_policies(Path(policy), additions, namespace, remaps, enclave, nodes)
 
 
 @_checked

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import re
 import subprocess
 import sys
@@ -377,7 +378,7 @@ FUNCTIONS = [
     value for name in sros_tool.__all__ if inspect.isfunction(value := getattr(sros_tool, name))
 ]
 VALID = {
-    **dict.fromkeys(("keystore", "path", "base", "head", "target", "requirements"), "ks"),
+    **dict.fromkeys(("keystore", "path", "policy", "base", "head", "target", "requirements"), "ks"),
     "enclave": "/a",
     "action": "join",
 }
@@ -454,6 +455,27 @@ def test_requirements_are_decided(tmp_path: Path) -> None:
     assert "/b" in [each.subject for each in found]
     with pytest.raises(sros_tool.SrosError, match="has a wildcard"):
         sros_tool.check_requirements(policy, required, namespaces=["/r*"])
+    remaps = ["x:=/right/x"]
+    found = sros_tool.check_requirements(policy, required, namespaces=["/left"], remaps=remaps)
+    assert "/b" in [each.subject for each in found]
+
+
+def test_policies_are_merged_as_by_the_verb(tmp_path: Path) -> None:
+    own, other = tmp_path / "own.xml", tmp_path / "other.xml"
+    own.write_text(policy_text({"/a": publish("/x")}))
+    other.write_text(policy_text({"/b": publish("x", "y")}))
+    merged = sros_tool.merge_policies(
+        own, other, namespace="/left", remaps=["x:=/z"], enclave="/c", nodes=["n"]
+    )
+    words = ("--namespace", "/left", "--remap", "x:=/z", "--enclave", "/c", "--node", "n", "--json")
+    ended = json.loads(sros("merge_policy", own, other, *words).ok().out)
+    assert merged.document.decode() == ended["document"]
+    assert [note.text for note in merged.notes] == [note["text"] for note in ended["notes"]] != []
+    assert [right.name for right in merged.added] == ["/left/y", "/z"]
+    plain = sros_tool.merge_policies(own, sros_tool.read_policy(other))
+    assert [right.name for right in plain.added] == ["/x", "/y"]
+    with pytest.raises(UsageError, match="no policy to merge has a node"):
+        sros_tool.merge_policies(own, other, nodes=["m"])
 
 
 def test_new_access_is_what_a_change_adds(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from shlex import quote
@@ -31,7 +30,7 @@ from sros_tool.cli.common import (
     save,
     verb,
 )
-from sros_tool.errors import Note, PolicyError, UsageError
+from sros_tool.errors import PolicyError, UsageError
 from sros_tool.terminal import echo, echo_document, echo_lines
 from sros_tool.values import FileChange, as_plain, file_change
 from sros_tool.wording import counted, first_few
@@ -118,47 +117,24 @@ def merge_policy(
       $ sros merge_policy robot.xml camera.xml --enclave /pipeline \\
             --node driver --node rectify --in-place
     """
-    from sros_tool.names import check_enclave_name, check_plain_namespace
+    from sros_tool.graph.learn import merge_policies
     from sros_tool.policy.document import read_policy
-    from sros_tool.policy.merge import EditedText, MergedPolicy, counterpart_notes, merge_all
-    from sros_tool.policy.model import policy_in_enclave, policy_in_namespace, policy_of_nodes
+    from sros_tool.policy.merge import EditedText, MergedPolicy
 
     if in_place and output:
         raise UsageError("--in-place and --output exclude each other")
     target = policy if in_place else output
     if output:
         check_output(output, force=force)
-    additions = [read_policy(path) for path in others]
-    if nodes:
-        additions = [policy_of_nodes(addition, nodes) for addition in additions]
-        known_nodes = {
-            p.node for addition in additions for e in addition.enclaves for p in e.all_profiles()
-        }
-        if missing := [node for node in nodes if node not in known_nodes]:
-            raise UsageError(
-                f"--node {missing[0]}: no policy to merge has a node of this name",
-                "",
-                "Write the name as node= has it.",
-            )
-    if namespace is not None:
-        namespace = check_plain_namespace(namespace)
-        additions = [policy_in_namespace(addition, namespace) for addition in additions]
-    notes: list[Note] = []
-    present, stated = read_policy(policy, may_be_empty=True), additions
-    if remaps:
-        from sros_tool.policy.remapping import remapped_policies
-
-        additions, notes = remapped_policies(additions, remaps, present)
-    if enclave is not None:
-        check_enclave_name(enclave)
-        additions = [policy_in_enclave(addition, enclave) for addition in additions]
-    merged = merge_all(policy, additions)
-    notes += (*merged.notes(), *counterpart_notes((present, *stated), merged.rights))
-    if merged.added and (output is None or output.parent.resolve() == policy.parent.resolve()):
-        from sros_tool.graph.learn import with_common_parts
-
-        document = with_common_parts(policy, merged.document, additions)
-        merged = replace(merged, document=document)
+    merged = merge_policies(
+        policy,
+        [read_policy(path) for path in others],
+        namespace,
+        remaps,
+        enclave,
+        nodes,
+        may_include=output is None or output.parent.resolve() == policy.parent.resolve(),
+    )
     if output:
         _check_includes(policy, output, merged.document)
     saved = ""
@@ -177,7 +153,7 @@ def merge_policy(
                 document=EditedText(merged.document, str(policy)).text if to_show else None,
                 dry_run=dry_run,
                 changes=changes,
-                notes=notes,
+                notes=merged.notes,
             )
         )
     elif dry_run:
@@ -191,7 +167,7 @@ def merge_policy(
         echo_document(merged.document)
     if not dry_run and not as_json:
         _print_added(merged)
-    print_notes(notes)
+    print_notes(merged.notes)
     if saved:
         echo(saved, err=True)
 

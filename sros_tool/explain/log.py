@@ -1146,10 +1146,26 @@ def _renaming_advice(nodes: Sequence[str], wrong: str, enclave: str) -> str:
             f"The enclave is for several nodes. Rename only this node, to {new_name}, in its code "
             f"or launch file, or with {rules}; `-r __node:=` would rename all nodes of the process"
         )
+    renamed = ""
+    if len(meant) == 1:
+        renamed = (
+            f"; or, if this is {meant[0]} by another name, write this name in its profile, or "
+            "merge the policy of its package with this name, into a policy without the node: "
+            f"`sros merge_policy POLICY OTHER {_merge_rules(meant[0], wrong)}`"
+        )
     return (
-        f"{start}; or, if {wrong} is right, give it a profile with common/node.xml: in the policy "
-        f"of {enclave}, or in an enclave of its own if it is another program."
+        f"{start}{renamed}; or, if {wrong} is a further node, give it a profile with "
+        f"common/node.xml: in the policy of {enclave}, or in an enclave of its own if it is "
+        "another program."
     )
+
+
+def _merge_rules(node: str, renamed: str) -> str:
+    """Return the options with which `sros merge_policy` gives a node another full name."""
+    (ns, _, name), (new_ns, _, new_name) = node.rpartition("/"), renamed.rpartition("/")
+    rules = [f"{name}:__node:={new_name}"] * (name != new_name)
+    rules += [f"{new_name}:__ns:={new_ns or '/'}"] * (ns != new_ns)
+    return " ".join(f"--remap {quote(rule)}" for rule in rules)
 
 
 def _enclaves_text(enclaves: Sequence[str]) -> str:

@@ -25,7 +25,7 @@ from typing import Annotated, NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Criteria, Rule, name_notes
-from sros_tool.errors import DocumentError, InvalidNameError, Note, PolicyError
+from sros_tool.errors import DocumentError, InvalidNameError, Note, PolicyError, UsageError
 from sros_tool.files import new_files, replace_file
 from sros_tool.graph.observation import (
     PUBLISH,
@@ -40,13 +40,22 @@ from sros_tool.names import (
     GLOBAL_TOPICS,
     check_enclave_name,
     check_namespace,
+    check_plain_namespace,
     dds_names,
     expand,
     expression_problem,
     is_expression,
 )
 from sros_tool.policy.document import IncludedFile, Includer, read_policy
-from sros_tool.policy.merge import Contradiction, EditedText, PlacedElement, merge_into
+from sros_tool.policy.merge import (
+    Contradiction,
+    EditedText,
+    Merged,
+    PlacedElement,
+    counterpart_notes,
+    merge_all,
+    merge_into,
+)
 from sros_tool.policy.model import (
     ALLOW,
     DENY,
@@ -57,7 +66,11 @@ from sros_tool.policy.model import (
     Policy,
     Profile,
     Profiles,
+    policy_in_enclave,
+    policy_in_namespace,
+    policy_of_nodes,
 )
+from sros_tool.policy.remapping import remapped_policies
 from sros_tool.policy.rights import Right, Rules, order, policy_rights, profile_rights
 from sros_tool.translate import ros_rights
 from sros_tool.values import DryRun, FileChanges, Notes, Words, shows
@@ -931,7 +944,57 @@ def _with_includes(
     return text.document(), tuple(sorted(included))
 
 
-def with_common_parts(path: Path, merged: bytes, others: Sequence[Policy]) -> bytes:
+def merge_policies(
+    path: Path,
+    others: Sequence[Policy],
+    namespace: str | None = None,
+    remaps: Sequence[str] = (),
+    enclave: str | None = None,
+    nodes: Sequence[str] = (),
+    *,
+    may_include: bool = True,
+) -> Merged:
+    """Merge policies into the policy file at ``path``; write nothing.
+
+    Of ``others``, only the ``nodes`` (() for all) are taken, moved to the ``namespace``, remapped
+    by the texts ``remaps``, and all put into the ``enclave``.  With ``may_include``, new profiles
+    include common parts in the folder of ``path``.
+
+    Raises:
+        SrosError: as `merge_all` and `remapped_policies`; or a name is not valid, or no policy has
+            one of the nodes.
+    """
+    additions = list(others)
+    if nodes:
+        additions = [policy_of_nodes(addition, nodes) for addition in additions]
+        known = {
+            p.node for addition in additions for e in addition.enclaves for p in e.all_profiles()
+        }
+        if missing := [node for node in nodes if node not in known]:
+            raise UsageError(
+                f"--node {missing[0]}: no policy to merge has a node of this name",
+                "",
+                "Write the name as node= has it.",
+            )
+    if namespace is not None:
+        namespace = check_plain_namespace(namespace)
+        additions = [policy_in_namespace(addition, namespace) for addition in additions]
+    notes: list[Note] = []
+    present, stated = read_policy(path, may_be_empty=True), additions
+    if remaps:
+        additions, notes = remapped_policies(additions, remaps, present)
+    if enclave is not None:
+        check_enclave_name(enclave)
+        additions = [policy_in_enclave(addition, enclave) for addition in additions]
+    merged = merge_all(path, additions)
+    notes += (*merged.notes, *counterpart_notes((present, *stated), merged.rights))
+    document = merged.document
+    if merged.added and may_include:
+        document = _with_common_parts(path, document, additions)
+    return replace(merged, document=document, notes=tuple(notes))
+
+
+def _with_common_parts(path: Path, merged: bytes, others: Sequence[Policy]) -> bytes:
     """Return the policy file ``merged``, whose new profiles include the common parts in its folder.
 
     A profile is new if the file at ``path`` lacks it.  Without includes in ``others``, which were

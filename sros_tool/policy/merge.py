@@ -398,24 +398,16 @@ def _encoding(data: bytes, root: etree._Element) -> str:
 class Merged:
     """A policy file after a merge: its new content, the added rights, and the contradictions.
 
-    Without additions ``document`` is the unchanged content of the file.  ``instances`` are texts on
-    the enclaves that have a node in several namespaces only since the merge, and ``shared`` texts
-    on enclaves whose nodes have other names than the nodes that the merge adds.
+    Without additions ``document`` is the unchanged content of the file.  ``rights`` are all rights
+    after the merge.  ``notes`` are on denials that win, and on enclaves that several nodes, or one
+    in several namespaces, share only since the merge.
     """
 
     document: bytes
     added: tuple[Right, ...]
     contradictions: tuple[Contradiction, ...]
-    instances: tuple[str, ...] = ()
-    shared: tuple[str, ...] = ()
-    rights: frozenset[Right] = frozenset()
-    """All rights of the policy after the merge."""
-
-    def notes(self) -> tuple[Note, ...]:
-        """Return notes on denials that win, and on enclaves that several nodes share now."""
-        several = (Note("merge.several-instances", text) for text in self.instances)
-        shared = (Note("merge.shared-enclave", text) for text in self.shared)
-        return (*merge_notes(self.contradictions), *several, *shared)
+    rights: frozenset[Right]
+    notes: tuple[Note, ...]
 
 
 @shows(optional=("document",))
@@ -470,15 +462,19 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
         for (enclave, node), profiles in nodes_in_several_namespaces(before.enclaves).items()
         if first_nodes.get((enclave, node), ()) != profiles
     )
-    shared = tuple(_shared_enclaves(first, policies, before))
+    notes = (
+        *merge_notes(contradictions),
+        *(Note("merge.several-instances", text) for text in several),
+        *(Note("merge.shared-enclave", text) for text in _shared_enclaves(first, policies, before)),
+    )
     rights = frozenset(policy_rights(before))
-    return Merged(document, tuple(added), tuple(contradictions), tuple(several), shared, rights)
+    return Merged(document, tuple(added), tuple(contradictions), rights, notes)
 
 
 def _shared_enclaves(before: Policy, policies: Iterable[Policy], after: Policy) -> Iterator[str]:
     """Yield a text on each enclave that gets new nodes from policies without its present nodes.
 
-    Nodes of the same name in other namespaces are `instances`.
+    Nodes of the same name in other namespaces are instances, of which there is another note.
     """
     asked: dict[str, set[str]] = {}
     for additions in policies:

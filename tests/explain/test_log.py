@@ -21,6 +21,8 @@ from sros_tool.keystore.participant import LoadedEnclave, load_enclave_of
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.names import PARAMETER_SERVICES
 from sros_tool.pki.certificates import identity_of, load_certificate
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.remapping import remapped_policies
 from sros_tool.runtime.log_texts import LOG_TEXTS, UNKNOWN, LogText
 from sros_tool.runtime.zenoh_log import ZENOH_TEXTS
 from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
@@ -742,6 +744,10 @@ def test_a_node_of_another_name_is_told(keystore: Path, log: str, node: str) -> 
     assert f"the permissions are for the node /talker, and this is the node {node}" in found
     assert "`--ros-args -r __node:=talker -r __ns:=/`" in found
     assert f"in the policy of {ENCLAVE}, or in an enclave of its own" in found
+    rules = re.findall("--remap ([^ `]+)", found)
+    text = policy_text({ENCLAVE: publish("chatter")}).replace('node="n"', 'node="talker"')
+    (renamed,), _ = remapped_policies([read_policy(Path("p.xml"), text.encode())], rules)
+    assert renamed.nodes() == {ENCLAVE: (node,)}
     assert f"here it belongs to node {node}" in sros("explain", "--log", path).out
 
 
@@ -761,6 +767,7 @@ def test_one_of_several_nodes_is_renamed_alone(keystore: Path, tmp_path: Path) -
         found
     )
     assert "`--ros-args -r foo:__node:=food -r food:__ns:=/camera`" in found
+    assert "--remap food:__node:=foo --remap foo:__ns:=/`" in found
     assert "-r __node:=food" not in found and "-r __node:=talker" not in found
 
 
