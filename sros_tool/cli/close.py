@@ -200,10 +200,15 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
     echo(f"how to restart each process with security (all of it: {robot.start}):")
     for process in closed.observed.processes:
         echo(f"  {_process_line(process, closed, policy)}")
+    for why in dict.fromkeys(closed.outdated.values()):
+        names = [name for name, other in closed.outdated.items() if other == why]
+        echo(f"  restart, because {why} the processes of {enumerated(names)}")
     for name in closed.new:
         why = "has ended" if name in closed.observed.ended else "new"
         start = closed.observed.command_of_new(robot.export.absolute(), name)
         echo(f"  {name}: {why}, start it with: {start}")
+    if naming := _naming(closed, policy):
+        echo(naming)
     if not_here := closed.observed.not_here:
         bring = f"sros distribute_key {shlex.quote(str(robot.keystore))} ENCLAVE FOLDER"
         echo(f"not on this machine: {', '.join(not_here)} (to bring one there: {bring})")
@@ -254,10 +259,34 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
 
 def _nodes(policy: Policy, enclave: str) -> str:
     """Return a clause on the nodes of an enclave, if it has several; "" otherwise."""
+    nodes = _node_names(policy, enclave)
+    return f", for the nodes {enumerated(nodes)}" if len(nodes) > 1 else ""
+
+
+def _node_names(policy: Policy, enclave: str) -> Sequence[str]:
     stated = policy.enclave(enclave)
     profiles = stated.all_profiles() if stated else ()
-    nodes = [f"{profile.ns.rstrip('/')}/{profile.node}" for profile in profiles]
-    return f", for the nodes {enumerated(sorted(nodes))}" if len(nodes) > 1 else ""
+    return sorted(f"{profile.ns.rstrip('/')}/{profile.node}" for profile in profiles)
+
+
+def _naming(closed: CloseState, policy: Policy) -> str:
+    """Return how to choose the name of an enclave that sros named after one of several nodes.
+
+    Returns "" when processes run closed: another name then means a restart.
+    """
+    several = [
+        process.enclave
+        for process in closed.observed.processes
+        if process.enclave in (nodes := _node_names(policy, process.enclave)) and len(nodes) > 1
+    ]
+    if closed.secured or not several:
+        return ""
+    folder = closed.folder
+    return (
+        f"sros chose the name of {enumerated(several)} by one of its nodes: to choose another, "
+        f"replace the name in {folder / 'policy.xml'} and {folder / 'requirements.toml'} now; when "
+        "processes run closed, they have to be restarted for that"
+    )
 
 
 def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool) -> None:
@@ -282,8 +311,10 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
         exceptions = "" if is_asked else ", except for what was not checked"
         if missing := [name for name in closed.without if name not in closed.secured]:
             exceptions += f", without a process of {', '.join(missing)}"
-        following = f"; next: bring {folder}/keystore to another machine: it has the CA keys"
-        following = following if robot.keystore.exists() else ""
+        following = "; next: have them renewed before then (docs/howto/close.md, Renewal without "
+        following += "hands)"
+        if robot.keystore.exists():
+            following += f", and bring {folder}/keystore to another machine: it has the CA keys"
         answer = f"the robot is closed{exceptions}{_until(closed)}{following}"
     elif closed.proofs:
         accept = _ACCEPT if closed.is_proved(partial=True) else ""

@@ -66,6 +66,7 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
         proofs=proofs,
         observed=running.observed,
         secured=running.secured,
+        outdated=running.outdated,
         new=running.new,
         absent=running.absent,
     )

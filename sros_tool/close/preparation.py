@@ -143,7 +143,7 @@ def _remember_later_processes(robot: LocalRobot) -> None:
         return
     known = robot.keystore_enclaves() | robot.policy_enclaves()
     not_here = [name for name in robot.observed.not_here if name in known]
-    before = robot.observed._replace(not_here=not_here)
+    before = _with_renamed_enclaves(robot, robot.observed._replace(not_here=not_here))
     now = RunningRobot(robot).with_later_processes(before)
     for old, new in zip(before.processes, now.processes, strict=False):
         if new != old:
@@ -153,6 +153,27 @@ def _remember_later_processes(robot: LocalRobot) -> None:
             )
     if now != robot.observed:
         robot.remember(now)
+
+
+def _with_renamed_enclaves(robot: LocalRobot, observed: ObservedProcesses) -> ObservedProcesses:
+    """Return observed processes in the enclaves to which the policy moved all of their nodes.
+
+    A process stays where it is if the policy has its enclave, or the other one has a process.
+    """
+    nodes, moved = ObservedNodes(robot), dict[str, set[str]]()
+    if robot.observation_file.exists():
+        for old, new in zip(nodes.as_observed, nodes.in_their_enclaves(), strict=True):
+            moved.setdefault(old.enclaves[0], set()).add(new.enclaves[0])
+    taken = {process.enclave for process in observed.processes}
+    renamed = []
+    for process in observed.processes:
+        enclaves = moved.get(process.enclave, set()) - taken
+        if len(enclaves) == len(moved.get(process.enclave, ())) == 1 and not process.shares:
+            (name,) = enclaves
+            robot.shell.say(f"{name} was {process.enclave}: the policy has its nodes there now")
+            process = process._replace(enclave=name)
+        renamed.append(process)
+    return observed._replace(processes=renamed)
 
 
 def _denied_access(robot: LocalRobot) -> list[str]:
@@ -307,7 +328,8 @@ def _keystore_problems(robot: LocalRobot) -> Iterator[str]:
             revoke = f"sros revoke {shlex.quote(str(robot.keystore))} {name}"
             yield (
                 f"the keystore has {name}, and the policy does not. If nothing needs it any more: "
-                f"{revoke}. If it belongs to another machine, such as a laptop: "
+                f"{revoke} (then restart all closed processes: each knows only what was revoked "
+                f"before its start). If it belongs to another machine, such as a laptop: "
                 f"{robot.close_command} --elsewhere {name}. If it belongs to this machine: sros "
                 f"merge_policy {shlex.quote(str(robot.policy))} ITS_POLICY --in-place"
             )

@@ -20,6 +20,7 @@ from sros_tool.close.processes import (
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot, check_enclaves
 from sros_tool.keystore.expiry import Threshold, survey
 from sros_tool.keystore.layout import (
+    CRL_FILE,
     KEY_FILE,
     enclave_path,
     list_enclaves,
@@ -154,7 +155,8 @@ class RunningRobot:
             return f"no {STRATEGY}=Enforce in"
         if not enclave.is_there:
             return f"without files{f' ({enclave.problem})' * bool(enclave.problem)} run"
-        newer = first_few([*newer_files(process, enclave)], MOST_NAMES)
+        names = [*newer_files(process, enclave)]
+        newer = first_few(names, MOST_NAMES)
         if not newer:
             finding = next(zenoh_findings(process), None)
             return f"not as the files say ({finding.text}) run" if finding else ""
@@ -166,6 +168,8 @@ class RunningRobot:
         warning = readable if mode & 0o077 else ""
         if clock := order_unknown(process):
             return f"{warning}{clock}, and {newer} may have changed after the start of"
+        if names == [CRL_FILE]:
+            return f"{warning}something was revoked ({CRL_FILE}), and is still accepted by"
         return f"{warning}{newer} changed, or got another mode, after the start of"
 
     def with_later_processes(self, observed: ObservedProcesses) -> ObservedProcesses:
@@ -294,6 +298,9 @@ class CloseState(NamedTuple):
     secured: Mapping[str, bool]
     """The enclaves in which a process of the robot runs now, and whether with the current files;
     otherwise it has to be restarted."""
+    outdated: Mapping[str, str]
+    """Why the processes of these enclaves have to be restarted, as text before "the processes of"
+    and the enclave."""
     new: Sequence[str]
     """The enclaves of the policy without a process: none was observed, and none runs now."""
     absent: Sequence[str]
@@ -381,6 +388,9 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
         observed=observed,
         steps=(),
         secured=secured,
+        outdated={
+            name: why for name, (_, why) in sorted(running.not_current.items()) if name in secured
+        },
         new=sorted(new),
         absent=sorted(absent - secured.keys()),
         without=robot.without,

@@ -314,9 +314,8 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     mine.write_text("A=1\n")
     first = robot.close("--apply", status=1)
     assert "the keystore has /listener, and the policy does not. If nothing needs" in first.out
-    assert (
-        f"{revoke}. If it belongs to another machine, such as a laptop: sros close r" in first.out
-    )
+    assert f"{revoke} (then restart all closed processes: " in first.out
+    assert ". If it belongs to another machine, such as a laptop: sros close r" in first.out
     assert (
         "removed robot/start/listener.env: it was for an enclave without a " in first.err
         and mine.exists()
@@ -365,6 +364,29 @@ def refuse_undo_of_others(robot: Robot) -> None:
     assert len(robot.restarts) == 2
 
 
+def renew_without_hands(robot: Robot) -> None:
+    """Run the two commands of the timer in docs/howto/close.md: renew; export, restart, prove."""
+
+    class UntilRestarted(set[str]):
+        def __contains__(self, enclave: object) -> bool:
+            return len(robot.restarts) == 2
+
+    robot.outdated = UntilRestarted()
+    sros("renew", "robot/keystore", "--all-expiring", "400d", cwd=robot.folder).ok()
+    keystore, export = (
+        robot.folder / "robot" / name / "enclaves/talker/cert.pem"
+        for name in ("keystore", "export")
+    )
+    assert keystore.read_bytes() != export.read_bytes()
+    said = robot.close("--apply")
+    assert keystore.read_bytes() == export.read_bytes()
+    assert robot.restarts[2:] == ["daemon-reload", "restart listener.service talker.service"]
+    assert "the robot is closed; the files are valid until" in said.err
+    robot.outdated = set()
+    log = robot.folder / "systemctl.log"
+    log.write_text("".join(log.read_text().splitlines(keepends=True)[:2]))
+
+
 def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     robot.units, robot.spelled = UNITS, "systemd/../robot/export"
     robot.close()
@@ -379,10 +401,12 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
         "(types are not compared)",
         "yes: an open listener finds nothing: the observer that saw 2 nodes before sees none",
     ]
-    assert "; next: bring robot/keystore to another machine: it has the CA keys\n" in closed.err
+    renew = "Z; next: have them renewed before then (docs/howto/close.md, Renewal without hands), "
+    assert f"{renew}and bring robot/keystore to another machine: it has the CA k" in closed.err
     assert "the robot is closed; the files are valid until 20" in closed.err
     robot.close("--apply")
     assert len(robot.restarts) == 2  # they run in their enclaves already
+    renew_without_hands(robot)
     (robot.folder / "robot/keystore").rename(robot.folder / "home")
     policy = robot.folder / "robot/policy.xml"
     signed = policy.read_text()
@@ -502,7 +526,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     )
     robot.more, robot.absent = (), set()
     for words in ("--apply", "--proof"):
-        assert "; next: bring robot/keystore to another machine" in robot.close(words).err
+        assert "and bring robot/keystore to another machine" in robot.close(words).err
     robot.by_hand, robot.absent = {"/talker"}, {"/listener"}
     (robot.folder / "link").symlink_to("robot")
     robot.spelled = "link/export"
@@ -686,8 +710,13 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     )
     assert " and 2 more changed, or got another mode, after the start of" in said
     assert f"the processes of /talker (process {PID['/talker']}); restart them\n" in said
+    said = robot.close().out
+    assert "\n  restart, because " in said
+    assert " changed, or got another mode, after the start of the processes of /talker\n" in said
     robot.outdated, robot.absent = set(), {"/talker"}
     talker = robot.process("/talker", is_secured=True)
+    robot.more = (replace(talker, started=datetime.now(UTC) + timedelta(days=1)),)
+    assert "restart, because" not in robot.close().out
     long_ago = talker.started - timedelta(days=400)
     robot.more = (replace(talker, started=long_ago, clock_advanced=timedelta(days=2)),)
     said = robot.close("--proof", status=1).out
@@ -1464,6 +1493,30 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     there = "start /listener and /operator/look, on other machines, without sros run, too"
     assert f"sros sees no process in an enclave of this folder; {there}\n" in (
         robot.close("--undo").err
+    )
+
+
+def test_an_enclave_that_gets_another_name_keeps_its_process(robot: Robot) -> None:
+    """A container has one enclave, by the name of one of its nodes, which says little."""
+    robot.units = {"/talker": "talker.service"}
+    robot.nodes = (TALKER, LISTENER, ros_node("logger", TALKER[3]))
+    robot.remaining = robot.nodes
+    said = robot.close()
+    policy = robot.folder / "robot/policy.xml"
+    named = "sros chose the name of /logger by one of its nodes: to choose another, replace the"
+    files = "name in robot/policy.xml and robot/requirements.toml now; when"
+    assert f"{named} {files} processes run closed, they have" in said.out
+    for file in (policy, robot.folder / "robot/requirements.toml"):
+        file.write_text(file.read_text().replace('"/logger"', '"/mission"'))
+    said = robot.close(status=1)
+    assert "/mission was /logger: the policy has its nodes there now\n" in said.err
+    known = "/mission: process 4711, known by its process id, for the nodes /logger and /talker: "
+    assert f"{known}--apply restarts talker.service\n" in said.out
+    assert "sros chose the name" not in said.out
+    revoke = "sros revoke robot/keystore /logger (then restart all closed processes: each knows"
+    assert (
+        f"If nothing needs it any more: {revoke} only what was revoked before its start)"
+        in said.out
     )
 
 
