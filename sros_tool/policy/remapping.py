@@ -34,6 +34,8 @@ from sros_tool.wording import enumerated, first_few
 _RULE = re.compile(r"(?:([A-Za-z_]\w*):)?([^:=]+):=([^:=]+)")
 _NODE_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _NODE, _NAMESPACE = "__node", "__ns"
+_OF_NODE = (_NODE, "~")
+"""What begins the old names that differ from node to node."""
 _EMPTY = Policy(())
 _SHOWN = 3
 
@@ -99,7 +101,7 @@ def parse_remapping_of_names(text: str) -> Remapping:
     problem = remedy = ""
     if rule.old == _NAMESPACE:
         problem, remedy = "It is for a namespace.", "Name the namespace with --namespace."
-    elif rule.old == _NODE or rule.old.startswith("~"):
+    elif rule.old.startswith(_OF_NODE):
         if not rule.node:
             problem, remedy = "It does not say for which node.", f"Write it as NODE:{rule}."
     elif rule.node:
@@ -185,6 +187,8 @@ def _notes_on_requirements(
     does not count: `sros check` puts requirements into one, too.
     """
     of_names = [rule for rule in rules if rule.old != _NAMESPACE]
+    policies = tuple(policies)
+    remapped = [remapped_policy(policy, of_names) for policy in policies]
     before, after = (
         {
             (right.kind, right.name)
@@ -192,15 +196,22 @@ def _notes_on_requirements(
             for right in policy_rights(policy)
             if right.qualifier is not DENY
         }
-        for side in (policies, [remapped_policy(policy, of_names)[0] for policy in policies])
+        for side in (policies, [policy for policy, _ in remapped])
     )
     gone = {name for _, name in before - after if name.rpartition("/")[2] not in NODE_SERVICES}
     if gone:
+        # As `parse_remapping_of_names` takes them, where no node keeps the name.
+        options = {
+            str(use.rule._replace(node=use.node if use.rule.old.startswith(_OF_NODE) else ""))
+            for _, uses in remapped
+            for use in uses
+            if use.rule.old == _NODE or use.old in gone
+        }
         text = (
             f"requirements that name {first_few(sorted(gone), _SHOWN)} do not apply to the new "
-            "name: check them with the same --namespace and --remap, as in `sros check POLICY "
-            "--requirements FILE "
-            f"{' '.join(f'--remap {quote(str(rule))}' for rule in of_names)}`."
+            "name: check them with the same --namespace and with the new name, as in `sros check "
+            "POLICY --requirements FILE "
+            f"{' '.join(f'--remap {quote(option)}' for option in sorted(options))}`."
         )
         yield Note("merge.requirements-of-old-names", text)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
+from shlex import split
 
 import pytest
 from hypothesis import given
@@ -178,6 +179,21 @@ def test_a_name_of_no_single_node_is_remapped() -> None:
         ("/l/nn/a", ["n:__node:=m"], ["/l/nn/a"]),
     ):
         assert remapped_name(name, "/l", map(parse_remapping_of_names, texts)) == names
+
+
+def test_the_note_on_requirements_names_rules_that_they_take() -> None:
+    driver = one(group("topics", "x ~/y z", publish="ALLOW"), node="driver")
+    viewer = one(group("topics", "z", subscribe="ALLOW"), node="viewer")
+    for texts, options in (
+        (["__node:=front"], ["driver:__node:=front", "viewer:__node:=front"]),
+        (["~/y:=/y", "driver:x:=/x"], ["driver:~/y:=/y", "x:=/x"]),
+        (["x:=/x", "driver:z:=/z"], ["x:=/x"]),
+    ):
+        _, notes = remapped_policies([driver, viewer], texts)
+        (text,) = (note.text for note in notes if note.id == OF_REQUIREMENTS)
+        rules = split(text.partition("FILE ")[2].partition("`")[0])[1::2]
+        assert rules == options
+        assert all(map(parse_remapping_of_names, rules))
 
 
 def test_names_that_are_exchanged_are_denied_as_before() -> None:
