@@ -186,8 +186,8 @@ def test_the_note_on_requirements_names_rules_that_they_take() -> None:
     viewer = one(group("topics", "z", subscribe="ALLOW"), node="viewer")
     for texts, options in (
         (["__node:=front"], ["driver:__node:=front", "viewer:__node:=front"]),
-        (["~/y:=/y", "driver:x:=/x"], ["driver:~/y:=/y", "x:=/x"]),
-        (["x:=/x", "driver:z:=/z"], ["x:=/x"]),
+        (["~/y:=/v", "driver:x:=/w"], ["driver:~/y:=/v", "x:=/w"]),
+        (["x:=/w", "driver:z:=/u"], ["x:=/w"]),
     ):
         _, notes = remapped_policies([driver, viewer], texts)
         (text,) = (note.text for note in notes if note.id == OF_REQUIREMENTS)
