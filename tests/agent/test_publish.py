@@ -345,13 +345,15 @@ def test_a_kill_after_the_keystore_changed_keeps_the_number(
     assert publisher.robot().gets().number == number
 
 
-@pytest.mark.parametrize("changed", ["", "renew", "revoke"])
+@pytest.mark.parametrize("changed", ["", "renew", "revoke", "nothing, on Zenoh"])
 @pytest.mark.parametrize("is_lost", [False, True])
 def test_a_kill_before_the_keystore_knows_its_first_releases(
     publisher: Home, is_lost: bool, changed: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not is_lost:
         forget_publishing(publisher.root)
+    if "Zenoh" in changed:
+        publisher.run("zenoh", "ks")
     shutil.rmtree(publisher.pub)
     with monkeypatch.context() as patched:
         patched.setattr(publishing._Run, "compose", _raise_killed)
@@ -359,7 +361,7 @@ def test_a_kill_before_the_keystore_knows_its_first_releases(
             publisher.publish(new_folder=is_lost)
     killed = archives(publisher)
     assert killed and not [*publisher.pub.glob("metadata/*")]
-    if changed:
+    if changed in ("renew", "revoke"):
         publisher.run(changed, "ks", "/r1/base")
     publisher.publish(new_folder=is_lost)
     publisher.robot("r2").gets()
