@@ -29,7 +29,7 @@ from sros_tool.checks.keystores.issued import (
 from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.kind import WARNING, ChosenFindings, Finding, FindingFilter
 from sros_tool.checks.policies import is_mended_by
-from sros_tool.checks.requirements import DROPPED, VACUOUS
+from sros_tool.checks.requirements import DROPPED, VACUOUS, VIOLATED
 from sros_tool.checks.targets import path_findings, policy_findings
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
@@ -64,7 +64,7 @@ from sros_tool.keystore.rights import (
 from sros_tool.keystore.template import Template, load_template, read_template, template_names
 from sros_tool.names import expand
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import ALLOW, DENY, Enclave, Policy, Profile
+from sros_tool.policy.model import ALLOW, DENY, Enclave, Policy, Profile, policy_in_namespace
 from sros_tool.policy.patterns import ELSEWHERE
 from sros_tool.policy.remapping import Remapping
 from sros_tool.policy.rights import (
@@ -104,7 +104,7 @@ from sros_tool.proof.requirements import (
     read_requirements,
 )
 from sros_tool.proof.sources import AccessSource, load_policies, load_side
-from sros_tool.proof.system import System, load_system
+from sros_tool.proof.system import System, load_system, policy_system
 from sros_tool.values import Words
 from sros_tool.wording import enumerated, first_few
 
@@ -383,6 +383,8 @@ class _Review:
     """Map the subject of a step to the fleet of the policy or keystore that it examines."""
     is_relative: bool = False
     """Whether a requirement has a name that moves with the namespace."""
+    is_compared_elsewhere: bool = False
+    """Whether the review decided which of them the change breaks in another namespace."""
 
     def _allows(self, kind: str) -> bool:
         """Return whether the request, or the kind itself, allows what steps of a kind find."""
@@ -846,10 +848,11 @@ class _Review:
             yield "no policy is named"
         if not asked.requirements:
             yield "no requirements are named"
+        others = ", and for others only whether the change breaks them" * self.is_compared_elsewhere
         if self.is_relative and not asked.namespaces:
             yield (
                 "requirements with names without '/' at the beginning were decided only in the "
-                "namespace / (another: --namespace)"
+                f"namespace /{others} (--namespace)"
             )
         if not self.base:
             yield "nothing is compared with an earlier commit, as the options say"
@@ -1013,13 +1016,15 @@ class _Review:
             with suppress(SrosError, OSError):  # said by the comparison
                 if subject in earlier_sources:
                     rights = earlier_sources[subject]().rights
+            sources = moved.get(subject)
+            elsewhere = partial(self._broken_elsewhere, files.values(), wanted, system, sources)
             yield from self._step_result(
                 "requirements",
                 subject,
-                partial(self._decided, wanted, system, rights),
+                partial(self._decided, wanted, system, rights, elsewhere),
                 only_with_result=bool(files),
             )
-            decide = partial(self._dropped_step, earlier, wanted, system, moved.get(subject))
+            decide = partial(self._dropped_step, earlier, wanted, system, sources)
             yield from self._step_result("requirements-before", subject, decide)
 
     def _read(
@@ -1043,15 +1048,57 @@ class _Review:
         return [requirement for requirements in read.values() for requirement in requirements]
 
     def _decided(
-        self, requirements: Sequence[Requirement], system: System, before: Iterable[Right]
+        self,
+        requirements: Sequence[Requirement],
+        system: System,
+        before: Iterable[Right],
+        elsewhere: Callable[[], Iterable[Finding]],
     ) -> tuple[int, ChosenFindings]:
         """Return the step on requirements, also on the robots that have another namespace."""
         findings = [
             *requirement_findings(requirements, system, before),
             *robots_left_out(system, self.request.namespaces),
+            *elsewhere(),
         ]
         chosen = FindingFilter().choose(findings)
         return _status(chosen), chosen
+
+    def _broken_elsewhere(
+        self,
+        files: Iterable[Path],
+        requirements: Sequence[Requirement],
+        system: System,
+        sources: Callable[[], tuple[AccessSource, AccessSource]] | None,
+    ) -> Iterator[Finding]:
+        """Yield a finding for each requirement that the change breaks in another namespace alone.
+
+        Users put the nodes of a package, and its requirements, into a namespace of their own.
+        ``requirements`` are those of ``files`` for the namespace / of ``system``.
+        """
+        asked = self.request
+        if asked.namespaces or asked.fleet or not sources:
+            return
+        if not any(requirement.is_relative for requirement in requirements):
+            return
+        both = sources()
+        ns = "/any_namespace"
+        while any(ns in right.name for source in both for right in source.rights):
+            ns += "_"
+        moved = chain.from_iterable(
+            read_requirements(path, namespaces=(ns,), remaps=asked.remaps) for path in files
+        )
+        before, after = (
+            policy_system(
+                policy_in_namespace(Policy(tuple(source.enclaves.values())), ns),
+                self._circumstances(),
+                self._template(),
+            )
+            for source in both
+        )
+        for here, there in zip(requirements, moved, strict=True):
+            if here.is_relative and not (_violations(here, system) or _violations(there, before)):
+                yield from _violations(there, after)
+        self.is_compared_elsewhere = True
 
     def place(self) -> str:
         """Return a clause with the namespaces of the requirements; "" without any."""
@@ -1254,6 +1301,11 @@ def _moved_rights(enclave: Enclave) -> Iterator[tuple[PlacedRight, Right]]:
     moved = placed_rights(enclave.with_profiles(elsewhere))
     for placed, moved_right in zip(placed_rights(enclave), moved, strict=True):
         yield placed, moved_right.right
+
+
+def _violations(requirement: Requirement, system: System) -> list[Finding]:
+    findings = requirement_findings([requirement], system)
+    return [finding for finding in findings if finding.kind is VIOLATED]
 
 
 def _status(chosen_findings: ChosenFindings) -> int:

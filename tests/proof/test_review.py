@@ -1268,7 +1268,11 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(change: Change) ->
     change.commit({"other": "1"})
     asked = ("--policy", "robot.xml", "--requirements", "robot.toml")
     ended = change.review(*asked).ok()
-    assert "were decided only in the namespace / (another: --namespace)" in ended.out
+    assert "were decided only in the namespace /, and for others only whether" in ended.out
+    assert (
+        "in the namespace / (--namespace)"
+        in sros("review", "--base", "none", *asked, cwd=change.folder).out
+    )
     ended = change.review(*asked, "--namespace", "/l", "--namespace", "/")
     assert ended.status == 1 and "decided only" not in ended.out, ended
     assert "requirements robot.xml: 1 error, 1 warning in /l and /" in ended.out, ended
@@ -1277,3 +1281,19 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(change: Change) ->
     assert "/a: may publish /x, but only /l/a may" in ended.out and "/l/x" not in ended.out, ended
     ended = change.review(*asked, "--remap", "z:=/x")
     assert (ended.status, "no requirement names this" in ended.out) == (2, True), ended
+
+
+def test_a_name_that_breaks_requirements_of_users_in_a_namespace(change: Change) -> None:
+    """In the namespace / nothing changes; twin: a name that was absolute before."""
+    must = '[[must]]\npublish = ["x"]\nenclave = "/a"\n'
+    moving = policy_text({"/a": publish("x"), "/b": publish("y")})
+    change.base = change.commit({"robot.xml": moving, "robot.toml": must})
+    asked = ("--policy", "robot.xml", "--requirements", "robot.toml")
+    change.commit({"robot.xml": moving.replace(">x<", ">/x<")})
+    ended = change.review(*asked)
+    said = "error: /any_namespace/a: "
+    assert (ended.status, "requirements robot.xml: 1 error\n" in ended.out) == (1, True), ended
+    assert said in ended.out, ended
+    change.base = change.commit({"other": "1"})
+    change.commit({"robot.xml": moving.replace(">x<", ">/x<").replace(">y<", ">/y<")})
+    assert said not in change.review(*asked).out
