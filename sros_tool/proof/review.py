@@ -383,7 +383,7 @@ class _Review:
     """Map the subject of a step to the fleet of the policy or keystore that it examines."""
     is_relative: bool = False
     """Whether a requirement has a name that moves with the namespace."""
-    is_compared_elsewhere: bool = False
+    is_compared_elsewhere: bool = True
     """Whether the review decided which of them the change breaks in another namespace."""
 
     def _allows(self, kind: str) -> bool:
@@ -1076,9 +1076,10 @@ class _Review:
         ``requirements`` are those of ``files`` for the namespace / of ``system``.
         """
         asked = self.request
-        if asked.namespaces or asked.fleet or not sources:
-            return
         if not any(requirement.is_relative for requirement in requirements):
+            return
+        if asked.namespaces or asked.fleet or not sources:
+            self.is_compared_elsewhere = False
             return
         both = sources()
         ns = "/any_namespace"
@@ -1098,7 +1099,6 @@ class _Review:
         for here, there in zip(requirements, moved, strict=True):
             if here.is_relative and not (_violations(here, system) or _violations(there, before)):
                 yield from _violations(there, after)
-        self.is_compared_elsewhere = True
 
     def place(self) -> str:
         """Return a clause with the namespaces of the requirements; "" without any."""
