@@ -34,8 +34,6 @@ from sros_tool.wording import enumerated, first_few
 _RULE = re.compile(r"(?:([A-Za-z_]\w*):)?([^:=]+):=([^:=]+)")
 _NODE_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _NODE, _NAMESPACE = "__node", "__ns"
-_OF_NODE = (_NODE, "~")
-"""What begins the old names that differ from node to node."""
 _EMPTY = Policy(())
 _SHOWN = 3
 
@@ -46,6 +44,11 @@ class Remapping(NamedTuple):
     node: str
     old: str
     new: str
+
+    @property
+    def is_of_node(self) -> bool:
+        """Whether its names differ from node to node."""
+        return self.old == _NODE or "~" in (self.old[0], self.new[0])
 
     def __str__(self) -> str:
         return f"{self.node}{':' * bool(self.node)}{self.old}:={self.new}"
@@ -101,7 +104,7 @@ def parse_remapping_of_names(text: str) -> Remapping:
     problem = remedy = ""
     if rule.old == _NAMESPACE:
         problem, remedy = "It is for a namespace.", "Name the namespace with --namespace."
-    elif rule.old.startswith(_OF_NODE):
+    elif rule.is_of_node:
         if not rule.node:
             problem, remedy = "It does not say for which node.", f"Write it as NODE:{rule}."
     elif rule.node:
@@ -202,7 +205,7 @@ def _notes_on_requirements(
     if gone:
         # As `parse_remapping_of_names` takes them, where no node keeps the name.
         options = {
-            str(use.rule._replace(node=use.node if use.rule.old.startswith(_OF_NODE) else ""))
+            str(use.rule._replace(node=use.node if use.rule.is_of_node else ""))
             for _, uses in remapped
             for use in uses
             if use.rule.old == _NODE or use.old in gone

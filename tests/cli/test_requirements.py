@@ -527,6 +527,7 @@ def test_requirements_are_remapped_as_the_policy(tmp_path: Path) -> None:
     for words, problem in (
         (("--remap", "close:=/g"), "--remap close:=/g: no requirement names this"),
         (("--remap", "~/close:=/g"), "Write it as NODE:~/close:=/g."),
+        (("--remap", "close:=~/g"), "Write it as NODE:close:=~/g."),
         (("--remap", "__node:=x"), "Write it as NODE:__node:=x."),
         (("--remap", "__ns:=/x"), "Name the namespace with --namespace."),
         (("--remap", "a:close:=/g"), "Other nodes than a may keep the name."),

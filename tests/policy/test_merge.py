@@ -177,6 +177,7 @@ def test_a_name_of_no_single_node_is_remapped() -> None:
         ("/l/n/a", ["n:__node:=m", "m:~/a:=/b"], ["/b"]),
         ("/l/n/*", ["n:__node:=m"], ["/l/m/*"]),
         ("/l/nn/a", ["n:__node:=m"], ["/l/nn/a"]),
+        ("/l/a", ["n:a:=~/b"], ["/l/n/b"]),
     ):
         assert remapped_name(name, "/l", map(parse_remapping_of_names, texts)) == names
 
