@@ -15,6 +15,7 @@ def test_wildcards_and_denials_count_in_what_is_shown(tmp_path: Path) -> None:
         "/b": subscribe("/odom"),
         "/look": subscribe("/*"),
         "/mute": publish("/tf") + publish("/tf").replace("ALLOW", "DENY"),
+        "/pan": subscribe("/camera/*"),
         "/not": subscribe("/*") + subscribe("/odom").replace("ALLOW", "DENY"),
     })  # fmt: skip
     (tmp_path / "p.xml").write_text(text)
@@ -22,6 +23,7 @@ def test_wildcards_and_denials_count_in_what_is_shown(tmp_path: Path) -> None:
     assert lines == [
         "topic /odom: /a -> /b, /look",
         "topic /*: in part /a -> /look, /not",
+        "topic /camera/*: nobody -> /look, /not, /pan",
         "topic /tf: nobody -> /look, /not",
     ]
 

@@ -11,7 +11,16 @@ from hypothesis import strategies as st
 
 from sros_tool.policy.model import ALLOW, DENY, Policy
 from sros_tool.policy.patterns import covers, overlap
-from sros_tool.policy.rights import Right, Rules, folded, parts, policy_rights, unfolded
+from sros_tool.policy.rights import (
+    Right,
+    Rules,
+    compare,
+    folded,
+    parts,
+    policy_rights,
+    unanswered_rights,
+    unfolded,
+)
 from sros_tool.translate import grant_rights
 from tests.policy.drawn_policies import PATHS, effective, grant_of, policies
 
@@ -106,6 +115,27 @@ def test_what_is_denied_in_part_is_not_allowed() -> None:
     assert not rules.allow("/a", "publish", "/arm/*")
     assert not rules.allow("/a", "publish", "/arm/st*")
     assert rules.allow("/a", "publish", "/arm/move*")
+
+
+@pytest.mark.parametrize(
+    ("other_publisher", "is_wildcard_unanswered"), [("/arm/x", True), ("/base/x", False)]
+)
+def test_rights_whose_other_side_is_gone(
+    other_publisher: str, is_wildcard_unanswered: bool
+) -> None:
+    """A denial waits for nobody, and a wildcard is answered by any name that it matches."""
+    lost = Right("/base", ALLOW, "publish", "/base/odom")
+    name = Right("/map", ALLOW, "subscribe", "/base/odom")
+    wildcard = Right("/all", ALLOW, "subscribe", "/base/*")
+    after = [
+        Right("/other", ALLOW, "publish", other_publisher),
+        name,
+        wildcard,
+        Right("/deaf", DENY, "subscribe", "/base/odom"),
+    ]
+    before = [lost, *after]
+    unanswered = unanswered_rights(before, after, compare(before, after))
+    assert unanswered == sorted([name, *([wildcard] if is_wildcard_unanswered else [])])
 
 
 def test_a_right_reads_as_people_say_it() -> None:
