@@ -283,7 +283,7 @@ def _naming(closed: CloseState, policy: Policy) -> str:
         return ""
     folder = closed.folder
     return (
-        f"sros chose the name of {enumerated(several)} by one of its nodes: to choose another, "
+        f"{enumerated(several)}: named after one of several nodes; to choose another name, "
         f"replace the name in {folder / 'policy.xml'} and {folder / 'requirements.toml'} now; when "
         "processes run closed, they have to be restarted for that"
     )

@@ -73,6 +73,8 @@ _LOADING = timedelta(milliseconds=20)
 """Shortest time from a process's start (known in steps of 10 ms) to loading its enclave."""
 _CLOCK_TOLERANCE = timedelta(seconds=1)
 """Longest time by which the clock of a process's folder can be behind without having been set."""
+_FIRST_LOOK = timedelta(minutes=1)
+"""Longest time from a start to a first look, for the process that somebody looked at soonest."""
 _MOST_BYTES = 4 * 1024 * 1024
 _MOST_MAPS = 32 * 1024 * 1024
 _MOST_TRIES = 3
@@ -106,16 +108,15 @@ class Process:
     """A running process that uses ROS 2, DDS or Zenoh.
 
     ``started`` is the earliest moment at which it can have loaded its files, by the clock of that
-    moment; ``clock_advanced`` is how far the clock was set forward since, as far as that is known:
-    then ``started`` is a moment before which it cannot have started, and no better one is known.
-    ``libraries`` are the
-    names of the libraries of ROS 2, DDS and Zenoh that it has mapped, such as "libddsc", and
-    ``dds`` the DDS libraries with their versions.  ``network`` names its network
-    namespace; "" is the namespace of this process.  ``enclave`` is the enclave that it names, if it
-    asks for security, and ``configuration`` the file that it names for Zenoh.  ``forked_by`` are
-    the id and command of the first process of its program, if another one started it.  ``own_pid``
-    is the id that the process itself sees; in a container, it differs from ``pid``.  ``user`` is
-    the id of the user who runs it, for a set-user-ID program of the user who started it.
+    moment; ``clock_advanced`` is how far the clock was set forward since: then ``started`` is a
+    minute too early or more.  ``libraries`` are the names of the libraries of ROS 2, DDS and
+    Zenoh that it has mapped, such as "libddsc", and ``dds`` the DDS libraries with their
+    versions.  ``network`` names its network namespace; "" is the namespace of this process.
+    ``enclave`` is the enclave that it names, if it asks for security, and ``configuration`` the
+    file that it names for Zenoh.  ``forked_by`` are the id and command of the first process of
+    its program, if another one started it.  ``own_pid`` is the id that the process itself sees;
+    in a container, it differs from ``pid``.  ``user`` is the id of the user who runs it, for a
+    set-user-ID program of the user who started it.
     """
 
     pid: int
@@ -368,9 +369,11 @@ class ProcessTable:
             command: tuple[str, ...] = ()
             try:
                 command = tuple(_words(folder, "cmdline"))
-                age = uptime - timedelta(seconds=stat.ticks / self._ticks) - _LOADING
-                advanced = _clock_advanced(folder, now - age)
-                started = now - age - (advanced and advanced + age)
+                started = now - uptime + timedelta(seconds=stat.ticks / self._ticks) + _LOADING
+                advanced = _clock_advanced(folder, started)
+                if advanced:
+                    advanced = max(advanced, *self._clock_advances(now - uptime))
+                    started -= advanced + _FIRST_LOOK
                 if before and before.process and before.stat.identity == stat.identity:
                     # The same, whatever the clock is set to.
                     started, advanced = before.process.started, before.process.clock_advanced
@@ -385,6 +388,18 @@ class ProcessTable:
                 return _ProcessData(stat, process, unseen)
         why = "it keeps starting other programs"
         return _ProcessData(stat, None, UnseenProcess(pid, command, why, _may_speak(command)))
+
+    def _clock_advances(self, begin: datetime) -> Iterator[timedelta]:
+        """Yield how far the clock was set forward, as each process that /proc shows tells it.
+
+        ``begin`` is when the machine started, by the present clock.  The later somebody looked at
+        a process, the less it tells.
+        """
+        yield timedelta()
+        for pid in filter(str.isdigit, os.listdir(self._proc)):
+            with suppress(OSError), self._opened(int(pid)) as folder:
+                ticks = _stat(folder).ticks
+                yield _clock_advanced(folder, begin + timedelta(seconds=ticks / self._ticks))
 
     def _with_files(self, process: Process, folder: int) -> Process:
         """Return the process with the state of its files, resolved as the process sees them."""

@@ -1503,8 +1503,8 @@ def test_an_enclave_that_gets_another_name_keeps_its_process(robot: Robot) -> No
     robot.remaining = robot.nodes
     said = robot.close()
     policy = robot.folder / "robot/policy.xml"
-    named = "sros chose the name of /logger by one of its nodes: to choose another, replace the"
-    files = "name in robot/policy.xml and robot/requirements.toml now; when"
+    named = "\n/logger: named after one of several nodes; to choose another name, replace the name"
+    files = "in robot/policy.xml and robot/requirements.toml now; when"
     assert f"{named} {files} processes run closed, they have" in said.out
     for file in (policy, robot.folder / "robot/requirements.toml"):
         file.write_text(file.read_text().replace('"/logger"', '"/mission"'))
@@ -1512,7 +1512,7 @@ def test_an_enclave_that_gets_another_name_keeps_its_process(robot: Robot) -> No
     assert "/mission was /logger: the policy has its nodes there now\n" in said.err
     known = "/mission: process 4711, known by its process id, for the nodes /logger and /talker: "
     assert f"{known}--apply restarts talker.service\n" in said.out
-    assert "sros chose the name" not in said.out
+    assert "named after" not in said.out
     revoke = "sros revoke robot/keystore /logger (then restart all closed processes: each knows"
     assert (
         f"If nothing needs it any more: {revoke} only what was revoked before its start)"

@@ -243,18 +243,21 @@ def test_only_what_changed_is_read_again_and_another_process_is_another(proc: Pr
 
 def test_a_clock_that_was_set_forward_makes_no_process_newer_than_it_is(proc: Proc) -> None:
     """Files have stamps of the old clock, and the kernel tells starts by the new one."""
-    table, machine_starts = ProcessTable(proc.path), timedelta(seconds=-1)
-    before = proc.add(7, *ROS, start="0").stat().st_ctime
-    now = datetime.fromtimestamp(before, UTC)
-    uptime = timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME))
-    (first,) = table.look(now + uptime + machine_starts).processes
+    table = ProcessTable(proc.path)
+    first_look = datetime.fromtimestamp(proc.add(7, *ROS, start="0").stat().st_ctime, UTC)
+    begin = first_look + timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME))
+    (first,) = table.look(begin - timedelta(seconds=1)).processes
     assert first.clock_advanced == timedelta()
-    later = now + uptime + timedelta(hours=1)
-    (known,) = table.look(later).processes
-    assert known == first
+    later = begin + timedelta(hours=1)
+    assert table.look(later).processes == (first,)
     (process,) = ProcessTable(proc.path).look(later).processes
     assert timedelta(minutes=59) < process.clock_advanced < timedelta(minutes=61)
-    assert process.started < now, "its first look was not before its start"
+    assert first_look - timedelta(minutes=2) < process.started < first_look
+    # Another process started five minutes later, and somebody looked at it at the same moment.
+    proc.add(8, "sh", start=f"{300 * os.sysconf('SC_CLK_TCK')}")
+    (process,) = ProcessTable(proc.path).look(later).processes
+    assert timedelta(minutes=64) < process.clock_advanced < timedelta(minutes=66)
+    assert first_look - timedelta(minutes=7) < process.started < first_look - timedelta(minutes=5)
 
 
 @pytest.mark.parametrize(
