@@ -131,7 +131,9 @@ def vendor_problems(
     faults = [fault for fault in faults if not _is_of_list(fault)]
     for side in _SIDES:
         of_side = [fault for fault in faults if fault.file in side]
-        files = {problem.file for problem in of_side} | ({side[0]} if of_side else set())
+        files = {problem.file for problem in of_side}
+        if files & {*side[:2]}:  # a CA that is at fault is so for the first file that needs it
+            files.add(side[0])
         if of_side and of_side[0].fault in CRASHES:
             kept.append(of_side[0])
             continue
@@ -431,7 +433,7 @@ def _identity_faults(
         if not _key_fits(traits, key, pss=pss):
             text = f"it is a key of {algorithm(key)}{_ALONE * pss}"
             yield Problem(KEY_FILE, text, Fault.KEY_ALGORITHM)
-    if traits.crashes_on_empty_subject and not certificate.subject.rdns:
+    if traits.crashes_on_empty_subject and not any(certificate.subject.rdns):
         text = "its subject is empty, which crashes the process"
         yield Problem(CERTIFICATE_FILE, text, Fault.CERTIFICATE_CRASH)
     remaining = validity_of(certificate).not_after - moment

@@ -30,7 +30,7 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.pki.distinguished_names import canonical
-from sros_tool.pki.tolerant import UnreadableName, is_unread
+from sros_tool.pki.tolerant import UnknownKey, UnreadableName, is_unread
 from sros_tool.validity import iso
 
 _NETSCAPE_TYPE = ObjectIdentifier("2.16.840.1.113730.1.1")
@@ -131,6 +131,7 @@ class _Chain:
     def _faults(self, checks: Checks, *, new: bool) -> Iterator[str]:
         chain = self._certificates
         if new:
+            yield from _key_faults(chain[0])
             for certificate in chain:
                 yield from _extension_faults(certificate)
             yield from _network_faults(chain)
@@ -224,7 +225,11 @@ def _issuer(
         for candidate in candidates
         if likely_issued(certificate, candidate) and candidate not in chain
     ]
-    valid = (issuer for issuer in certificates if validity_of(issuer).contains(moment))
+    valid = (
+        issuer
+        for issuer in certificates
+        if validity_of(issuer).contains(moment) and not tolerant.unread_date(issuer)
+    )
     return next(
         valid,
         max(certificates, key=lambda issuer: validity_of(issuer).not_after, default=None),
@@ -244,6 +249,16 @@ def denies_issuing(certificate: x509.Certificate) -> bool:
     constraints = extension(certificate, x509.BasicConstraints)
     denied = constraints is not None and not constraints.ca
     return denied or not _may_sign_certificates(certificate)
+
+
+def _key_faults(certificate: x509.Certificate) -> Iterator[str]:
+    """Yield a fault if the key of the first certificate of a chain cannot be read.
+
+    OpenSSL reads the key (X509_self_signed), also one on a curve that its parameters describe.
+    """
+    if isinstance(certificate.public_key(), UnknownKey) and not has_explicit_curve(certificate):
+        name = subject_text(certificate.subject)
+        yield f"the public key of {name} is damaged, or of a kind which sros does not know"
 
 
 @lru_cache(maxsize=64)
@@ -347,7 +362,7 @@ def _authority_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iter
         if place > 1 and longest is not None and below > longest:
             name = subject_text(certificate.subject)
             yield f"the chain is longer than the pathlen of {name} allows"
-        if not place or not is_self_issued(certificate):
+        if place and not is_self_issued(certificate):
             below += 1
 
 
@@ -485,7 +500,7 @@ def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
         )
         if maps and policies is not None:
             yield f"{name} has policyMappings, which sros does not know"
-        asked = _ALWAYS_ASKED if policies is None else _OF_POLICIES
+        asked = _OF_POLICIES if named else _ALWAYS_ASKED
         if any(
             extension.oid in asked and is_unread(extension) for extension in certificate.extensions
         ):
@@ -531,7 +546,7 @@ def _name_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
 def _names(certificate: x509.Certificate, *, is_leaf: bool) -> Iterator[x509.GeneralName | None]:
     """Yield a certificate's names that constraints apply to; None for a name that is unreadable."""
     subject = certificate.subject
-    if subject.rdns:
+    if any(subject.rdns):
         readable_name = isinstance(subject, x509.Name)
         yield x509.DirectoryName(subject) if readable_name else None
     for text in subject.get_attributes_for_oid(NameOID.EMAIL_ADDRESS):

@@ -30,8 +30,8 @@ _SPACES = re.compile(rb"[ \t\n\v\f\r]+")
 
 
 def same_name(first: x509.Name, second: x509.Name) -> bool:
-    """Return whether two names are equal: string types, case and blanks do not count."""
-    return len(first.rdns) == len(second.rdns) and canonical(first) == canonical(second)
+    """Return whether names are equal; string types, case, blanks and empty parts do not count."""
+    return canonical(first) == canonical(second)
 
 
 @lru_cache(maxsize=64)  # all documents of a keystore have the same signer
@@ -52,6 +52,7 @@ def canonical_der(name: bytes) -> tuple[bytes, ...]:
     return tuple(
         b"".join(sorted(_attribute(attribute) for attribute in der.children(part.content)))
         for part in parts
+        if part.content
     )
 
 

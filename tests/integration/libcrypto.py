@@ -45,6 +45,7 @@ class Libcrypto:
         library.X509_STORE_CTX_init.argtypes = [pointer] * 4
         library.X509_STORE_CTX_set_flags.argtypes = [pointer, ctypes.c_ulong]
         library.X509_STORE_CTX_set_default.argtypes = [pointer, ctypes.c_char_p]
+        library.X509_check_purpose.argtypes = [pointer, ctypes.c_int, ctypes.c_int]
         for name in ("X509_verify_cert", "X509_STORE_CTX_get_error"):
             getattr(library, name).argtypes = [pointer]
 
@@ -94,6 +95,18 @@ class Libcrypto:
             for each in filter(None, loaded):
                 library.X509_free(each)
             library.ERR_clear_error()
+
+    def has_invalid_extensions(self, data: bytes) -> bool:
+        """Return whether an extension of a certificate, in DER, is invalid (EXFLAG_INVALID).
+
+        Such a certificate is taken for no issuer, so that another of its name may be found.
+        """
+        loaded = self._load(data)
+        try:
+            return bool(self._library.X509_check_purpose(loaded, -1, 0) != 1)
+        finally:
+            self._library.X509_free(loaded)
+            self._library.ERR_clear_error()
 
     def _load(self, data: bytes) -> int | None:
         at = ctypes.cast(ctypes.create_string_buffer(data, len(data)), ctypes.c_void_p)

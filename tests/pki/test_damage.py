@@ -8,13 +8,10 @@ import re
 import shutil
 import subprocess
 from collections.abc import Callable
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding
 from hypothesis import given
 from hypothesis import strategies as st
@@ -24,8 +21,7 @@ from sros_tool.keystore.describe import describe
 from sros_tool.keystore.lifecycle.create import create_enclaves
 from sros_tool.keystore.reader import open_enclave
 from sros_tool.pki import der
-from sros_tool.pki.certificates import common_name, load_certificate, load_der_certificate
-from sros_tool.pki.chains import chain_fault
+from sros_tool.pki.certificates import load_certificate, load_der_certificate
 from tests.support.children import LONG
 from tests.support.long_form import some
 
@@ -188,26 +184,3 @@ def test_a_certificate_that_openssl_cannot_read_is_refused(part: str, keystore: 
         input=whole.replace(before, after, 1),
         capture_output=True,
     ).returncode
-
-
-def test_name_constraints_allow_no_name_that_cannot_be_compared() -> None:
-    key, now = ec.generate_private_key(ec.SECP256R1()), datetime.now(UTC)
-    day = timedelta(days=1)
-    begun = x509.CertificateBuilder(
-        common_name("CA"), None, key.public_key(), 7, now - day, now + day
-    )
-    leaf = begun.subject_name(common_name("robot")).sign(key, hashes.SHA256())
-    below = x509.NameConstraints([x509.DirectoryName(common_name("robot"))], None)
-    authority = begun.subject_name(common_name("CA"))
-    for extension in (x509.BasicConstraints(ca=True, path_length=None), below):
-        authority = authority.add_extension(extension, critical=True)
-    signed, algorithm, _ = der.children(der.children(leaf.public_bytes(Encoding.DER))[0].content)
-    odd = signed.whole.replace(b"\x0c\x05robot", b"\x13\x05rob\xe9t")
-    signature = b"\0" + key.sign(odd, ec.ECDSA(hashes.SHA256()))
-    bits = der.encode(der.BIT_STRING, signature)
-    twin = load_der_certificate(der.encode(der.SEQUENCE, odd, algorithm.whole, bits))
-    faults = [
-        chain_fault(certificate, [authority.sign(key, hashes.SHA256())], moment=now)
-        for certificate in (leaf, twin)
-    ]
-    assert faults[0] == "" and "do not allow the names of CN=rob" in faults[1]

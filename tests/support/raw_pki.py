@@ -235,9 +235,14 @@ def pss_algorithm(digest: str, masked: str, salt: int) -> bytes:
 
 
 def public_info(label: str, form: str = "") -> bytes:
-    """Return the SubjectPublicKeyInfo; ``form`` is "", compressed, explicit, pss, no parameters."""
+    """Return the SubjectPublicKeyInfo.
+
+    ``form`` is "", compressed, explicit, pss, no parameters, or damaged: no point of the curve.
+    """
     public = key(label).public_key()
     plain: bytes = public.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
+    if form == "damaged":
+        return plain[:-1] + bytes([plain[-1] ^ 1])
     if isinstance(public, ec.EllipticCurvePublicKey):
         point = (
             PublicFormat.CompressedPoint if form == "compressed" else PublicFormat.UncompressedPoint

@@ -82,13 +82,18 @@ _LETTERS = {"m": "matched", "u": "unmatched", "d": "denied", "r": "refused", "c"
 
 
 def kept_replies() -> dict[Case, dict[Vendor, str]]:
-    """Return what libraries were observed to do with cases: a line each, a letter a vendor."""
+    """Return what libraries were observed to do with cases: a line each, a letter a vendor.
+
+    A dot stands for a vendor that was not asked.
+    """
     kept = {}
     for line in KEPT.read_text().splitlines():
         letters, _, text = line.partition(" ")
-        kept[Case.parse(text)] = dict(
-            zip(VENDORS, (_LETTERS[each] for each in letters), strict=True)
-        )
+        kept[Case.parse(text)] = {
+            vendor: _LETTERS[letter]
+            for vendor, letter in zip(VENDORS, letters, strict=True)
+            if letter != "."
+        }
     return kept
 
 
