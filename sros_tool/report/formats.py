@@ -10,6 +10,7 @@ import subprocess
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from datetime import datetime
+from string import Template
 from textwrap import wrap
 
 from sros_tool.errors import UnavailableError
@@ -44,42 +45,52 @@ from sros_tool.terminal import visible_line
 from sros_tool.wording import counted
 
 _HEAD, _SAID = 40, 19
+_PALETTE = {
+    "paper": ("#fbfcfd", "#131416"),
+    "card": ("#fff", "#1e2023"),
+    "ink": ("#17222e", "#e8eef5"),
+    "soft": ("#56657a", "#a9b2bc"),
+    "rule": ("#cfd7e1", "#424850"),
+    "frame": ("#eef2f6", "#191b1e"),
+    "line": ("#5d7590", "#8aa3bf"),
+    "deny": ("#b3261e", "#ff8a80"),
+    "first": ("#a34a00", "#ffb070"),
+    "second": ("#176b3a", "#7fd6a0"),
+    "encrypt": ("#176b3a", "#7fd6a0"),
+    "sign": ("#1f5fae", "#8fbcff"),
+    "open": ("#a34a00", "#ffb070"),
+}
+"""The light and the dark color of each `$` word of the style."""
 _STYLE = """\
-svg{--paper:#fbfcfd;--card:#fff;--ink:#17222e;--soft:#56657a;--rule:#cfd7e1;--frame:#eef2f6;\
---line:#5d7590;--deny:#b3261e;--first:#a34a00;--second:#176b3a;--encrypt:#176b3a;--sign:#1f5fae;\
---open:#a34a00;background:var(--paper)}
-@media (prefers-color-scheme:dark){svg{--paper:#131416;--card:#1e2023;--ink:#e8eef5;--soft:#a9b2bc;\
---rule:#424850;--frame:#191b1e;--line:#8aa3bf;--deny:#ff8a80;--first:#ffb070;--second:#7fd6a0;\
---encrypt:#7fd6a0;--sign:#8fbcff;--open:#ffb070}}
+svg{background:$paper}
 text{font:12px ui-monospace,"SFMono-Regular",Menlo,Consolas,"DejaVu Sans Mono",monospace;\
-fill:var(--ink);white-space:pre}
-.small{font:11px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;fill:var(--soft)}
+fill:$ink;white-space:pre}
+.small{font:11px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;fill:$soft}
 .title{font:600 15px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif}
 .said{font:13px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif}
-.head{font:600 11px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;fill:var(--soft);\
+.head{font:600 11px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;fill:$soft;\
 letter-spacing:.06em}
 .enclave text{font-weight:600}.enclave .small{font-weight:400}
-.paper{fill:var(--paper)}.card rect{fill:var(--card);stroke:var(--rule)}
-.enclave rect,.group rect{stroke:var(--soft)}\
-.chosen rect{stroke:var(--sign);stroke-width:2.5}.frame{fill:var(--frame)}
-.lacking rect{stroke:var(--open);stroke-dasharray:5 3}.small.lack{fill:var(--open)}
-.link{fill:none;stroke:var(--line);stroke-width:1.5;marker-end:url(#to)}
+.paper{fill:$paper}.card rect{fill:$card;stroke:$rule}
+.enclave rect,.group rect{stroke:$soft}\
+.chosen rect{stroke:$sign;stroke-width:2.5}.frame{fill:$frame}
+.lacking rect{stroke:$open;stroke-dasharray:5 3}.small.lack{fill:$open}
+.link{fill:none;stroke:$line;stroke-width:1.5;marker-end:url(#to)}
 .wild{stroke-width:1;stroke-opacity:.75}
 .sign{stroke-dasharray:9 3}.none{stroke-dasharray:2 3}
-.first{stroke:var(--first);stroke-width:2.25;marker-end:url(#to1)}
-.second{stroke:var(--second);stroke-width:2.25;marker-end:url(#to2)}
-.differs{stroke:var(--sign);stroke-width:3;stroke-opacity:1;marker-end:url(#odd)}
-.tipodd{fill:var(--sign)}
-.deny{stroke:var(--soft);stroke-width:1.75;stroke-opacity:1;marker-end:url(#no)}
-.violates{stroke:var(--deny);stroke-width:3;stroke-opacity:1;marker-end:url(#bad)}
-.tip{fill:var(--line)}.tipbad{fill:var(--deny)}.tip1{fill:var(--paper);stroke:var(--first);stroke-width:1.2}.tip2{fill:var(--second)}
-.cross{fill:var(--paper);stroke:var(--soft);stroke-width:1.6}
-.glyph{fill:none;stroke:var(--soft);stroke-width:1.4}
-.lock{fill:none;stroke-width:1.4}.lock-encrypt{stroke:var(--encrypt)}.lock-sign{stroke:var(--sign)}\
-.lock-none{stroke:var(--open)}
-.tag{font:700 11px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;fill:var(--soft)}
+.first{stroke:$first;stroke-width:2.25;marker-end:url(#to1)}
+.second{stroke:$second;stroke-width:2.25;marker-end:url(#to2)}
+.differs{stroke:$sign;stroke-width:3;stroke-opacity:1;marker-end:url(#odd)}
+.tipodd{fill:$sign}
+.deny{stroke:$soft;stroke-width:1.75;stroke-opacity:1;marker-end:url(#no)}
+.violates{stroke:$deny;stroke-width:3;stroke-opacity:1;marker-end:url(#bad)}
+.tip{fill:$line}.tipbad{fill:$deny}.tip1{fill:$paper;stroke:$first;stroke-width:1.2}.tip2{fill:$second}
+.cross{fill:$paper;stroke:$soft;stroke-width:1.6}
+.glyph{fill:none;stroke:$soft;stroke-width:1.4}
+.lock{fill:none;stroke-width:1.4}.lock-encrypt{stroke:$encrypt}.lock-sign{stroke:$sign}\
+.lock-none{stroke:$open}
+.tag{font:700 11px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;fill:$soft}
 """
-_USE = "svg{--second:var(--deny)}\n"  # use without permission is drawn like a violation
 _MARKERS = """\
 <marker id="to" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="8" markerHeight="8" \
 markerUnits="userSpaceOnUse" orient="auto"><path class="tip" d="M0 0.5L8 4L0 7.5z"/></marker>
@@ -112,7 +123,9 @@ _LOCKS = {
 def render_svg(picture: Picture, scene: Scene) -> str:
     """Return the scene as an SVG document; the same scene gives the same bytes."""
     legend = list(_legend(picture, scene))
-    used = _USE if picture.overlay and picture.overlay.kind == "use" else ""
+    # Use without permission is drawn like a violation.
+    use = picture.overlay is not None and picture.overlay.kind == "use"
+    palette = {**_PALETTE, "second": _PALETTE["deny"]} if use else _PALETTE
     text_lines = [
         line for headline in picture.headlines for line in _lines(f"{headline}.", scene.width)
     ]
@@ -122,7 +135,7 @@ def render_svg(picture: Picture, scene: Scene) -> str:
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {scene.width} {height}" '
         f'width="{scene.width}" height="{height}" role="img">',
         f"<title>{escape(picture.title)}: who may do what</title>",
-        f"<style>{_STYLE}{used}</style>",
+        f"<style>{_style(palette)}</style>",
         f"<defs>{_MARKERS}</defs>",
         f'<rect class="paper" width="{scene.width}" height="{height}"/>',
         f'<text class="title" x="14" y="26">{escape(picture.title)}</text>',
@@ -157,6 +170,27 @@ def render_svg(picture: Picture, scene: Scene) -> str:
         y = top + scene.height + 16 + 20 * number
         lines.append(f'<g transform="translate(14 {y})">{text}</g>')
     return "\n".join((*lines, "</svg>", ""))
+
+
+def _style(palette: Mapping[str, tuple[str, str]]) -> str:
+    """Return the style of a drawing: light, and dark where the viewer asks for it.
+
+    Viewers that know neither variables nor media queries (CairoSVG, Qt, printing) draw in the
+    light colors, so the style has each color itself.
+    """
+    light = {word: colors[0] for word, colors in palette.items()}
+    dark = {word: colors[1] for word, colors in palette.items()}
+    colored = "".join(
+        f"{selector.strip()}{{{';'.join(parts)}}}\n"
+        for selector, rule in re.findall(r"([^{}]+)\{([^{}]*)\}", _STYLE)
+        if (parts := [part for part in rule.split(";") if "$" in part])
+    )
+    return (
+        Template(_STYLE).substitute(light)
+        + "@media (prefers-color-scheme:dark){\n"
+        + Template(colored).substitute(dark)
+        + "}\n"
+    )
 
 
 def _summary(picture: Picture, scene: Scene) -> str:

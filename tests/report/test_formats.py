@@ -92,6 +92,21 @@ def test_svg_is_whole_xml_without_anything_that_runs_or_loads(tmp_path: Path) ->
     assert HOSTILE[0] in texts  # as text, and all of it
 
 
+def test_svg_has_each_color_itself_and_another_one_for_the_dark(tmp_path: Path) -> None:
+    shown = (
+        sros("view", REPOSITORY / "policies" / "talker_listener.xml", "--format", "svg").ok().out
+    )
+    style = shown[shown.index("<style>") + 7 : shown.index("</style>")]
+    assert "var(" not in style  # CairoSVG and Qt draw black for it
+    assert "$" not in style
+    light, dark = style.split("@media (prefers-color-scheme:dark){")
+    colored = r"([^{}]+)\{[^{}]*#[^{}]*\}"
+    words = r"(?:fill|stroke|background):#\w{3,6}\b"
+    rules = [[rule[1].strip() for rule in re.finditer(colored, part)] for part in (light, dark)]
+    assert rules[0] == rules[1]
+    assert len(re.findall(words, light)) == len(re.findall(words, dark)) > 20
+
+
 def test_dot_can_hold_any_name(tmp_path: Path) -> None:
     path = tmp_path / "hostile.xml"
     path.write_text(hostile_permissions())
