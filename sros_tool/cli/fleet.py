@@ -641,7 +641,7 @@ def _status(
       robot                  state            confirmed  to do         what
       r7                     earlier          3 d ago    deliver       earlier ...
       r8                     foreign files    2 min ago  find out why  10 files of r9
-      r31 to r34 (4)         never confirmed  -          deliver       2 enclaves
+      r31 to r34 (4)         never confirmed  -          deliver       each: 2 ...
       r1 to r6, r9 ... (44)  current          4 min ago
       $ sros fleet status keystore --max-age 7d
       $ sros fleet status keystore --prometheus -o /var/lib/.../fleet.prom
@@ -983,7 +983,8 @@ def _groups(compared_fleet: ComparedFleet, robots: Sequence[str]) -> list[_Group
     groups = []
     for (state, to_do, *_), group in robots_by_texts.items():
         what = _joined_durations({robot.robot: clauses_by_robot[robot.robot] for robot in group})
-        groups.append(_Group(group, state, to_do, what))
+        each = "each: " if len(group) > 1 and what[:1].isdigit() else ""  # not their sum
+        groups.append(_Group(group, state, to_do, f"{each}{what}"))
     return [*groups, _Group(current, "current", "", "")] if current else groups
 
 

@@ -294,9 +294,11 @@ def _sentence(text: str) -> str:
 
 
 def _with_marks(text: str) -> str:
-    """Return ``text`` in HTML, in which backticks mark commands; CVE numbers stay whole."""
+    """Return ``text`` in HTML, with commands for backticks; options and CVE numbers stay whole."""
     marked = re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
-    return re.sub(r"\bCVE-\d+-\d+", r'<span class="id">\g<0></span>', marked)
+    return re.sub(
+        r"\bCVE-\d+-\d+|(?<![\w-])--[a-z][a-z-]*", r'<span class="id">\g<0></span>', marked
+    )
 
 
 def _demo_head(result: Json, made: str) -> str:

@@ -1077,6 +1077,7 @@ def test_fifty_robots_of_which_the_same_is_to_be_said_share_a_line(field: Field)
     field.deliver("r20")
     lines = field.run("fleet", "status", "ks", status=1).out.splitlines()
     assert lines[0] == "50 robots: 3 current, 1 earlier, 46 never confirmed"
+    assert lines[4].endswith("  each: 1 enclave")
     assert [re.split("  +", line)[:4] for line in lines[3:7]] == [
         ["r1", "earlier", re.split("  +", lines[3])[2], "deliver"],
         ["r4 to r19, r21 to r50 (46 robots)", "never confirmed", "-", "deliver"],

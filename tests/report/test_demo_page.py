@@ -190,8 +190,14 @@ def fleet_page() -> str:
     status: dict[str, Any] = {"keystore": name, "at": "2027-01-01T00:00:00Z", "counts": counts}
     rows = [(state, name, "2027-01-01T00:00:00Z", "", "deliver", 60 * "file") for state in states]
     status |= {"robots": states, "outdated_dds": ["r1"], "findings": [finding]}
+    deliver = f"`sros distribute_key --force` {name}"
     return render_fleet_page(
-        status, {"earlier": "an earlier one"}, [name], rows, {"deliver": name}, f"on 1 of 2{name}"
+        status,
+        {"earlier": "an earlier one"},
+        [name],
+        rows,
+        {"deliver": deliver},
+        f"on 1 of 2{name}",
     )
 
 
@@ -207,6 +213,8 @@ def test_a_fleet_begins_with_how_many_are_current_and_says_it_once() -> None:
     (library,) = page.cssselect("section > details")
     assert library.cssselect("summary")[0].text_content() == f"{HOSTILE[0]}: 1 known; on r1"
     assert "In '/opt/library" in library.text_content() and "CVE-1-2." in library.text_content()
+    # A line of a phone does not end within an option: "--" and "force" are no words.
+    assert [option.text for option in page.cssselect("dd code .id")] == ["--force"]
 
 
 @pytest.mark.browser

@@ -859,6 +859,9 @@ def test_what_is_violated_comes_first_and_the_map_opens_where_it_is(
         assert "may publish /n8/t8" not in " ".join(others)
         assert "No error" not in " ".join(others)
         assert page.evaluate(inside)
+        # What can be pressed in a sentence is not told by its color alone.
+        lines = "buttons => buttons.map(button => getComputedStyle(button).textDecorationLine)"
+        assert set(page.eval_on_selector_all("#headlines button", lines)) == {"underline"}
         broken = "/a8: p.xml:1: may publish /n8/t8, but only /mux"
         for words, said in (
             ("1 of 3 requirements", broken),
