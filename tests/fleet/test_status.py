@@ -5,8 +5,12 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -1301,7 +1305,36 @@ def test_a_robot_with_other_files_than_the_release_that_it_has(field: Field) -> 
     assert field.status()["robots"]["r1"]["to_do"] == "find out why"
 
 
-def test_the_module_on_the_robot_confirms_the_same(field: Field) -> None:
+MAPS_A_LIBRARY = """
+import mmap, sys
+with open(sys.argv[1], "rb") as file:
+    mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+print("mapped", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def only_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Yield the library that the only process has loaded that sros and the module can see.
+
+    The processes of other tests come and go between two looks.
+    """
+    library = tmp_path / "libfastrtps.so.2.14.5"
+    library.write_bytes(b"library")
+    words = [sys.executable, "-IS", "-c", MAPS_A_LIBRARY, str(library)]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout and process.stdout.readline() == b"mapped\n"
+        listed = os.listdir
+
+        def only_this(folder: Any = ".") -> list[str]:
+            return [str(process.pid)] if str(folder) == "/proc" else listed(folder)
+
+        monkeypatch.setattr(os, "listdir", only_this)
+        yield str(library)
+
+
+def test_the_module_on_the_robot_confirms_the_same(field: Field, only_process: str) -> None:
     parts = "ansible_collections/sros/fleet/plugins/module_utils/exports.py"
     spec = importlib.util.spec_from_file_location("exports", Path(__file__).parents[2] / parts)
     assert spec and spec.loader
@@ -1321,11 +1354,11 @@ def test_the_module_on_the_robot_confirms_the_same(field: Field) -> None:
         "sros does not know which processes were restarted"
     )
     assert {**made, "dds": 0} == {**said, "dds": 0}
-    found = [
-        {(each["product"], each["version"]) for each in dds["libraries"] if "/usr/" in each["path"]}
-        for dds in (made["dds"], said["dds"])
-    ]
-    assert found[0] == found[1]
+    for dds in (made["dds"], said["dds"]):
+        loaded = [each for each in dds["libraries"] if each["seen"] == "process"]
+        assert [(each["product"], each["version"], each["path"]) for each in loaded] == [
+            ("Fast DDS", "2.14.5", only_process)
+        ]
     (robot / ".agent").mkdir()
     for boot, due in ((boot_id(), ["/r1/base"]), ("of an earlier start", None)):
         write_state(robot, AgentState(due=("/r1/base",), boot=boot))
