@@ -55,8 +55,8 @@ from sros_tool.keystore.confirmation import (
     EnclaveExpiry,
     RobotClock,
     RunningFiles,
+    concerns_key,
     enclave_of,
-    lacks_key,
     make_confirmation,
     render_confirmation,
     shortened_dds,
@@ -511,7 +511,7 @@ class _Round:
             self._problems.append(self._refused(error))
             return Installation()
         for name, why in installation.kept.items():
-            remedy = _BRING_KEY.format(settings.robot) if lacks_key(why) else ""
+            remedy = _BRING_KEY.format(settings.robot) if concerns_key(why) else ""
             self._problems.append(f"{name} keeps its files: {why}.{remedy}")
         for name in installation.removed:
             self._problems.append(

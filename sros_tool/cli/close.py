@@ -103,6 +103,8 @@ def close(
 ) -> int:
     """Close the robot that runs open on this machine, step by step.
 
+    A robot is open if its processes run without security, and closed if each runs in an enclave.
+
     Watches the robot on DDS or Zenoh, and writes its policy and the requirements that hold now
     into FOLDER. Adds a production keystore with an enclave for each process, an export of the
     enclaves without CA keys, and the files that start each process with security. Each step is a

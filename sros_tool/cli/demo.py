@@ -164,7 +164,7 @@ def demo(
 
     Creates keystores, starts nodes with and without enclaves, and compares expected and observed
     results. The scenario `isolation` takes about 10 s on Cyclone DDS and 20 s on rclpy. The
-    scenario `attacks` tries all attacks that sros knows, also without the defences that stop them;
+    scenario `attacks` tries all attacks that sros knows, also without the defenses that stop them;
     it takes about 30 s on Cyclone DDS and 60 s on rclpy. On Zenoh (--backend zenoh), all scenarios
     run, in about 25 s.
 

@@ -261,8 +261,9 @@ def explain(
     keystore, sros decides by the permissions that the policy would give.
 
     The exit status is 0 if the operation is allowed (with --who: to at least one enclave), and 1 if
-    it is denied; with --log, 1 if the log reports a fault. An action is allowed only as a whole:
-    "in part" names the enclaves that can still command its server, for example by send_goal.
+    it is denied; with --log, 1 if the log reports a fault. An action is allowed only with all of
+    its services and topics. "in part" marks an enclave that has only some of them but can command
+    the action's server, for example by send_goal.
 
     Example:
       $ sros explain keystore /talker publish /chatter --policy robot.xml

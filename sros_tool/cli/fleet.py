@@ -128,10 +128,11 @@ def _report(folder: Path, robot: str, restarted: bool) -> None:
 
     The report is JSON. It has the time, the SHA-256 of each file of the enclaves in DIR except
     their keys, the DDS libraries that processes have loaded or that are installed, and the enclaves
-    whose processes still run with earlier files: root can see all processes. Its problems are
-    enclaves in which no process could start, for example because the key does not fit the
-    certificate, files that other users can read or change, and what `sros check runtime` finds in
-    the processes of these enclaves. docs/json.md describes the report under "confirmation".
+    whose processes still run with earlier files. Run the command as root, who can see all
+    processes. The problems in the report are enclaves in which no process could start, for example
+    because the key does not fit the certificate, files that other users can read or change, and
+    what `sros check runtime` finds in the processes of these enclaves. docs/json.md describes the
+    report under "confirmation".
 
     Example:
       $ ssh root@r7 sros fleet report /etc/sros/keystore --robot r7 |

@@ -538,15 +538,15 @@ def minimize_policy(
         check_output(output, force=force)
     fleet = read_fleet(fleet_file) if fleet_file else None
     minimized = minimized_policy(policy, observed, fleet, strict=strict, output=output)
-    measured, notes = minimized.enclaves, minimized.notes
+    enclaves, notes = minimized.enclaves, minimized.notes
     changes = file_change(output, existed=output.exists()) if output else ()
     saved = save(output, minimized.document) if output and not dry_run else ""
     if as_json:
         kept = output if not dry_run else None
-        plain = as_plain(PolicyMinimization(policy, kept, measured, dry_run, changes, notes))
+        plain = as_plain(PolicyMinimization(policy, kept, enclaves, dry_run, changes, notes))
         print_json({**plain, "enclaves": _as_written(plain["enclaves"])})
     else:
-        for enclave in measured:
+        for enclave in enclaves:
             for line in _use_lines(enclave):
                 echo(as_written(line))
     print_notes(notes)

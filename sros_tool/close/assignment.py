@@ -180,7 +180,7 @@ def ended_processes(
     ran: Iterable[tuple[Process, ProcessOrigin]],
     observed: ObservedProcesses,
 ) -> list[ClosedProcess]:
-    """Return the processes of nodes that ended while sros watched.
+    """Return the processes that ended while sros watched, with the nodes that they ran.
 
     If an enclave had several commands, its processes are left out, because one of them may be
     another program that took the node's name.  ``observed`` are the processes that stayed; a unit

@@ -381,12 +381,12 @@ def _best_cast(
         if pair is None:
             continue
         cast = dict(zip(("talker", "listener"), pair, strict=True))
-        guests = [name for name in rights if name not in pair]
-        guests.sort(
+        unpaired = [name for name in rights if name not in pair]
+        unpaired.sort(
             key=lambda name: ((name in talkers) + (name in listeners), name in serving.values())
         )
-        if guests:
-            cast["guest"] = guests[0]
+        if unpaired:
+            cast["guest"] = unpaired[0]
         nested = [(g, a) for g, a in permutations(rights, 2) if _is_below(g, a)]
         guest_and_admin = next(
             ((g, a) for g, a in nested if a in talkers and g not in talkers), None

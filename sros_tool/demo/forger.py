@@ -1,8 +1,8 @@
-"""Forgeries: change a keystore as an attacker would, or remove a defence.
+"""Forgeries: change a keystore as an attacker would, or remove a defense.
 
 Rows of scenarios refer to these functions. A row that names only a function applies it to a copy of
-the keystore, with all defences in place. A row that names an `Undefended` applies its function to a
-new keystore without one of the defences, to show that the attack works there.
+the keystore, with all defenses in place. A row that names an `Undefended` applies its function to a
+new keystore without one of the defenses, to show that the attack works there.
 """
 
 from __future__ import annotations
@@ -214,7 +214,7 @@ def _same_template(template: Template) -> Template:
 
 
 class Undefended(NamedTuple):
-    """A forgery in a new keystore that lacks a defence: its template is changed first."""
+    """A forgery in a new keystore that lacks a defense: its template is changed first."""
 
     forge: Forge = _forge_nothing
     template: Callable[[Template], Template] = _same_template

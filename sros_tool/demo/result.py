@@ -117,11 +117,11 @@ class RowResult:
     attack: str = ""
     """Name of the attack, or an empty string for ordinary communication."""
     defence_removed: str = ""
-    """Defence that the row removes, or an empty string."""
+    """Defense that the row removes, or an empty string."""
     open_because: str = ""
     """Why the attack is known to succeed, or an empty string."""
     remedy: str = ""
-    """Defence against the attack, or an empty string."""
+    """Defense against the attack, or an empty string."""
     accepted: bool = False
     """Whether `--accept-open` names the row."""
     unaccepted: bool = False
@@ -153,7 +153,7 @@ class RowResult:
     def untried(self) -> bool:
         """Whether the row of an attack that has to fail was skipped, so that it may succeed.
 
-        False for rows that prove nothing about a keystore (without the defence, or of an attack
+        False for rows that prove nothing about a keystore (without the defense, or of an attack
         that is known to succeed or was accepted), and for rows that do not apply to it.
         """
         if self.observed is not RowStatus.SKIPPED or not self.applies or self.defence_removed:
@@ -890,21 +890,21 @@ def _verdict(result: DemoResult, wrong: Sequence[RowResult]) -> str:
 
 
 def _attack_lines(
-    attacks: Sequence[RowResult], rows_without_defence: Sequence[RowResult]
+    attacks: Sequence[RowResult], rows_without_defense: Sequence[RowResult]
 ) -> list[str]:
     closed = [row for row in attacks if not row.open_because]
     open_ = [row for row in attacks if row.open_because]
     lines = [
         "## Attacks",
         "",
-        "A failed attack proves something only if the same attack succeeds without the defence: the"
+        "A failed attack proves something only if the same attack succeeds without the defense: the"
         " last column shows that result.",
         "",
-        "| attack | expected | observed | mechanism | without the defence |",
+        "| attack | expected | observed | mechanism | without the defense |",
         "| --- | --- | --- | --- | --- |",
     ]
     for row in closed:
-        texts = (_twin_text(twin) for twin in rows_without_defence if twin.attack == row.attack)
+        texts = (_twin_text(twin) for twin in rows_without_defense if twin.attack == row.attack)
         twins = "; ".join(dict.fromkeys(texts))
         lines.append(f"| {_cells(row)} | {row.mechanism} | {twins} |")
     if open_:
@@ -918,9 +918,9 @@ def _attack_lines(
 
 
 def _twin_text(row: RowResult) -> str:
-    """Return the result without the defence, such as ``heard with the right key``."""
+    """Return the result without the defense, such as ``heard with the right key``."""
     if row.defence_removed.startswith("the wrong "):
-        # The defence is a fault of the attacker's own files.
+        # The defense is a fault of the attacker's own files.
         return f"{row.observed} with the right {row.defence_removed.removeprefix('the wrong ')}"
     return f"{row.observed} without {row.defence_removed}"
 

@@ -229,7 +229,7 @@ COULD_NOT_START = "could not start"
 """A robot's message on an enclave in which no process would start."""
 
 
-def lacks_key(problem: str) -> bool:
+def concerns_key(problem: str) -> bool:
     """Return whether a problem of a robot is about a key, which no release can bring."""
     is_of_key = is_unusable(problem) and KEY_FILE in problem
     return is_of_key or KEY_NOT_HERE in problem or OF_ANOTHER_KEY in problem

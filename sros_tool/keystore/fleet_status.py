@@ -39,10 +39,10 @@ from sros_tool.keystore.confirmation import (
     RobotDds,
     RunningFiles,
     certificate_digests,
+    concerns_key,
     enclave_of,
     is_of_copy,
     is_unusable,
-    lacks_key,
     last_confirmation,
     refusals,
 )
@@ -979,7 +979,7 @@ class _KeystoreRecords:
         confirmed = compared_robot.confirmed
         if confirmed is None:
             return ()
-        problems = [problem for problem in confirmed.problems or () if lacks_key(problem)]
+        problems = [problem for problem in confirmed.problems or () if concerns_key(problem)]
         enclaves_without_key = {
             name
             for name in compared_robot.enclaves

@@ -139,7 +139,7 @@ _SETTINGS = re.compile(
 )
 """A table of a keystore template or of requirements."""
 _LARGEST_SETTINGS = 1024 * 1024
-_IS_KEY = (
+_PRIVATE_KEY_FOUND = (
     "has a private key, which whoever can read the repository has now: replace the key, because "
     "its history keeps it"
 )
@@ -657,7 +657,7 @@ class _Review:
             if _PRIVATE_KEY.search(content)
         }
         lines = [
-            (_IS_KEY, path)
+            (_PRIVATE_KEY_FOUND, path)
             for path, digits in sorted(files.items())
             if digits in keys and not _is_below(path, self.request.left_out)
         ]
@@ -848,7 +848,10 @@ class _Review:
             yield "no policy is named"
         if not asked.requirements:
             yield "no requirements are named"
-        others = ", and for others only whether the change breaks them" * self.is_compared_elsewhere
+        others = (
+            ", and in other namespaces only whether the change breaks them"
+            * self.is_compared_elsewhere
+        )
         if self.is_relative and not asked.namespaces:
             yield (
                 "requirements with names without '/' at the beginning were decided only in the "

@@ -117,8 +117,9 @@ class Card:
     ``column`` counts from 0, names are in odd columns; an enclave that sends and listens has a card
     on both sides.  A card in the focus of the picture is ``chosen``.  ``lines``
     is the text, ``notes`` smaller text below it.  ``members`` are all enclaves or names of the
-    card.  Only cards of names have ``kind``, ``level``, ``lacks`` and ``tags`` (letters of
-    onlookers); only cards of enclaves have ``group``.
+    card.  Only cards of names have ``kind``, ``level``, ``lacks`` and ``tags``:
+    the letters of onlookers, which are nodes with rights to many of the names.  Only cards of
+    enclaves have ``group``.
     """
 
     id: str

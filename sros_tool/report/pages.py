@@ -334,8 +334,8 @@ def _demo_head(result: Json, made: str) -> str:
     )
     removed = sum(bool(row.get("defence_removed")) for row in rows)
     controls = (
-        f"in {removed} of the attempts a defence is removed, and the attack has to succeed: this "
-        "shows that the defence stops it elsewhere"
+        f"in {removed} of the attempts a defense is removed, and the attack has to succeed: this "
+        "shows that the defense stops it elsewhere"
         if removed
         else ""
     )

@@ -1,4 +1,4 @@
-"""The attacks as data: each has a control, and a twin without its defence that succeeds."""
+"""The attacks as data: each has a control, and a twin without its defense that succeeds."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_a_closed_door_has_a_control_that_is_open(row: Row) -> None:
         assert all(claim.holds for claim in row.controls)
 
 
-def test_every_closed_door_opens_without_its_defence() -> None:
+def test_every_closed_door_opens_without_its_defense() -> None:
     closed = {row.attack for row in ROWS if row.expected in CLOSED}
     opened = {row.attack for row in ROWS if row.defence_removed}
     # The closed row of this one is the control of those with variables that are spelt wrong.

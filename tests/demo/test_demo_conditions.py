@@ -112,7 +112,7 @@ def test_what_differs_between_templates_and_vendors() -> None:
     }
 
 
-def test_a_defence_that_a_vendor_has_in_another_form_is_removed_in_that_form() -> None:
+def test_a_defense_that_a_vendor_has_in_another_form_is_removed_in_that_form() -> None:
     holding = conditions(FAST, load_template("production"), "rt/chatter")
     twins = {
         row.name: row.with_expected_status(holding) for row in ATTACKS.rows if row.defence_removed

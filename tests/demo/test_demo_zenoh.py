@@ -52,7 +52,7 @@ def judged(name: str, parties: Mapping[str, PartyRecord], expiry: float | None =
 # ── the rows ───────────────────────────────────────────────────────────────────────────────
 
 
-def test_every_attack_is_also_tried_without_its_defence_or_told_as_open() -> None:
+def test_every_attack_is_also_tried_without_its_defense_or_told_as_open() -> None:
     rows = defaultdict[str, list[Row]](list)
     for row in ATTACKS.rows:
         rows[row.attack].append(row)

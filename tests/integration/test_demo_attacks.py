@@ -114,16 +114,16 @@ OFTEN = ("subjects that others contain", "files open to all users")
 def test_a_weakness_makes_its_rows_fail_and_no_others(
     backend: Backend, name: str, tmp_path: Path
 ) -> None:
-    """Of the rows that keep their defences: all that must fail, and one of the others.
+    """Of the rows that keep their defenses: all that must fail, and one of the others.
 
     In the long form each weakness tries all rows.
     """
     weakness = WEAKNESSES[name]
     broken = weakness.broken_on(backend)
-    rows_with_defences = [row.name for row in ATTACKS.rows if not row.defence_removed]
-    others = [row for row in rows_with_defences if row not in broken]
+    rows_with_defenses = [row.name for row in ATTACKS.rows if not row.defence_removed]
+    others = [row for row in rows_with_defenses if row not in broken]
     other = others[list(WEAKNESSES).index(name) % len(others)]
-    tried = [row for row in rows_with_defences if LONG or row in broken or row == other]
+    tried = [row for row in rows_with_defenses if LONG or row in broken or row == other]
     root = make_weak(tmp_path, weakness, datetime.now(UTC))
     before = snapshot(root)
     words = [word for row in {*tried, *broken} for word in ("--only", row)]

@@ -134,7 +134,7 @@ def test_weaknesses_of_one_keystore_are_each_named_and_nothing_else(tmp_path: Pa
 def test_a_weak_robot_fails_in_the_rows_of_its_weakness(
     backend: str, name: str, robot: Path, tmp_path: Path
 ) -> None:
-    """All attacks that keep their defences, in a robot of ROS nodes; a sound one fails in none."""
+    """All attacks that keep their defenses, in a robot of ROS nodes; a sound one fails in none."""
     enforcing = enforcing_backend(backend)
     victim, other = "/mobile_robot/teleop", "/mobile_robot/monitor"
     broken: set[str] = set()

@@ -1,4 +1,4 @@
-"""The whole demo on Zenoh as a user runs it; and that a missing defence makes it fail."""
+"""The whole demo on Zenoh as a user runs it; and that a missing defense makes it fail."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_nothing_stays_in_shared_memory(shown: tuple[dict[str, Any], int, Path])
     assert not [each for each in mine if b"Hello World from the talker" in each.read_bytes()]
 
 
-def without_defences(name: str) -> Scenario:
+def without_defenses(name: str) -> Scenario:
     """The scenario of an attack as if it were closed, in a keystore where it is not."""
     attacks = {row.name: row for row in ATTACKS.rows}
     closed = attacks[name]
@@ -106,8 +106,8 @@ def without_defences(name: str) -> Scenario:
         1,
     ),
 )
-def test_the_demo_fails_where_the_defence_is_missing(name: str) -> None:
-    options = DemoOptions(backend="zenoh", scenarios=(without_defences(name),))
+def test_the_demo_fails_where_the_defense_is_missing(name: str) -> None:
+    options = DemoOptions(backend="zenoh", scenarios=(without_defenses(name),))
     result = run_demo(options, datetime.now(UTC), lambda _line: None)
     assert not result.as_expected
     assert [row.observed.value for row in result.rows] == ["heard"]

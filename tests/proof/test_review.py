@@ -1268,7 +1268,7 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(change: Change) ->
     change.commit({"other": "1"})
     asked = ("--policy", "robot.xml", "--requirements", "robot.toml")
     ended = change.review(*asked).ok()
-    assert "were decided only in the namespace /, and for others only whether" in ended.out
+    assert "were decided only in the namespace /, and in other namespaces only whether" in ended.out
     assert (
         "in the namespace / (--namespace)"
         in sros("review", "--base", "none", *asked, cwd=change.folder).out

@@ -105,7 +105,7 @@ def test_every_row_is_told_with_what_came_of_it() -> None:
     assert texts[0].startswith("ok an unsecured node listens not heard not heard who cannot")
     assert "without the refusal of strangers heard heard" in texts[1]
     assert texts[2].startswith("open names read")
-    assert "4 of 5" not in page and "in 1 of the attempts a defence is removed" in page.lower()
+    assert "4 of 5" not in page and "in 1 of the attempts a defense is removed" in page.lower()
     assert texts[3].startswith("differs something else not heard heard")
     assert texts[4].startswith("skipped")
     assert "3 of 5" in page and "heard 0 of 50; control" in page

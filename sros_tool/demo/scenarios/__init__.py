@@ -376,7 +376,7 @@ def _check_controls(
             )
         raise table.error(
             "claim",
-            f"no claim or control shows that {who} meanwhile: a crash would look the same",
+            f"no claim or control shows that {who} at the same time: a crash would look the same",
             remedy,
         )
 

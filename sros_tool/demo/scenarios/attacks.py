@@ -2,7 +2,7 @@
 
 The attacker is the intruder of a row.  A row that expects the attack to fail has a control: the
 same listener must hear the permitted talker at the same time.  For each attack there is also a row
-with ``defence_removed``, which shows that the attack succeeds without that defence: an attack that
+with ``defence_removed``, which shows that the attack succeeds without that defense: an attack that
 never works would prove nothing.
 """
 
@@ -41,7 +41,7 @@ from sros_tool.demo.scenarios.model import (
 
 # ── kinds of attacks ───────────────────────────────────────────────────────────────────────
 # Each function returns a row with the party "attacker".  The victims, and the controls unless
-# noted, have enclaves in the keystore `victims`: by default the attacker's, if a defence is
+# noted, have enclaves in the keystore `victims`: by default the attacker's, if a defense is
 # removed there, otherwise the scenario's own.
 
 _ATTACKER = "attacker"
@@ -56,7 +56,7 @@ _UNCONTROLLED = (
 )
 
 
-def _variants_without_defence(success: RowStatus, expected: RowStatus) -> tuple[Variant, ...]:
+def _variants_without_defense(success: RowStatus, expected: RowStatus) -> tuple[Variant, ...]:
     """Return variants of a row that expect ``success`` if the template does not stop the attack."""
     if expected is RowStatus.REFUSED:
         return (Variant((Condition.UNCONTROLLED,), success, *_UNCONTROLLED),)
@@ -80,7 +80,7 @@ def _injection_row(
 ) -> Row:
     """Return a row that shows whether the attacker is heard on the topic.
 
-    A permitted talker on the same topic shows that the listener can hear, unless a defence is
+    A permitted talker on the same topic shows that the listener can hear, unless a defense is
     switched off (``defence_removed``).
     """
     talker, listener = talker_and_listener(victims or _victims(attacker, defence_removed))
@@ -96,7 +96,7 @@ def _injection_row(
         (hears("listener", _ATTACKER).expecting(expected),),
         () if defence_removed else (hears("listener", "talker"),),
         brief=True,
-        variants=(*variants, *_variants_without_defence(RowStatus.HEARD, expected)),
+        variants=(*variants, *_variants_without_defense(RowStatus.HEARD, expected)),
         defence_removed=defence_removed,
     )
 
@@ -120,7 +120,7 @@ def _tampered_files_row(
 
 
 def _successful_injection_row(name: str, attacker: Identity, defence_removed: str) -> Row:
-    """Return a row in which the listener hears the attacker, because a defence is removed.
+    """Return a row in which the listener hears the attacker, because a defense is removed.
 
     The files of the attacker are valid.
     """
@@ -151,7 +151,7 @@ def _listening_row(
         (hears(_ATTACKER, "talker").expecting(expected),),
         (hears("listener", "talker"),),
         brief=True,
-        variants=_variants_without_defence(RowStatus.HEARD, expected),
+        variants=_variants_without_defense(RowStatus.HEARD, expected),
         defence_removed=defence_removed,
     )
 
@@ -214,7 +214,7 @@ def _call_row(
         (answered(_ATTACKER, "server").expecting(expected),),
         (answered("client", "server"),),
         brief=True,
-        variants=() if defence_removed else _variants_without_defence(RowStatus.ANSWERED, expected),
+        variants=() if defence_removed else _variants_without_defense(RowStatus.ANSWERED, expected),
         defence_removed=defence_removed,
     )
 
@@ -237,7 +237,7 @@ def _false_server_row(
         (answered("client", _ATTACKER).expecting(expected),),
         () if defence_removed else (answered("client", "server"),),
         brief=True,
-        variants=() if defence_removed else _variants_without_defence(RowStatus.ANSWERED, expected),
+        variants=() if defence_removed else _variants_without_defense(RowStatus.ANSWERED, expected),
         defence_removed=defence_removed,
     )
 
@@ -338,7 +338,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
                         "authenticates"
                     ),
                 ),
-                *_variants_without_defence(RowStatus.HEARD_AGAIN, RowStatus.NOT_HEARD_AGAIN),
+                *_variants_without_defense(RowStatus.HEARD_AGAIN, RowStatus.NOT_HEARD_AGAIN),
             ),
         ),
         replace(
@@ -966,7 +966,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
                 "keep join_access_control on",
                 mechanism="its DDS joins, and then finds no rule for the topic in this domain",
             ),
-            *_variants_without_defence(RowStatus.HEARD, RowStatus.NOT_HEARD),
+            *_variants_without_defense(RowStatus.HEARD, RowStatus.NOT_HEARD),
             Variant(
                 (Condition.UNCONTROLLED,),
                 RowStatus.NOT_HEARD,
@@ -1063,7 +1063,7 @@ def _misconfiguration_row(
         (hears("unsecured listener", "misconfigured talker").expecting(expected),),
         (hears("unsecured listener", "unsecured talker"),),
         brief=True,
-        variants=_variants_without_defence(RowStatus.HEARD, expected),
+        variants=_variants_without_defense(RowStatus.HEARD, expected),
         defence_removed=defence_removed,
     )
 
@@ -1128,7 +1128,7 @@ _VARIABLE_ROWS: tuple[Row, ...] = (
 
 ATTACKS = Scenario(
     "attacks",
-    "all attacks that sros knows, also without the defences that stop them",
+    "all attacks that sros knows, also without the defenses that stop them",
     (*_NETWORK_ROWS, *_RIGHTS_ROWS, *_IDENTITY_ROWS, *_PERMISSIONS_ROWS, *_VARIABLE_ROWS),
     {
         "talker": "/talker_listener/talker",

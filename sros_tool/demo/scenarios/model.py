@@ -257,7 +257,7 @@ class Variant:
     """The expected status of a row if all ``conditions`` are true.
 
     ``open_because`` is the reason why an attack then succeeds ("": it fails), ``remedy`` what a
-    user can do.  ``instead`` is a row to run instead, for a vendor that implements the defence
+    user can do.  ``instead`` is a row to run instead, for a vendor that implements the defense
     differently.
     """
 
@@ -281,7 +281,7 @@ class Row:
     expires while the row runs.  Rows of the same ``world`` share their processes: a party of two
     rows is the same process.  The first of ``variants`` whose conditions hold replaces the expected
     status.  ``attack`` names the attack to which the row belongs; with ``defence_removed``, the row
-    shows that attack without the defence of that name.  ``open_because`` and ``remedy`` are as in
+    shows that attack without the defense of that name.  ``open_because`` and ``remedy`` are as in
     `Variant`.  ``accepted`` says that the user accepts that the attack succeeds, ``unaccepted``
     that it succeeds because of the user's keystore, and the user did not accept that.
     """
@@ -527,10 +527,10 @@ def attacked_policy(topic: str) -> Policy:
         enclave for enclave in _shipped_policy(_POLICY_FILE).enclaves if enclave.path == _TALKER
     )
     guest = replace(_with_topic(talker, _GUEST_TOPIC), path=GUEST)
-    guests = (guest, replace(_with_topic(talker, topic), path=f"{GUEST}/admin"))
+    guest_enclaves = (guest, replace(_with_topic(talker, topic), path=f"{GUEST}/admin"))
     service = _shipped_policy("add_two_ints.xml").enclaves
     allowed = tuple(enclave for enclave in talking.enclaves if not enclave.path.endswith(_WITHOUT))
-    return replace(talking, enclaves=(*allowed, *guests, *service))
+    return replace(talking, enclaves=(*allowed, *guest_enclaves, *service))
 
 
 def zenoh_policy(topic: str, *, guest_talks: bool = False, silent: str = "") -> Policy:

@@ -2,7 +2,7 @@
 
 Every world has a router; several rows share a world.  An attacker's process does not enforce its
 own rules, so that only the rules of others stop it.  Each attack has a control, and is tried again
-without the defence that stops it.
+without the defense that stops it.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from sros_tool.demo.scenarios.model import (
 
 _ROUTER = "/router"
 _PEERS, _CLIENTS = "peers", "clients"
-"""The groups of rows with all defences: sessions connect to each other, or only to the router."""
+"""The groups of rows with all defenses: sessions connect to each other, or only to the router."""
 _CAST = {
     "talker": "/talker_listener/talker",
     "listener": "/talker_listener/listener",
@@ -359,7 +359,7 @@ def _refused_connection_row(
 
 
 def _accepted_connection_row(name: str, keystore: KeystoreChoice, defence_removed: str) -> Row:
-    """Return a row in which a process in the name of the talker is heard, without a defence."""
+    """Return a row in which a process in the name of the talker is heard, without a defense."""
     wide, _, listener = _topic_pair(keystore)
     party = _attacker("attacker", Role.TALKER, keystore, "talker")
     return _attempt_row(
@@ -596,7 +596,7 @@ def _through_the_router(party: Party, attack: str, denied: RowStatus, done: RowS
 
 
 def _trespass_rows() -> tuple[Row, ...]:
-    """Return the rows past the router, and through it, with and without the defence."""
+    """Return the rows past the router, and through it, with and without the defense."""
     rows: list[Row] = []
     for way, rows_of in (
         ("past the router", _past_the_router),
@@ -635,7 +635,7 @@ def _rogue_router_row(
 ) -> Row:
     """Return a row in which a talker and a listener are connected to a router that attacks.
 
-    The attack succeeds without the defence, and for an attacker with the router's enclave.
+    The attack succeeds without the defense, and for an attacker with the router's enclave.
     """
     rogue = Party("attacking router", Role.RELAY, Identity(keystore, part), intruder=True)
     succeeds = bool(defence_removed) or part == "router"
@@ -896,7 +896,7 @@ def _false_token_row(
 
 
 def _false_token_rows(token: _FalseToken) -> tuple[Row, ...]:
-    """Return the rows of a token: past the router, through it, and without the defence."""
+    """Return the rows of a token: past the router, through it, and without the defense."""
     forgery, wide = zenoh_forger.tokens_of_any_name, "names"
     if token.announced:
         forgery, wide = zenoh_forger.tokens_of_any_enclave, "enclaves"
@@ -1140,7 +1140,7 @@ _FLOOD_ROWS = tries(
 
 ATTACKS = _scenario(
     "attacks",
-    "attacks on Zenoh, also without the defences that stop them",
+    "attacks on Zenoh, also without the defenses that stop them",
     *_EXPIRY_ROWS,
     *_WIRE_ROWS,
     *_MEMORY_ROWS,

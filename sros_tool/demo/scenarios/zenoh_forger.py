@@ -1,4 +1,4 @@
-"""Forgeries of Zenoh files: as an attacker would change them, or without a defence.
+"""Forgeries of Zenoh files: as an attacker would change them, or without a defense.
 
 Rows of scenarios refer to these functions; each changes a copy of the keystore (see `forger`).
 """

@@ -435,11 +435,11 @@ def _older_message_notes(inbox: Path, messages: Iterable[_ReceivedMessage]) -> I
     robots = [message.robot.name for message in messages if message.outcome == "older"]
     if robots:
         messages_text = "an older message" if len(robots) == 1 else "older messages"
-        lies = "lies" if len(robots) == 1 else "lie"
+        lies, pronoun = ("lies", "it") if len(robots) == 1 else ("lie", "them")
         yield Note(
             "fleet.older-message",
-            f"{messages_text} of {first_few(robots, _SHOWN)} {lies} in '{inbox}', from before the "
-            "last one came, and changes nothing: delete it there.",
+            f"{messages_text} of {first_few(robots, _SHOWN)} {lies} in '{inbox}', although a "
+            f"newer message was already collected. sros ignores {pronoun}: delete {pronoun}.",
         )
 
 

@@ -845,8 +845,8 @@ class _Run:
             else:
                 return release
         raise KeystoreError(
-            f"no last release in '{self._folder}' can be read",
-            f"{problem} So it is not known which revocations the keystore lacks.",
+            f"no robot's last release in '{self._folder}' can be read",
+            f"{problem} Without a release, sros cannot tell which revocations the keystore lacks.",
             "Copy a release there from a copy of the folder, or from the robot, whose agent "
             "keeps it as FOLDER/.agent/release.tar.gz.",
         )

@@ -217,7 +217,7 @@ def _measured_enclaves(
 ) -> list[MinimizedEnclave]:
     """Return the enclaves of a minimized policy with their sizes."""
     estimator = SizeEstimator()
-    measured = []
+    enclaves = []
     for before, after, use in zip(
         policy.enclaves, result.policy.enclaves, result.uses, strict=True
     ):
@@ -237,8 +237,8 @@ def _measured_enclaves(
                 needed=sizes.after - MAX_SIGNED_BYTES + _MARGIN,
                 size=right_bytes,
             )
-        measured.append(MinimizedEnclave(use, sizes, proposals))
-    return measured
+        enclaves.append(MinimizedEnclave(use, sizes, proposals))
+    return enclaves
 
 
 def _longest_enclave(policy: Policy, fleet: Fleet | None) -> Enclave:
