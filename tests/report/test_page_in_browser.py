@@ -569,6 +569,12 @@ def test_what_all_names_have_in_common_is_said_once(
         assert ", all encrypted; left out: " in summary
         assert summary.endswith("; A: also subscribed by /mobile_robot/recorder")
         assert page.locator("#map .lock").count() == 0
+        # Names that an enclave receives stand below those that it sends: each column has its head.
+        page.click("#map .card.enclave:has-text('velocity_mux')")
+        left_edges = "cards => new Set(cards.map(card => card.getBoundingClientRect().left)).size"
+        assert page.locator("#map .card.names").count() > 2
+        assert page.eval_on_selector_all("#map .card.names", left_edges) == 1
+        page.click("#close")
         # A line of a name ends after a part of it, and what is tapped is large enough.
         page.click("#tab-names")
         assert page.locator("#names .link-button wbr").count() > 50

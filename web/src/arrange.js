@@ -104,11 +104,15 @@ export function columns(bundles) {
     const width = Math.max(0, ...column.map((card) => card.width));
     for (const card of column) card.width = width;
   }
-  const scene = arranged(all, links);
+  // Names that nobody sends stand in the column of the other names, not in that of the senders.
+  const sent = new Set(links.map((link) => link.target));
+  const sender = all.find((card) => card.id[0] === "s");
+  const unsent = all.filter((card) => sender && card.role === "names" && !sent.has(card.id));
+  const scene = arranged(all, links, unsent.map((card) => [sender.id, card.id]));
   return { ...scene, heads: heads(scene.cards) };
 }
 
-// What the columns are, above them; only where every card is in one of the three.
+// What the three columns are, above them.
 function heads(cards) {
   const headings = [];
   const add = (column, anchor, at, text) => {
@@ -161,12 +165,15 @@ export function flowScene({ start, hops, steps }, upstream, most) {
   return arranged(cards, links);
 }
 
-function arranged(cards, links) {
+// Cards from left to right along the links; ``ahead`` has pairs of cards with nothing drawn between
+// them, of which the first also stands further left.
+function arranged(cards, links, ahead = []) {
   const graph = new dagre.graphlib.Graph({ multigraph: true });
   graph.setGraph({ rankdir: "LR", nodesep: 9, edgesep: 4, ranksep: GAP, marginx: MARGIN, marginy: 34 });
   graph.setDefaultEdgeLabel(() => ({}));
   for (const card of cards) graph.setNode(card.id, { width: card.width, height: card.height });
   links.forEach((link, number) => graph.setEdge(link.source, link.target, {}, `${number}`));
+  for (const [left, right] of ahead) graph.setEdge(left, right, { weight: 0 }, "ahead");
   dagre.layout(graph);
   const path = line().curve(curveBumpX).x((point) => point.x).y((point) => point.y);
   const placed = cards.map((card) => {
