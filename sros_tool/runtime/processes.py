@@ -116,7 +116,8 @@ class Process:
     file that it names for Zenoh.  ``forked_by`` are the id and command of the first process of
     its program, if another one started it.  ``own_pid`` is the id that the process itself sees;
     in a container, it differs from ``pid``.  ``user`` is the id of the user who runs it, for a
-    set-user-ID program of the user who started it.
+    set-user-ID program of the user who started it; it is `SEVERAL_USERS` if both, or others, have
+    a say in it.
     """
 
     pid: int
@@ -703,8 +704,10 @@ def _stat(folder: int) -> _Stat:
     return _Stat(int(numbers[1]), int(numbers[19]), identity, numbers[20], is_idle)
 
 
-_USER = re.compile(rb"^Uid:\s+\d+\s+(\d+)", re.MULTILINE)
-"""The effective user id in /proc/PID/status."""
+_USERS = re.compile(rb"^Uid:\s+(\d+)\s+(\d+)\s+(\d+)\s+(\d+)", re.MULTILINE)
+"""The real, effective, saved and file system user id in /proc/PID/status."""
+SEVERAL_USERS = 0xFFFFFFFF
+"""In place of a user id that no process has (setresuid(2)): several users may have a say in it."""
 _OWN_PID = re.compile(rb"^NSpid:(?:\s+\d+)*\s+(\d+)$", re.MULTILINE)
 """The process id in the innermost PID namespace, in /proc/PID/status."""
 
@@ -726,9 +729,11 @@ def _clock_advanced(folder: int, started: datetime) -> timedelta:
 
 
 def _user(folder: int, status: bytes) -> int:
-    """Return the effective user id of a process; for a set-user-ID program, who started it.
+    """Return the only user but root who has a say in a process, or 0, or `SEVERAL_USERS`.
 
-    This user chose its words and environment, whatever user ids the program gives itself later.
+    Whoever starts a set-user-ID program chose its words and environment, whatever user ids it gives
+    itself later.  A process can write its auxiliary vector, but not its ids in ``status``, anew
+    (PR_SET_MM in prctl(2)), so that the vector can only add a user.
 
     Raises:
         OSError: It has ended, or may not be examined.
@@ -738,10 +743,13 @@ def _user(folder: int, status: bytes) -> int:
     values = dict(struct.iter_unpack("QQ", auxiliary[:length]))
     if any(name > 0xFFFFFFFF for name in values):  # the words of a process of 32 bits
         values = dict(struct.iter_unpack("II", auxiliary[:length]))
+    match = _USERS.search(status)
+    users = set(map(int, match.groups())) if match else {SEVERAL_USERS}
     started_by = values.get(_STARTED_BY)
     if started_by is not None and started_by != values.get(_STARTED_AS):
-        return int(started_by)
-    return _number(_USER, status)
+        users.add(int(started_by))
+    users.discard(0)
+    return SEVERAL_USERS if len(users) > 1 else min(users, default=0)
 
 
 def _number(pattern: re.Pattern[bytes], status: bytes) -> int:

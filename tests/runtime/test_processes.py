@@ -15,6 +15,7 @@ import pytest
 from sros_tool.runtime import processes
 from sros_tool.runtime.environment import NO_CONFIGURATION, ROUTER_URI, enclave_argument
 from sros_tool.runtime.processes import (
+    SEVERAL_USERS,
     FileReader,
     LoadedFile,
     Process,
@@ -54,7 +55,7 @@ class Proc:
         (folder / "environ").write_bytes(environment)
         (folder / "maps").write_text(f"7f00-7f01 r-xp 0 08:01 7 {maps}\n" if maps else "")
         (folder / "auxv").write_bytes(struct.pack("QQQQ", 11, 7, 12, 7))
-        (folder / "status").write_text("Name:\ta\nUid:\t7\t8\t9\t9\nNSpid:\t70\t7\n")
+        (folder / "status").write_text("Name:\ta\nUid:\t8\t8\t8\t8\nNSpid:\t70\t7\n")
         for link, target in (("ns/net", "net:[1]"), ("cwd", "/"), ("root", str(self.path))):
             (folder / link).unlink(missing_ok=True)
             (folder / link).symlink_to(target)
@@ -109,13 +110,30 @@ def test_kernel_threads_and_processes_that_wait_for_a_node_are_none(proc: Proc) 
 
 
 @pytest.mark.parametrize("words", ["8Q", "8I"])
-def test_a_set_user_id_program_counts_as_of_the_user_who_started_it(proc: Proc, words: str) -> None:
-    """Whoever starts ``su`` chooses its words and environment, and could seem to be root's node."""
+@pytest.mark.parametrize(
+    ("ids", "started_by", "started_as", "user"),
+    [
+        ("8 8 8 8", 65534, 65534, 8),
+        ("0 8 0 8", 0, 0, 8),
+        # Whoever starts ``su`` chooses its words and environment, and could seem to be root's node.
+        ("65534 0 0 0", 65534, 0, 65534),
+        ("0 0 0 0", 65534, 0, 65534),
+        # A process may write its auxiliary vector anew, and so name other users there.
+        ("8 8 8 8", 0, 1, 8),
+        ("8 8 8 8", 7, 1, SEVERAL_USERS),
+        ("8 7 7 7", 8, 7, SEVERAL_USERS),
+        ("", 0, 0, SEVERAL_USERS),
+    ],
+)
+def test_the_user_of_a_process_is_whoever_has_a_say_in_it(
+    proc: Proc, words: str, ids: str, started_by: int, started_as: int, user: int
+) -> None:
     folder = proc.add(7, *ROS)
-    for started_as, user in ((65534, 8), (0, 65534)):
-        values = (6, 4096, 11, 65534, 12, started_as, 13, 65534)
-        (folder / "auxv").write_bytes(struct.pack(words, *values))
-        assert [each.user for each in proc.look().processes] == [user]
+    values = (6, 4096, 11, started_by, 12, started_as, 13, 65534)
+    (folder / "auxv").write_bytes(struct.pack(words, *values))
+    ids = "\t".join(["Uid:", *ids.split()])
+    (folder / "status").write_text(f"Name:\ta\n{ids}\nNSpid:\t70\t7\n")
+    assert [each.user for each in proc.look().processes] == [user]
 
 
 def test_the_first_of_two_variables_counts_as_for_getenv(proc: Proc) -> None:
