@@ -732,7 +732,7 @@ def _user(folder: int, status: bytes) -> int:
     """Return the only user but root who has a say in a process, or 0, or `SEVERAL_USERS`.
 
     Whoever starts a set-user-ID program chose its words and environment, whatever user ids it gives
-    itself later.  A process can write its auxiliary vector, but not its ids in ``status``, anew
+    itself later.  A process can replace its auxiliary vector, but not its ids in ``status``
     (PR_SET_MM in prctl(2)), so that the vector can only add a user.
 
     Raises:

@@ -118,7 +118,7 @@ def test_kernel_threads_and_processes_that_wait_for_a_node_are_none(proc: Proc) 
         # Whoever starts ``su`` chooses its words and environment, and could seem to be root's node.
         ("65534 0 0 0", 65534, 0, 65534),
         ("0 0 0 0", 65534, 0, 65534),
-        # A process may write its auxiliary vector anew, and so name other users there.
+        # A process may replace its auxiliary vector, and so name other users there.
         ("8 8 8 8", 0, 1, 8),
         ("8 8 8 8", 7, 1, SEVERAL_USERS),
         ("8 7 7 7", 8, 7, SEVERAL_USERS),
