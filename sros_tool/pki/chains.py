@@ -66,7 +66,6 @@ _INHERITED = tuple(
 )
 """Values of the network extensions that mean: inherited from the CA."""
 _SSL_CLIENT, _SMIME, _SMIME_CA, _ANY_NETSCAPE_CA = 0x80, 0x20, 0x02, 0x07
-_ANY_POLICY = ObjectIdentifier("2.5.29.32.0")
 _OF_POLICIES = {
     ExtensionOID.CERTIFICATE_POLICIES,
     ExtensionOID.POLICY_CONSTRAINTS,
@@ -478,17 +477,16 @@ _ALWAYS_ASKED = {ExtensionOID.CERTIFICATE_POLICIES, ExtensionOID.POLICY_CONSTRAI
 
 
 def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
-    """Yield a fault if a demanded policy is not valid for the whole chain (pcy_tree.c).
+    """Yield a fault if a certificate demands a policy, or its policies are not valid (pcy_tree.c).
 
-    Also yield a fault if a certificate has a policy twice, or maps policies, which sros does not
-    support.
+    A process of DDS names no policy that it accepts, so none is valid where one is demanded.  Also
+    yield a fault if a certificate maps policies, which sros does not support.
     """
     if not any(
         _OF_POLICIES & {extension.oid for extension in below.extensions} for below in chain[:-1]
     ):
         return
-    demanded = len(chain)
-    valid: set[ObjectIdentifier] = {_ANY_POLICY}
+    until_demanded = len(chain)
     for certificate in reversed(chain[:-1]):
         name = subject_text(certificate.subject)
         policies = extension(certificate, x509.CertificatePolicies)
@@ -507,15 +505,11 @@ def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
             yield f"the policies of {name} cannot be read"
         constraints = extension(certificate, x509.PolicyConstraints)
         after = constraints.require_explicit_policy if constraints else None
-        if demanded:
-            demanded -= not is_self_issued(certificate)
-            demanded = min(demanded, demanded if after is None else after)
-        kept = valid if _ANY_POLICY in named else set()
-        valid = kept | (set(named) if _ANY_POLICY in valid else valid & set(named))
-        if extension(certificate, x509.InhibitAnyPolicy) is not None:
-            valid -= {_ANY_POLICY}
-    if not demanded and not valid:
-        yield "a certificate demands a policy that the others do not have"
+        if until_demanded:
+            until_demanded -= not is_self_issued(certificate)
+            until_demanded = min(until_demanded, until_demanded if after is None else after)
+    if not until_demanded:
+        yield "a certificate demands a certificate policy, and DDS names none that it accepts"
 
 
 # ── name constraints (v3_ncons.c) ─────────────────────────────────────────────────────────────

@@ -18,6 +18,7 @@ from tests.support.raw_pki import (
     basic_constraints,
     name,
     name_der,
+    oid,
     sequence,
     tagged,
 )
@@ -29,6 +30,11 @@ MIDDLE = Certificate(name("CN=middle"), name("CN=root"), "p256 1", "p256 0", 2, 
 LEAF = Certificate(name("CN=robot"), name("CN=middle"), "p256 2", "p256 1", 3)
 EMPTY_RDN = ()
 NO_POLICIES = Extension("2.5.29.32", sequence())
+A_POLICY = Extension("2.5.29.32", sequence(sequence(oid("2.5.29.32.0"))))
+DEMANDED_AFTER_ONE, DEMANDED_AFTER_TWO = (
+    Extension("2.5.29.36", sequence(tagged(0, bytes([certificates]), constructed=False)))
+    for certificates in (1, 2)
+)
 DAMAGED_POLICIES = Extension("2.5.29.54", b"\4\0")
 
 
@@ -36,6 +42,11 @@ def for_robots() -> Extension:
     """The name constraint that below a CA a name begins with CN=robot."""
     subtree = tagged(4, name_der(name("CN=robot")))
     return Extension("2.5.29.30", sequence(tagged(0, sequence(subtree))), critical=True)
+
+
+def middle(*extensions: Extension) -> Certificate:
+    """The intermediate CA with these extensions, too."""
+    return replace(MIDDLE, extensions=(*MIDDLE.extensions, *extensions))
 
 
 CHAINS = {
@@ -60,17 +71,25 @@ CHAINS = {
         (replace(LEAF, key_form="damaged"), MIDDLE, ROOT),
         "the public key of CN=robot is damaged",
     ),
-    "names that are allowed": ((LEAF, MIDDLE.with_extension(for_robots()), ROOT), ""),
+    "names that are allowed": ((LEAF, middle(for_robots()), ROOT), ""),
     "a name that cannot be compared": (
         (
             replace(LEAF, subject=((Attribute("CN", "rob\xe9t", PRINTABLE),),)),
-            MIDDLE.with_extension(for_robots()),
+            middle(for_robots()),
             ROOT,
         ),
         "do not allow the names of CN=rob",
     ),
     "no name that a constraint is about": (
-        (replace(LEAF, subject=(EMPTY_RDN,)), MIDDLE.with_extension(for_robots()), ROOT),
+        (replace(LEAF, subject=(EMPTY_RDN,)), middle(for_robots()), ROOT),
+        "",
+    ),
+    "a policy that is demanded, and that each certificate has": (
+        (LEAF.with_extension(A_POLICY), middle(A_POLICY, DEMANDED_AFTER_ONE), ROOT),
+        "a certificate demands a certificate policy",
+    ),
+    "a policy that a longer chain would have to have": (
+        (LEAF.with_extension(A_POLICY), middle(A_POLICY, DEMANDED_AFTER_TWO), ROOT),
         "",
     ),
     "damaged policies next to a list of none": (
