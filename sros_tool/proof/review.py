@@ -65,7 +65,7 @@ from sros_tool.keystore.template import Template, load_template, read_template, 
 from sros_tool.names import expand
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Policy, Profile, policy_in_namespace
-from sros_tool.policy.patterns import ELSEWHERE
+from sros_tool.policy.patterns import ELSEWHERE, common_name
 from sros_tool.policy.remapping import Remapping
 from sros_tool.policy.rights import (
     NodeName,
@@ -121,6 +121,7 @@ No policy is larger.
 """
 _PACKED = (b"\x1f\x8b", b"PK\x03\x04", b"\xfd7zXZ", b"BZh", b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf")
 """How files of gzip, ZIP, xz, bzip2, Zstandard and 7z begin."""
+_MOST_NAMESPACES = 20
 _LONGEST = 200  # characters of the target of a link that are shown
 _NOT_USED = (
     "changes and is not reviewed: no reviewed policy uses it. Name it with --policy, leave it out "
@@ -1085,23 +1086,32 @@ class _Review:
             self.is_compared_elsewhere = False
             return
         both = sources()
-        ns = "/any_namespace"
-        while any(ns in right.name for source in both for right in source.rights):
-            ns += "_"
-        moved = chain.from_iterable(
-            read_requirements(path, namespaces=(ns,), remaps=asked.remaps) for path in files
-        )
-        before, after = (
-            policy_system(
-                policy_in_namespace(Policy(tuple(source.enclaves.values())), ns),
-                self._circumstances(),
-                self._template(),
+        namespaces = _namespaces_of_change(*(source.rights for source in both))
+        if len(namespaces) > _MOST_NAMESPACES:
+            self.is_compared_elsewhere = False
+        left = {
+            at
+            for at, here in enumerate(requirements)
+            if here.is_relative and not _violations(here, system)
+        }
+        for ns in namespaces[:_MOST_NAMESPACES]:
+            moved = list(
+                chain.from_iterable(
+                    read_requirements(path, namespaces=(ns,), remaps=asked.remaps) for path in files
+                )
             )
-            for source in both
-        )
-        for here, there in zip(requirements, moved, strict=True):
-            if here.is_relative and not (_violations(here, system) or _violations(there, before)):
-                yield from _violations(there, after)
+            before, after = (
+                policy_system(
+                    policy_in_namespace(Policy(tuple(source.enclaves.values())), ns),
+                    self._circumstances(),
+                    self._template(),
+                )
+                for source in both
+            )
+            for at in sorted(left):
+                if not _violations(moved[at], before) and (broken := _violations(moved[at], after)):
+                    left.remove(at)
+                    yield from broken
 
     def place(self) -> str:
         """Return a clause with the namespaces of the requirements; "" without any."""
@@ -1304,6 +1314,25 @@ def _moved_rights(enclave: Enclave) -> Iterator[tuple[PlacedRight, Right]]:
     moved = placed_rights(enclave.with_profiles(elsewhere))
     for placed, moved_right in zip(placed_rights(enclave), moved, strict=True):
         yield placed, moved_right.right
+
+
+def _namespaces_of_change(before: frozenset[Right], after: frozenset[Right]) -> list[str]:
+    """Return namespaces in which requirements may be broken that hold in ``/``.
+
+    The first one has a name that no right has; it is as good as every other namespace without such
+    a name.  The others are those in the names of rights that the change adds or removes, or that
+    their wildcards match.
+    """
+    changed = sorted({right.name for right in before ^ after})
+    examples = [name for name in (common_name([name, "/*/*"]) for name in changed) if name]
+    parts_of_names = (name.split("/")[:-1] for name in examples)
+    namespaces = [
+        "/".join(parts[:end]) for parts in parts_of_names for end in range(2, len(parts) + 1)
+    ]
+    ordinary = "/any_namespace"
+    while any(ordinary in right.name for right in (*before, *after)):
+        ordinary += "_"
+    return [*dict.fromkeys([ordinary, *namespaces])]
 
 
 def _violations(requirement: Requirement, system: System) -> list[Finding]:

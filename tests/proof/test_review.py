@@ -1297,3 +1297,20 @@ def test_a_name_that_breaks_requirements_of_users_in_a_namespace(change: Change)
     change.base = change.commit({"other": "1"})
     change.commit({"robot.xml": moving.replace(">x<", ">/x<").replace(">y<", ">/y<")})
     assert said not in change.review(*asked).out
+
+
+@pytest.mark.parametrize(
+    ("name", "namespace"),
+    [("/*/x", "/any_namespace"), ("/[!a]*/x", "/b"), ("/left/x", "/left"), ("/*_arm/x", "/_arm")],
+)
+def test_a_wildcard_that_leaves_out_one_namespace_breaks_requirements_in_others(
+    change: Change, name: str, namespace: str
+) -> None:
+    only = '[[only]]\npublish = ["x"]\nenclaves = ["/a"]\n'
+    text = policy_text({"/a": publish("x"), "/b": publish("y")})
+    change.base = change.commit({"robot.xml": text, "robot.toml": only})
+    change.commit({"robot.xml": text.replace(">y<", f">{name}<")})
+    asked = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
+    ended = change.review(*asked)
+    assert ended.status == 1, ended
+    assert f"error: {namespace}/b: may publish {namespace}/x" in ended.out
