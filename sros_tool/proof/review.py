@@ -1109,7 +1109,15 @@ class _Review:
                 for source in both
             )
             for at in sorted(left):
-                if not _violations(moved[at], before) and (broken := _violations(moved[at], after)):
+                known = {
+                    (finding.subject, finding.text) for finding in _violations(moved[at], before)
+                }
+                broken = [
+                    finding
+                    for finding in _violations(moved[at], after)
+                    if (finding.subject, finding.text) not in known
+                ]
+                if broken:
                     left.remove(at)
                     yield from broken
 
