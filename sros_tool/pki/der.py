@@ -158,7 +158,9 @@ def _normalized(data: bytes, start: int, depth: int) -> tuple[bytes, int]:
 
 
 def integer(value: Value) -> int:
-    """Return the number in an INTEGER; raise `PkiError` unless it has the shortest form."""
+    """Return the number in an INTEGER; raise `PkiError` for other tags, and longer forms."""
+    if value.tag != INTEGER:
+        raise PkiError("a DER value is not a number")
     number = int.from_bytes(value.content, "big", signed=True)
     if (number if number >= 0 else ~number).bit_length() // 8 + 1 != len(value.content):
         raise PkiError("a DER number is empty, or longer than it needs to be")

@@ -171,12 +171,12 @@ class _TolerantCertificate(_Signed):
         parts = self._parts
         number = 0
         if parts[0].tag == der.CONTEXT_0:
-            number = _integer(_only(parts.pop(0)))
+            number = der.integer(_only(parts.pop(0)))
         self.version = x509.Version.v1 if number == 0 else x509.Version.v3
         self.number = number + 1
         serial, algorithm, issuer, validity, subject, key, *rest = parts
         _algorithm(algorithm)
-        self.serial_number = _integer(serial)
+        self.serial_number = der.integer(serial)
         self.issuer, self.subject = _name(issuer.whole), _name(subject.whole)
         begin, end = _sequence(validity)
         self.unread_dates = [
@@ -392,12 +392,6 @@ def _algorithm(value: der.Value) -> ObjectIdentifier:
 def _check_bits(value: der.Value) -> None:
     if value.tag != der.BIT_STRING or not value.content or value.content[0] > 7:
         raise ValueError("not a BIT STRING")
-
-
-def _integer(value: der.Value) -> int:
-    if value.tag != der.INTEGER:
-        raise ValueError("not an INTEGER")
-    return der.integer(value)
 
 
 def _only(value: der.Value) -> der.Value:

@@ -159,6 +159,21 @@ def test_a_serial_number_that_no_list_holds_is_refused(serial: int) -> None:
         sign_crl(ca, key, [Revoked(serial, NOW)], number=1, **times)
 
 
+def test_a_list_whose_serial_numbers_are_no_numbers_is_refused(tmp_path: Path) -> None:
+    key, window = generate_key(), Window(NOW - DAY, NOW + DAY)
+    ca = issue_ca(key, common_name("CA"), window)
+    times = {"this_update": NOW - DAY, "next_update": NOW + DAY}
+    made = load_crl(sign_crl(ca, key, [Revoked(5, NOW)], number=1, **times), "").list
+    (changed,) = Node.read(made.public_bytes(serialization.Encoding.DER))
+    entries = next(each for each in changed.children[0].children[::-1] if each.tag == 0x30)
+    entries.children[0].children[0].tag = 0x0A  # ENUMERATED
+    data = raw_pki.pem("X509 CRL", signed_again(changed, key))
+    (tmp_path / "crl").write_bytes(data)
+    assert run(["openssl", "crl", "-in", "crl", "-noout"], cwd=tmp_path, status=None).returncode
+    with pytest.raises(PkiError):
+        load_crl(data, "")
+
+
 def signed_again(changed: Node, key: PrivateKey) -> bytes:
     assert isinstance(key, ec.EllipticCurvePrivateKey)
     signature = key.sign(changed.children[0].write(), ec.ECDSA(hashes.SHA256()))
