@@ -314,7 +314,7 @@ _PHRASES = {
     "agent init": "set up the agent",
     "agent run": "run the agent",
     "agent status": "show the agent",
-    "fleet collect": "collect what robots sent",
+    "fleet collect": "finish collecting",
     "fleet confirm": "store the confirmation",
     "fleet inventory": "print the inventory",
     "fleet publish": "publish",

@@ -983,6 +983,10 @@ def test_a_publishing_folder_that_lost_its_files_is_not_in_order(home: Home) -> 
     assert f"metadata/timestamp.json, which robots fetch: {command} says what to check" in found
     refused = sros(*publish, cwd=home.folder)
     assert "if the keystore was restored, first repeat its later revocations" in refused.err
+    collect = ("fleet", "collect", "ks", "inbox", "--publish", str(pub))
+    refused = sros(*collect, cwd=home.folder)
+    assert f"add --new-folder to {command}" in refused.err, "no option of collect"
+    assert refused.err.startswith("Unable to finish collecting: '") and refused.status == 2
     sros(*publish, "--new-folder", cwd=home.folder).ok()
     assert "lacks" not in sros(*status, cwd=home.folder).out
     pub.rename(home.folder / "elsewhere")

@@ -694,6 +694,12 @@ class _Run:
         return False
 
     @property
+    def _command(self) -> str:
+        """The command that publishes, in backquotes; `fleet collect` lacks its options."""
+        where = f"{quote(str(self.keystore.root))} {quote(str(self._folder))}"
+        return f"`sros fleet publish {where}`"
+
+    @property
     def _is_other_folder(self) -> bool:
         """Whether the keystore published to another folder last."""
         return self._earlier_folder not in ("", self.list.folder)
@@ -721,7 +727,7 @@ class _Run:
             "The keystore was restored from a backup, or is a copy. Publishing to "
             f"'{self._folder}' would undo later changes, such as a revocation.",
             f"Restore a later backup. If there is none, run `sros fleet collect {where} INBOX`, "
-            "revoke again what was revoked, and add --restored.",
+            f"revoke again what was revoked, and add --restored to {self._command}.",
         )
 
     def _learned_after_restore(self) -> bool:
@@ -745,13 +751,12 @@ class _Run:
         )
 
     def _not_restored_error(self) -> KeystoreError:
-        where = f"{quote(str(self.keystore.root))} {quote(str(self._folder))}"
         return KeystoreError(
             f"nothing shows that the keystore '{self.keystore.root}' was restored",
             f"'{self._folder}' and the messages of robots have nothing later than its ledger. If "
             "robots say that their server has an older copy, that server does not have the files "
             f"of '{self._folder}'.",
-            f"Publish with `sros fleet publish {where}`, and copy '{self._folder}' to the server. "
+            f"Publish with {self._command}, and copy '{self._folder}' to the server. "
             "If keystore and folder come from the same backup, add --new-folder.",
         )
 
@@ -761,8 +766,8 @@ class _Run:
             "The keystore has published before. If it was restored from a backup and the folder "
             "was lost, too, robots that were revoked since would get releases again.",
             "Name the folder in which the keystore publishes. If that folder is lost, or this is "
-            "an additional folder, add --new-folder; if the keystore was restored, first repeat "
-            "its later revocations, and add --restored as well.",
+            f"an additional folder, add --new-folder to {self._command}; if the keystore was "
+            "restored, first repeat its later revocations, and add --restored as well.",
         )
 
     def _has_later_releases(self, restored: bool) -> bool:
@@ -786,8 +791,8 @@ class _Run:
             ]
             raise self._restored_error(
                 f"has later releases: {first_few(robots, 3)}, up to the number {latest}",
-                "repeat the later changes, and then add --restored, which revokes again the "
-                "enclaves that these releases revoke",
+                f"repeat the later changes, and add --restored to {self._command}, which "
+                "revokes again what these releases revoke",
             )
         self._number = latest
         return True
@@ -1003,8 +1008,9 @@ class _Run:
             f"{unknown[-1].number}",
             f"first run `sros fleet collect {where} INBOX`, because messages of robots show what "
             f"was revoked; revoke again what else was revoked (`sros revoke {where} --robot "
-            f"NAME`); empty '{self._folder / _METADATA}', and add --restored --new-folder, which "
-            f"also revokes again what these releases revoke. Then renew all certificates, {end}: "
+            f"NAME`); empty '{self._folder / _METADATA}', and add --restored --new-folder to "
+            f"{self._command}, which also revokes again what these releases revoke. Then renew all "
+            f"certificates, {end}: "
             "docs/howto/keystore_is_lost.md",
         )
 

@@ -82,7 +82,10 @@ def load_signer(data: bytes, label: str) -> CryptoSigner:
 
 def replaced_key(role: str) -> str:
     """Return the remedy for a lost key of this role, as a sentence."""
-    return f"Restore it from a backup, or make another with --rotate-key {role}."
+    return (
+        "Restore it from a backup, or make another with --rotate-key "
+        f"{role} of `sros fleet publish`."
+    )
 
 
 _NAME_ROOT = (
@@ -280,7 +283,10 @@ def _foreign_folder_error(folder: Path, why: str) -> KeystoreError:
 
 def _without_metadata(folder: Path) -> str:
     """Return the remedy for damaged metadata, as a clause."""
-    return f"remove '{folder / _METADATA}', and publish again with --new-folder"
+    return (
+        f"remove '{folder / _METADATA}', and publish again with --new-folder of "
+        "`sros fleet publish`"
+    )
 
 
 def _read_present(folder: Folder, roots: Roots) -> Present:
