@@ -28,7 +28,7 @@ from sros_tool.keystore.layout import (
     REVOKED,
     revoked_certificates,
 )
-from sros_tool.keystore.ledger import REPORTED, RESTORED, SAME_KEY, Entry
+from sros_tool.keystore.ledger import RECORDED_LATE, REPORTED, RESTORED, Entry
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import (
@@ -117,14 +117,14 @@ def _since_trusted(
     """Return the entries from when the key of a CA that is trusted in a role was recorded.
 
     ``entries`` are of a reading of the ledger, each of which has all CAs; all are returned if there
-    is no trusted CA, if a trusted CA was recorded only when it was renewed, because the ledger from
-    before was lost, or if CAs are recorded without keys, as by earlier versions of sros.
+    is no trusted CA, if a trusted CA was recorded only when it was renewed or replaced, because the
+    ledger from before was lost, or if CAs are recorded without keys, as by earlier versions.
     """
     trusted = {_digest_of(ca) for ca in keystore.authority(role)}
     authorities = [
         place
         for place, entry in enumerate(entries)
-        if entry.what == "ca" and entry.reason != SAME_KEY
+        if entry.what == "ca" and entry.reason not in RECORDED_LATE
     ]
     places = (
         next((place for place in authorities if entries[place].key in (key, "")), 0)

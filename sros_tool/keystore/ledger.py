@@ -71,6 +71,11 @@ REPORTED = "reported"
 proves nothing."""
 SAME_KEY = "same key"
 """The ``reason`` of a CA certificate that has the same key as the CA's previous certificate."""
+FROM_BEFORE = "from before the ledger"
+"""The ``reason`` of a CA that a rotation replaces, and that the ledger lacked, such as a lost one.
+"""
+RECORDED_LATE = (SAME_KEY, FROM_BEFORE)
+"""Each ``reason`` of a CA certificate whose key may have issued what earlier lines record."""
 
 
 class Entry(NamedTuple):
@@ -1016,14 +1021,13 @@ def _first_ca_line(
 ) -> int:
     """Return the number of the first ledger line about any of these CAs.
 
-    It is 0 if one of the CAs has no line, or was renewed with the same key.
+    It is 0 if one of the CAs has no line, or was recorded only after it had issued something.
     """
     wanted = {digest(authority) for authority in authorities}
     lines: dict[str, int] = {}
     for number, entry in entries:
         if entry.what == "ca" and entry.sha256 in wanted:
-            # Certificates from before a CA was renewed with the same key are still valid.
-            lines.setdefault(entry.sha256, 0 if entry.reason == SAME_KEY else number)
+            lines.setdefault(entry.sha256, 0 if entry.reason in RECORDED_LATE else number)
     return min(lines.values(), default=0) if lines.keys() == wanted else 0
 
 

@@ -26,6 +26,7 @@ from sros_tool.keystore.known_keys import (
     _since_trusted,
     removed_enclaves,
     revoked_issues,
+    unknown_authorities,
     unlisted_revocations,
 )
 from sros_tool.keystore.layout import FLEET_ROOT, ROTATION, enclave_path, list_enclaves
@@ -562,6 +563,27 @@ def test_a_ledger_that_begins_after_its_ca_has_the_certificates_from_before_its_
     assert [*removed_enclaves(OpenedKeystore(separate), NOW)] == ["/late"]
     (separate / "public/identity_ca.cert.pem").unlink()
     assert [*removed_enclaves(OpenedKeystore(separate), NOW)] == ["/late"], "nothing tells the CA"
+
+
+@pytest.mark.parametrize("stage", STAGES[:2])
+def test_a_ledger_that_was_lost_before_a_stage_learns_which_ca_is_replaced(
+    separate: Path, tmp_path: Path, stage: RotationStage
+) -> None:
+    """Else the remedy for its loss adds CAs that `check` calls unknown, and robots keep the old."""
+    distribute(OpenedKeystore(separate), ["/a"], tmp_path / "out", now=NOW)
+    for before in STAGES[: STAGES.index(stage)]:
+        rotate_ca(separate, before, now=NOW)
+    for file in ("ledger.jsonl", "ledger.p7s"):
+        (separate / file).unlink()
+    generate_artifacts(separate, policies=[read_policy(tmp_path / "policy.xml")], now=NOW)
+    create_enclaves(separate, ["/late"], now=NOW)
+    shutil.rmtree(enclave_path(separate, "/late"))
+    for later in STAGES[STAGES.index(stage) :]:
+        assert [*removed_enclaves(OpenedKeystore(separate), NOW)] == ["/late"], "of the old CA"
+        rotate_ca(separate, later, now=NOW)
+        assert not unknown_authorities(OpenedKeystore(separate), "identity")
+    assert not removed_enclaves(OpenedKeystore(separate), NOW)
+    distribute(OpenedKeystore(separate), ["/a"], tmp_path / "out", force=True, now=NOW)
 
 
 def test_what_the_old_ca_issued_during_a_rotation_and_was_revoked_keeps_no_export(

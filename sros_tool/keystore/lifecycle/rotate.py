@@ -60,6 +60,7 @@ from sros_tool.keystore.layout import (
     key_path,
 )
 from sros_tool.keystore.ledger import (
+    FROM_BEFORE,
     SAME_KEY,
     certificate_entry,
     document_entry,
@@ -480,6 +481,11 @@ class _Rotator:
                 self._reissue(successors, stage, progress)
         else:
             successors = _distributed_successors(self._change, self._rotation)
+            entries = self._keystore.ledger_with("what", "ca").entries
+            recorded = {entry.sha256 for entry in entries}
+            for successor in successors:
+                if digest(successor.new.certificate) not in recorded:  # it was lost since
+                    self._record_authorities(successor)
             if stage is RotationStage.REISSUE and self._lacks_crl(successors):
                 stage = RotationStage.DISTRIBUTE
                 self._distribute(successors)
@@ -559,11 +565,17 @@ class _Rotator:
         for successor in successors:
             if wanted.validity is None:
                 self._note_earlier_expiry(successor.old[0], successor.new.certificate)
-            self._change.entries.append(
-                certificate_entry(self._change.now, "ca", successor.new.certificate)
-            )
+            self._record_authorities(successor)
         self.replacements = [successor.replacement() for successor in successors]
         return successors
+
+    def _record_authorities(self, successor: _Successor) -> None:
+        """Record a new CA, after the CA that it replaces if a ledger with gaps lacks that one."""
+        now, old = self._change.now, successor.old[0]
+        ledger = self._keystore.ledger_with("what", "ca")
+        if ledger.gaps and digest(old) not in {entry.sha256 for entry in ledger.entries}:
+            self._change.entries.append(certificate_entry(now, "ca", old, reason=FROM_BEFORE))
+        self._change.entries.append(certificate_entry(now, "ca", successor.new.certificate))
 
     def _note_earlier_expiry(self, old: x509.Certificate, new: x509.Certificate) -> None:
         """Add a note if the settings make a new CA expire before the old CA.
