@@ -494,11 +494,10 @@ def _system(
 
 
 def _suggested(system: System) -> str:
-    from sros_tool.proof.suggestions import not_proposed, render_requirements, suggest
+    from sros_tool.proof.suggestions import render_requirements, suggest
 
-    proposed = suggest(system.rights, system.worlds, fleet := system.fleet())
-    comments = () if fleet else not_proposed(system.rights, proposed)
-    return render_requirements(proposed, system.file, comments)
+    proposed = suggest(system.rights, system.worlds, system.fleet())
+    return render_requirements(proposed.requirements, system.file, proposed.comments)
 
 
 def _family(targets: tuple[Path, ...]) -> tuple[str, tuple[Path, ...]]:

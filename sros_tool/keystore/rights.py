@@ -945,7 +945,7 @@ class RecordedRights:
             KeystoreError: the document is not the last one that the ledger records for the enclave.
         """
         recorded = self._ledger_part(name)
-        last, trust = recorded.last.get(name), ""
+        last, more = recorded.last.get(name), ""
         if last and last.sha256 != digest:
             why = (
                 f"The ledger has other permissions, signed at {last.time}. Perhaps older "
@@ -956,12 +956,13 @@ class RecordedRights:
                 f"The ledger has gaps ({'; '.join(recorded.gaps)}), so later permissions may be "
                 "missing."
             )
+            more = f" With --all in place of {name}, the command states those of all enclaves."
         elif recorded.unchained and name not in recorded.chained:
             why = (
                 f"Nothing shows whether one of the first {recorded.unchained} lines of the ledger "
                 "was removed, so later permissions may be missing."
             )
-            trust = (
+            more = (
                 " If you know that nobody else could change the ledger since version 0.1 of sros "
                 f"wrote it, run `sros update_keystore {quote(str(self._root))} --trust-records`."
             )
@@ -974,5 +975,5 @@ class RecordedRights:
             why,
             f"State its rights with `sros create_permission {quote(str(self._root))} {name} "
             "POLICY_FILE`, and "
-            f"try again.{trust}",
+            f"try again.{more}",
         )

@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
+from typing import NamedTuple
 
 from sros_tool.automata import SearchLimit
 from sros_tool.fleet.robots import Fleet, Robot
@@ -42,47 +43,66 @@ _WIDE_LIST = 50
 """Highest number of names that are joined into one requirement."""
 
 
+class Suggestions(NamedTuple):
+    """Requirements that hold, and comments on names that move a robot and that none reserves."""
+
+    requirements: Sequence[Requirement]
+    comments: Sequence[str]
+
+
 def suggest(
     rights: Iterable[Right], worlds: Sequence[World], fleet: Fleet | None = None
-) -> tuple[Requirement, ...]:
+) -> Suggestions:
     """Propose requirements that hold in all worlds, by the allowed ``rights``.
 
-    A requirement that holds for each robot of ``fleet``, or of one of its groups, is proposed once,
-    with placeholders.
+    What is proposed or said for each robot of ``fleet``, or of one of its groups, comes once, with
+    placeholders.
 
     Raises:
         DocumentError: there are too many wildcards to decide a requirement.
     """
     requirements: list[Requirement] = []
     limit = SearchLimit(MOST_STEPS)
-    all_worlds = Worlds(worlds)
+    all_worlds, stated = Worlds(worlds), _Stated(rights)
     most = _MOST * min(len(fleet.robots) if fleet else 1, _MOST_ROBOTS)
-    for requirement in islice(_candidates(_Stated(rights), worlds), most):
+    for requirement in islice(_candidates(stated, worlds), most):
         verdicts = all_worlds.decide(requirement, limit)
         if not any(verdict.witness or verdict.empty or verdict.always for _, verdict in verdicts):
             last = _joined_requirement(requirements[-1], requirement) if requirements else None
             requirements[-1:] = [last] if last else [*requirements[-1:], requirement]
-    return tuple(_with_placeholders_for_robots(requirements, fleet) if fleet else requirements)
+    missing: Iterable[Requirement] = _missing(stated, requirements)
+    if fleet:
+        missing = _with_placeholders_for_robots(missing, fleet)
+        requirements = [*_with_placeholders_for_robots(requirements, fleet)]
+    return Suggestions(requirements, [_not_proposed(each) for each in missing])
 
 
-def not_proposed(rights: Iterable[Right], requirements: Iterable[Requirement]) -> Iterator[str]:
-    """Yield a comment on each name that moves a robot, and that no requirement reserves.
+def _missing(stated: _Stated, proposed: Iterable[Requirement]) -> Iterator[Only]:
+    """Yield a requirement for each name that moves a robot, and that none of ``proposed`` reserves.
 
-    ``requirements`` are those that `suggest` proposed for one robot.
+    It does not hold, or was not decided.
     """
     reserved = {
         (right, name)
-        for requirement in requirements
+        for requirement in proposed
         if isinstance(requirement, Only)
         for right, names in requirement.rights
         for name in names
     }
-    for (right, name), users in sorted(_Stated(rights).users.items()):
+    for (right, name), users in sorted(stated.users.items()):
         if right in _SENDING and moves_robot(name) and (right, name) not in reserved:
-            yield (
-                f"# not proposed: who alone may {right} {name} (stated for "
-                f"{counted(len(users), 'enclave')}; others may by a wildcard, or a DENY is there)"
-            )
+            enclaves = tuple(sorted(users))
+            yield Only(source=_NOWHERE, rights=((right, (name,)),), enclaves=enclaves)
+
+
+def _not_proposed(requirement: Requirement) -> str:
+    """Return a comment on a requirement of one name that does not hold."""
+    assert isinstance(requirement, Only)
+    (right, (name,)), users = requirement.rights[0], counted(len(requirement.enclaves), "enclave")
+    return (
+        f"# not proposed: who alone may {right} {name} (stated for {users}; others may by a "
+        "wildcard, or a DENY is there)"
+    )
 
 
 def _joined_requirement(requirement: Requirement, other: Requirement) -> Requirement | None:

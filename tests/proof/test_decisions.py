@@ -15,7 +15,7 @@ from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from sros_tool.proof.findings import Decided, decide_all, requirement_findings, short_text
 from sros_tool.proof.requirements import Only, Protected, parse_requirements
-from sros_tool.proof.suggestions import not_proposed, suggest
+from sros_tool.proof.suggestions import suggest
 from sros_tool.proof.system import System, load_system, policy_system
 from tests.support.harness import policy_text, sros
 
@@ -282,7 +282,7 @@ def test_a_package_may_promise_what_its_nodes_never_do(required: str, reason: st
 def test_what_is_proposed_can_fail() -> None:
     two = {"/a": may("publish", "/x", "/*"), "/b": may("subscribe", "/x")}
     system = robot(two)
-    proposed = suggest(system.rights, system.worlds)
+    proposed = suggest(system.rights, system.worlds).requirements
     assert {type(each) for each in proposed} >= {Only, Protected}
     assert decide_all(proposed, system).vacuous == ()
 
@@ -291,15 +291,14 @@ def test_who_moves_the_robot_is_proposed_for_any_number() -> None:
     """Nothing else would forbid a fifth driver; where it cannot be proposed, a comment says so."""
     drivers = {f"/d{number}": may("publish", "/cmd_vel", "/x") for number in range(5)}
     base = {"/base": may("subscribe", "/cmd_vel", "/x")}
-    proposed = suggest((system := robot(drivers | base)).rights, system.worlds)
+    proposed, comments = suggest((system := robot(drivers | base)).rights, system.worlds)
     only = [each for each in proposed if isinstance(each, Only)]
     assert [each.rights for each in only] == [(("publish", ("/cmd_vel",)),)]
-    assert [*not_proposed(system.rights, proposed)] == []
+    assert comments == []
     fifth = robot({**drivers, **base, "/new": may("publish", "/cmd_vel")})
     assert len(decide_all(proposed, fifth).violations) == 1
     wide = robot({**drivers, **base, "/look": may("publish", "/*")})
-    comments = not_proposed(wide.rights, suggest(wide.rights, wide.worlds))
-    assert [*comments] == [
+    assert suggest(wide.rights, wide.worlds).comments == [
         "# not proposed: who alone may publish /cmd_vel (stated for 5 enclaves; others may by a "
         "wildcard, or a DENY is there)"
     ]

@@ -168,12 +168,23 @@ def test_proposals_for_a_fleet_demand_what_those_for_its_robots_demand(folder: P
         folder / "robot.xml", Circumstances(datetime(2027, 1, 1, tzinfo=UTC), fleet=fleet)
     )
     each, folded = (suggest(system.rights, system.worlds, of) for of in (None, fleet))
-    text = render_requirements(folded, "robot.xml")
+    text = render_requirements(folded.requirements, "robot.xml")
     assert "# only /{robot}/mux may publish {namespace}/cmd_vel\n" in text
     assert "# only /{robot:carriers}/lift may publish {namespace:carriers}/lift\n" in text
     filled = read(text, fleet)
-    assert sorted(map(demand, filled)) == sorted(map(demand, each))
+    assert sorted(map(demand, filled)) == sorted(map(demand, each.requirements))
     assert decide_all(filled, system).violations == ()
+    assert each.comments == folded.comments == []
+
+
+def test_what_is_not_proposed_for_a_fleet_is_said_once(folder: Path) -> None:
+    wide = POLICY.replace("/lift</topic>", "/lift</topic><topic>{namespace}/cmd_*</topic>", 1)
+    (folder / "robot.xml").write_text(wide)
+    suggested = sros("check", "robot.xml", "--fleet", "fleet.toml", "--suggest", cwd=folder).ok()
+    assert [line for line in suggested.out.splitlines() if line.startswith("# not")] == [
+        "# not proposed: who alone may publish {namespace:carriers}/cmd_vel (stated for 1 enclave; "
+        "others may by a wildcard, or a DENY is there)"
+    ]
 
 
 def test_a_finding_for_all_robots_is_shown_once(folder: Path) -> None:
