@@ -47,7 +47,7 @@ from sros_tool.pki.keys import (
 from sros_tool.pki.tolerant import TolerantName
 from sros_tool.validity import Window
 
-# A permissions CA signs governance and permissions documents, too.
+# A permissions CA also signs governance and permissions documents.
 _CA_USAGE = tolerant.key_usage("digital_signature", "key_cert_sign", "crl_sign")
 _LEAF_USAGE = tolerant.key_usage("digital_signature")
 Extension = TypeVar("Extension", bound=x509.ExtensionType)
@@ -58,7 +58,7 @@ _ENCODINGS = {
     0x1C: "utf-32-be",
     0x1E: "utf-16-be",
 }
-"""ASN.1 string type → encoding by which OpenSSL decodes it (a_strex.c, tag2nbyte)."""
+"""Maps an ASN.1 string type to the encoding in which OpenSSL reads it (a_strex.c, tag2nbyte)."""
 _ESCAPED = re.compile(r'[,+"\\<>;]|^[# ](?!\Z)| \Z')
 _UNIQUE = re.compile(r"[0-9a-f]{16}")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
@@ -72,7 +72,7 @@ _SIGNING_KEYS: dict[x509.ObjectIdentifier, type] = {
         if name.startswith(("RSA", "ECDSA", "_RSA")) and not name.startswith("ECDSA_WITH_SHA3_")
     },
 }
-"""OID of a signature algorithm → kind of key; OpenSSL 3.0 has no ECDSA with SHA-3."""
+"""Maps the OID of a signature algorithm to its kind of key; OpenSSL 3.0 has no ECDSA with SHA-3."""
 _NOT_A_CA = x509.BasicConstraints(ca=False, path_length=None)
 _A_CA = x509.BasicConstraints(ca=True, path_length=1)
 
@@ -83,13 +83,13 @@ def common_name(text: str) -> x509.Name:
 
 
 def enclave_subject(name: str, *, unique: bool) -> x509.Name:
-    """Return the subject of an enclave's certificate: CN ``name``, and if ``unique`` a random OU.
+    """Return the subject of an enclave's certificate: CN ``name``, and a random OU if ``unique``.
 
-    The OU makes the subject different from all others: from subjects of enclaves whose name
-    contains this name (Cyclone DDS compares parts), and from those of earlier certificates.
-    Permissions for these do not fit then.  The RFC 4514 text has the CN first.  For the root
-    enclave it has the CN last, because Cyclone DDS takes the slash for the end of a part, and
-    refuses a subject with an empty part before another part.
+    The OU makes the subject different from the subjects of the enclave's earlier certificates, and
+    from those of enclaves whose names contain ``name`` (Cyclone DDS compares parts of subjects).
+    So permissions for those subjects do not fit the new certificate.  As RFC 4514 text, the subject
+    begins with the CN.  The subject of the root enclave ends with the CN, because Cyclone DDS
+    splits subjects at slashes, and refuses a subject with an empty part before another part.
     """
     if not unique:
         return common_name(name)
@@ -109,8 +109,8 @@ def has_unique_part(subject: x509.Name) -> bool:
 def issue_ca(key: PrivateKey, name: x509.Name, validity: Window) -> x509.Certificate:
     """Return a self-signed CA certificate.
 
-    It has BasicConstraints, KeyUsage and both key identifiers: without them, OpenSSL's strict check
-    (``-x509_strict``, used by Fast DDS) refuses a chain.
+    The certificate has BasicConstraints, KeyUsage and both key identifiers: without them, OpenSSL's
+    strict check (``-x509_strict``, used by Fast DDS) refuses a chain.
     """
     public = key.public_key()
     identifier = x509.SubjectKeyIdentifier.from_public_key(public)
@@ -150,7 +150,7 @@ class Issuer:
         self._authority_id = authority_identifier(certificate)
 
     def issue(self, subject: x509.Name, public: PublicKey, validity: Window) -> x509.Certificate:
-        """Return a certificate that is not a CA; it expires no later than the CA."""
+        """Return an end-entity certificate (not a CA), which expires no later than the CA."""
         return (
             _builder(subject, self._name, public, validity.intersection(self._validity))
             .add_extension(_NOT_A_CA, critical=True)
@@ -202,7 +202,7 @@ def pem(certificate: x509.Certificate) -> bytes:
 
 
 class Settings(Enum):
-    """How a program treats the trust settings of a ``TRUSTED CERTIFICATE`` (OpenSSL, X509_AUX)."""
+    """How a program uses the trust settings of a ``TRUSTED CERTIFICATE`` (OpenSSL, X509_AUX)."""
 
     IGNORED = "nothing"
     READ = "settings, which have no effect"
@@ -277,7 +277,7 @@ def _blocks(data: bytes, label: str) -> Iterator[pem_file.Block]:
 
 @lru_cache(maxsize=8)  # several readers ask for the certificate of an enclave, or for all of them
 def _known_blocks(data: bytes) -> tuple[tuple[pem_file.Block, ...], str]:
-    """Return the PEM blocks before the first damaged block, and a clause on the damage, or ""."""
+    """Return the PEM blocks before the first damaged one, and a clause about the damage, or ""."""
     blocks: list[pem_file.Block] = []
     try:
         blocks.extend(pem_file.blocks(data))
@@ -306,7 +306,7 @@ def _permits(trust_settings: bytes, settings: Settings) -> bool:
     """Return whether the trust settings after a certificate allow its use (OpenSSL, obj_trust).
 
     Raises:
-        PkiError, ValueError: they are no settings (X509_AUX).
+        PkiError, ValueError: ``trust_settings`` is not an X509_AUX structure.
     """
     (value,) = der.children(der.normalized(trust_settings))
     if value.tag != der.SEQUENCE:
@@ -334,7 +334,7 @@ def _sentence(clause: str) -> str:
 
 
 def load_der_certificate(data: bytes) -> x509.Certificate:
-    """Return a certificate, given in DER, that a signed document embeds.
+    """Return the certificate in ``data`` (DER), such as a signed document embeds.
 
     Raises:
         PkiError: the certificate cannot be read.
@@ -362,7 +362,7 @@ _USUAL_BYTES = 16 * 1024
 
 
 def _read_in_full(certificate: x509.Certificate) -> x509.Certificate:
-    """Return ``certificate`` after reading all parts that sros uses, to find errors now."""
+    """Return ``certificate`` after reading all parts that sros uses, to raise errors now."""
     certificate.public_key()
     authority_identifier(certificate)
     _ = certificate.signature_hash_algorithm, certificate.serial_number
@@ -373,7 +373,7 @@ def _read_names(certificate: x509.Certificate) -> x509.Certificate:
     for name in (certificate.subject, certificate.issuer):
         read_name(name)
         subject_text(name)
-    validity_of(certificate)  # raises an error if it expires before it begins
+    validity_of(certificate)  # raises an error if the certificate expires before it begins
     return certificate
 
 
@@ -385,8 +385,8 @@ def same_key(certificate: x509.Certificate, key: PrivateKeyTypes) -> bool:
 def weakness(certificate: x509.Certificate) -> str:
     """Return the weak cryptography of a certificate as a clause, or "".
 
-    A hash under 256 bits (SHA-1, MD5) is weak: others choose part of what a CA signs, so they could
-    look for two contents with the same hash.
+    A hash under 256 bits (SHA-1, MD5) is weak: whoever requests a certificate chooses part of the
+    signed content, and could search for two contents with the same hash.
     """
     key, digest = certificate.public_key(), certificate.signature_hash_algorithm
     if is_weak(key):
@@ -399,16 +399,17 @@ def weakness(certificate: x509.Certificate) -> str:
 
 @lru_cache(maxsize=256)  # the same few certificates are checked repeatedly
 def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
-    """Return whether ``authority`` issued and signed ``certificate``; ignore their validity."""
+    """Return whether ``authority`` issued and signed ``certificate``; validity is not checked."""
     return likely_issued(certificate, authority) and signature_matches(certificate, authority)
 
 
 @lru_cache(maxsize=256)
 def likely_issued(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
-    """Return whether ``authority`` may have issued ``certificate``; ignore key and validity.
+    """Return whether ``authority`` may be the issuer of ``certificate``.
 
-    As OpenSSL 3.0 (``ossl_x509_likely_issued``), compare the names, the kind of the key with the
-    algorithm that the signed part names, and the key identifiers where both have one.
+    As in OpenSSL 3.0 (``ossl_x509_likely_issued``), the signature and the validity are not checked.
+    Three things are compared: the names, the kind of the CA's key with the signature algorithm of
+    the certificate, and the key identifiers if both certificates have them.
     """
     if tolerant.unread_extension(certificate) or tolerant.unread_extension(authority):
         return False
@@ -443,12 +444,12 @@ def is_for_pss(certificate: x509.Certificate) -> bool:
 
 
 def _normalized(certificate: x509.Certificate, part: bytes) -> bytes:
-    """Return a part of a certificate, re-encoded in DER if the certificate is not in DER."""
+    """Return a part of a certificate, re-encoded in DER if the certificate is in BER."""
     return der.normalized(part) if tolerant.is_tolerated(certificate) else part
 
 
 def has_explicit_curve(certificate: x509.Certificate) -> bool:
-    """Return whether the elliptic curve of a certificate's key is given by its parameters."""
+    """Return whether a certificate describes its elliptic curve by parameters instead of an OID."""
     kind, *parameters = _key_algorithm(certificate)
     return kind.content == _EC and bool(parameters) and parameters[-1].tag == der.SEQUENCE
 
@@ -469,10 +470,10 @@ def _key_algorithm(certificate: x509.Certificate) -> list[der.Value]:
 
 @lru_cache(maxsize=256)
 def _algorithms(certificate: x509.Certificate) -> tuple[der.Value, der.Value]:
-    """Return two signature algorithms: in the signed part, and next to the signature.
+    """Return the two fields for the signature algorithm: of the signed part, and of the whole.
 
-    OpenSSL compares them when it verifies the signature; it does not verify the signature of a
-    self-signed CA (RFC 5280, 4.1.1.2).
+    OpenSSL compares the two fields when it verifies the signature.  It does not verify the
+    signature of a self-signed CA (RFC 5280, 4.1.1.2).
     """
     certificate_value = der.first_value(
         _normalized(certificate, certificate.public_bytes(serialization.Encoding.DER))
@@ -506,7 +507,11 @@ def is_signed(
     tbs_bytes: bytes,
     authority: x509.Certificate,
 ) -> bool:
-    """Return whether the key of ``authority`` signed ``tbs_bytes``, a part of ``signed_object``."""
+    """Return whether the key of ``authority`` signed ``tbs_bytes``.
+
+    ``tbs_bytes`` is the signed part of ``signed_object``, which also has the signature and its
+    algorithm.
+    """
     key, signature = authority.public_key(), signed_object.signature
     if not isinstance(key, _SIGNING_KEYS.get(signed_object.signature_algorithm_oid, ())):
         return False
@@ -545,9 +550,9 @@ def digest(certificate: x509.Certificate) -> str:
 def authority_text(certificate: x509.Certificate) -> str:
     """Return the subject of a CA with the first digits of its SHA-256.
 
-    In a rotation, the old and the new CA have the same name, because Fast DDS 2.9.1 refuses peers
-    whose permissions CA has another name; only a CA that issues nothing but identities gets a new
-    name.
+    The digits tell CAs of one name apart.  In a rotation, the new permissions CA keeps the name of
+    the old one, because Fast DDS 2.9.1 refuses peers whose permissions CA has another name.  Only a
+    CA that signs no documents gets a new name.
     """
     return f"{subject_text(certificate.subject)} (SHA-256 {digest(certificate)[:8]})"
 
@@ -555,7 +560,8 @@ def authority_text(certificate: x509.Certificate) -> str:
 def other_issuer_text(certificate: x509.Certificate, authority: x509.Certificate) -> str:
     """Return the issuer of a certificate that ``authority`` did not issue.
 
-    If both have the same name, the text has their key identifiers, by which they differ.
+    If the issuer is named like ``authority``, the text tells both CAs apart by their key
+    identifiers.
     """
     name = subject_text(certificate.issuer)
     if certificate.issuer != authority.subject:
@@ -577,7 +583,7 @@ def subject_text(name: x509.Name) -> str:
     """
     if isinstance(name, TolerantName) or all(len(rdn) == 1 for rdn in name.rdns):
         return _name_text(name.public_bytes())
-    # In DER, the attributes within an RDN are in the order of DER.
+    # This name sorts the attributes of an RDN, so each attribute is printed by itself.
     return ",".join(
         "+".join(
             _name_text(x509.Name([attribute]).public_bytes()) for attribute in reversed(list(rdn))
@@ -588,7 +594,7 @@ def subject_text(name: x509.Name) -> str:
 
 @lru_cache(maxsize=1024)  # the subjects of a keystore are asked for repeatedly
 def _name_text(name: bytes) -> str:
-    """Return a name (DER) as OpenSSL prints it, with the attributes of an RDN in their order."""
+    """Return a name (DER) as OpenSSL prints it; the attributes of an RDN keep their order."""
     return ",".join(
         "+".join(map(_attribute_text, reversed(der.children(rdn.content))))
         for rdn in reversed(der.children(der.first_value(name).content))
@@ -648,9 +654,9 @@ _FIRST_BIT = 1 << (4 * IDENTITY_DIGITS - 1)
 
 
 def identity_of(subject: bytes) -> str:
-    """Return the first 6 bytes (hexadecimal) of a participant's GUID, by its subject name (DER).
+    """Return the first 6 bytes (hexadecimal) of a secured participant's GUID.
 
-    The participant is secured.  Source: DDS-Security 1.1, 9.3.3.
+    They depend only on its ``subject`` name (DER).  Source: DDS-Security 1.1, 9.3.3.
     """
     digest = int(sha256(subject).hexdigest()[:IDENTITY_DIGITS], 16)
     return f"{_FIRST_BIT | digest >> 1:x}"
@@ -680,15 +686,15 @@ _JUDGED = {
         _NETSCAPE_TYPE,
     )
 }
-"""The extensions, other than names, whose values OpenSSL evaluates."""
+"""The extensions whose values OpenSSL evaluates, except for those that hold names."""
 _UNUSUAL = re.compile(rb"[^A-Za-z0-9/_]")
 
 
 class CertificateForm(NamedTuple):
-    """The parts that all certificate files of the same kind have in common.
+    """The parts of a certificate file that do not differ from one enclave to the next.
 
-    ``common`` is equal for files that differ only in the values of their own certificate, such as
-    the key.  ``validity`` is the period in DER.
+    Two files with equal ``common`` differ only in values of their own, such as the key.
+    ``validity`` is the period in DER.
     """
 
     common: tuple[object, ...]

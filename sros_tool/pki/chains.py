@@ -1,7 +1,7 @@
-"""Verification of certificate chains as OpenSSL 3.0 does it for the DDS vendors (x509_vfy.c).
+"""Verification of certificate chains, as OpenSSL 3.0 does it for DDS vendors (x509_vfy.c).
 
-OpenSSL itself is not used, because Python's version may be newer, and accept chains that the
-vendors' version refuses.  tests/integration/test_forged_chains.py compares both.
+OpenSSL itself is not used: the version in Python may be newer, and may accept chains that the
+vendors' version refuses. tests/integration/test_forged_chains.py compares this module with OpenSSL.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ _INHERITED = tuple(
         ("30083006040200010500", "30083006040200020500", "3004a0020500", "3004a1020500"),
     )
 )
-"""Values of the network extensions that mean: inherited from the CA."""
+"""Values of the network extensions that mean "inherited from the CA"."""
 _SSL_CLIENT, _SMIME, _SMIME_CA, _ANY_NETSCAPE_CA = 0x80, 0x20, 0x02, 0x07
 _OF_POLICIES = {
     ExtensionOID.CERTIFICATE_POLICIES,
@@ -82,7 +82,7 @@ class Checks(Flag):
 
     NONE = 0
     ROOT_SIGNATURE = auto()
-    """The signature of the self-signed CA, too (``X509_V_FLAG_CHECK_SS_SIGNATURE``)."""
+    """The signature of the self-signed CA (``X509_V_FLAG_CHECK_SS_SIGNATURE``)."""
     POLICIES = auto()
     """Certificate policies (``X509_V_FLAG_POLICY_CHECK``)."""
     STRICT = auto()
@@ -99,10 +99,9 @@ def chain_fault(
     moment: datetime,
     checks: Checks = Checks.NONE,
 ) -> str:
-    """Return why ``start`` has no valid chain to a self-signed CA of ``authorities``, or "".
+    """Return why no valid chain leads from ``start`` to a self-signed CA of ``authorities``, or "".
 
-    ``other_certificates`` are possible intermediate certificates; validities are checked at the
-    time ``moment``.
+    ``other_certificates`` may serve as intermediate CAs.  Validities are checked at ``moment``.
     """
     chain = _chain_of(start, tuple(dict.fromkeys(authorities)), tuple(other_certificates), moment)
     return chain.missing or chain.fault(checks)
@@ -122,7 +121,7 @@ class _Chain:
     def fault(self, checks: Checks) -> str:
         """Return why the chain is not valid, or ""."""
         if checks not in self._known:
-            # Of a chain that all vendors find valid, only what the checks add is left to ask.
+            # If the chain passes the checks that all vendors make, only the optional checks remain.
             new = not checks or bool(self.fault(Checks.NONE))
             self._known[checks] = next(self._faults(checks, new=new), "")
         return self._known[checks]
@@ -174,11 +173,11 @@ def build_chain(
 ) -> tuple[list[x509.Certificate], str]:
     """Return the chain from ``start`` to a trusted CA, or why there is none.
 
-    OpenSSL (build_chain) takes the first certificate whose name and identifiers fit, even if its
-    key did not make the signature.
+    As in OpenSSL (build_chain), the first certificate with a fitting name and fitting identifiers
+    is the issuer, even if the signature was made by another key.
     """
     chain = [start]
-    only_others = 1  # the certificates at the start of the chain that come from ``others``
+    only_others = 1  # the certificates at the start of the chain that are not trusted CAs
     ask_others = True
     while len(chain) <= _DEEPEST:
         last = chain[-1]
@@ -189,7 +188,7 @@ def build_chain(
         elif issuer is not None and len(chain) == only_others:
             if issuer == last:
                 only_others -= 1
-            else:  # another certificate with the name of a trusted CA
+            else:  # this certificate only has the name of a trusted CA
                 issuer = None
         if issuer is not None:
             ask_others = False
@@ -218,7 +217,10 @@ def _issuer(
     moment: datetime,
     chain: Sequence[x509.Certificate] = (),
 ) -> x509.Certificate | None:
-    """Return the first issuer valid at ``moment``, else the issuer that expires last, or None."""
+    """Return the issuer of ``certificate``, or None.
+
+    The first candidate that is valid at ``moment`` is chosen, otherwise the one that expires last.
+    """
     certificates = [
         candidate
         for candidate in candidates
@@ -243,7 +245,8 @@ def _may_sign_certificates(certificate: x509.Certificate) -> bool:
 def denies_issuing(certificate: x509.Certificate) -> bool:
     """Return whether a certificate says that it must not issue other certificates.
 
-    A certificate without basicConstraints and keyUsage does not say so: vendors differ about it.
+    A certificate with neither basicConstraints nor keyUsage does not say so, and vendors disagree
+    on whether such a certificate is a CA.
     """
     constraints = extension(certificate, x509.BasicConstraints)
     denied = constraints is not None and not constraints.ca
@@ -251,9 +254,9 @@ def denies_issuing(certificate: x509.Certificate) -> bool:
 
 
 def _key_faults(certificate: x509.Certificate) -> Iterator[str]:
-    """Yield a fault if the key of the first certificate of a chain cannot be read.
+    """Yield a fault if the key of the first certificate in a chain cannot be read.
 
-    OpenSSL reads the key (X509_self_signed), also one on a curve that its parameters describe.
+    As in OpenSSL (X509_self_signed), a key on a curve that is given by its parameters is read, too.
     """
     if isinstance(certificate.public_key(), UnknownKey) and not has_explicit_curve(certificate):
         name = subject_text(certificate.subject)
@@ -262,7 +265,7 @@ def _key_faults(certificate: x509.Certificate) -> Iterator[str]:
 
 @lru_cache(maxsize=64)
 def _extension_faults(certificate: x509.Certificate) -> tuple[str, ...]:
-    """Return faults of extensions for which OpenSSL, or sros, refuses every chain."""
+    """Return the faults of extensions for which OpenSSL or sros refuses every chain with them."""
     name = subject_text(certificate.subject)
     faults = [*_unread_faults(certificate)]
     if extension(certificate, x509.KeyUsage) == _NO_USAGE:
@@ -284,10 +287,10 @@ def _unread_faults(certificate: x509.Certificate) -> list[str]:
 
 
 def _network_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
-    """Yield reasons why OpenSSL, or sros, refuses the network extensions of a chain (v3_addr.c).
+    """Yield reasons why OpenSSL or sros refuses the network extensions of a chain (v3_addr.c).
 
-    These extensions restrict nothing if they are inherited from the CA.  But if the first
-    certificate has one, the trusted CA must not inherit it from another CA.
+    Extensions with the value "inherited from the CA" restrict nothing.  But if the first
+    certificate has such an extension, the trusted CA must not have that value.
     """
     for oid, title in _NETWORKS.items():
         values = [
@@ -327,7 +330,7 @@ def _authority(certificate: x509.Certificate) -> _Authority:
 
 
 def _netscape_type(certificate: x509.Certificate) -> int | None:
-    """Return the bits of the extension nsCertType, None without it, -1 if it is unreadable."""
+    """Return the bits of the nsCertType extension; None without it, -1 if it is unreadable."""
     kinds = [
         extension.value for extension in certificate.extensions if extension.oid == _NETSCAPE_TYPE
     ]
@@ -473,14 +476,14 @@ def _signature_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iter
 
 
 _ALWAYS_ASKED = {ExtensionOID.CERTIFICATE_POLICIES, ExtensionOID.POLICY_CONSTRAINTS}
-"""The policy extensions that OpenSSL always decodes, even if no certificate names a policy."""
+"""The policy extensions that OpenSSL decodes even if no certificate names a policy."""
 
 
 def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
     """Yield a fault if a certificate demands a policy, or its policies are not valid (pcy_tree.c).
 
-    A process of DDS names no policy that it accepts, so none is valid where one is demanded.  Also
-    yield a fault if a certificate maps policies, which sros does not support.
+    DDS processes accept no policy by name, so a chain in which a policy is demanded is never valid.
+    Also yield a fault if a certificate maps policies, which sros does not support.
     """
     if not any(
         _OF_POLICIES & {extension.oid for extension in below.extensions} for below in chain[:-1]
@@ -517,7 +520,7 @@ def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
 
 _IA5_MAIL = der.encode(der.OID, der.encode_oid(NameOID.EMAIL_ADDRESS.dotted_string)) + b"\x16"
 _HOST = re.compile(r"(?!.*(?:\.-|-\.))\w(?:[\w-]*\w)?(?:\.[\w-]*\w)+", re.ASCII)
-"""Matches a common name that OpenSSL takes for a host name: it contains a dot."""
+"""Matches a common name that OpenSSL takes for a host name: a name with a dot."""
 
 
 def _name_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
@@ -538,7 +541,7 @@ def _name_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
 
 
 def _names(certificate: x509.Certificate, *, is_leaf: bool) -> Iterator[x509.GeneralName | None]:
-    """Yield a certificate's names that constraints apply to; None for a name that is unreadable."""
+    """Yield the names in a certificate to which constraints apply; None for an unreadable name."""
     subject = certificate.subject
     if any(subject.rdns):
         readable_name = isinstance(subject, x509.Name)
@@ -582,7 +585,7 @@ def _is_in_subtree(name: x509.GeneralName, base: x509.GeneralName) -> bool:
     """Return whether a name is in the subtree ``base``.
 
     Raises:
-        ValueError: that cannot be decided.
+        ValueError: sros cannot decide this for the kind or the value of the names.
     """
     if isinstance(name, x509.DirectoryName) and isinstance(base, x509.DirectoryName):
         parts = canonical(base.value)

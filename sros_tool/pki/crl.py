@@ -1,6 +1,6 @@
-"""Certificate revocation lists (CRLs, RFC 5280, section 5), and what OpenSSL decides by them.
+"""Certificate revocation lists (CRLs, RFC 5280, section 5), and what OpenSSL decides with them.
 
-DDS vendors need a list only from the CA that issued the certificate, not from the CAs above it
+DDS vendors need a list only of the CA that issued the certificate, not of the CAs above it
 (``X509_V_FLAG_CRL_CHECK`` without ``X509_V_FLAG_CRL_CHECK_ALL``).
 """
 
@@ -47,11 +47,11 @@ REASONS = tuple(
     # remove_from_crl only occurs in delta CRLs.
     if flag not in (x509.ReasonFlags.remove_from_crl,)
 )
-"""The reasons for a revocation, as RFC 5280 names them."""
+"""The reasons for a revocation, by their names in RFC 5280."""
 _RESTORE = "Restore it from a backup."
 
 SUPERSEDED = x509.ReasonFlags.superseded.value
-"""The reason for a certificate that was renewed: its key may still be in use."""
+"""The reason for revoking a certificate that was renewed, although its key may still be in use."""
 
 
 class Revoked(NamedTuple):
@@ -63,9 +63,9 @@ class Revoked(NamedTuple):
 
 
 class RevocationList(NamedTuple):
-    """A revocation list that was read, with a signature that is not verified yet.
+    """A revocation list whose signature is not verified yet.
 
-    ``revoked`` has no entries with the reason removeFromCRL: they revoke nothing.
+    ``revoked`` leaves out entries with the reason removeFromCRL, because they revoke nothing.
     """
 
     number: int
@@ -126,7 +126,7 @@ def sign_crl(
             .serial_number(revocation.serial)
             .revocation_date(revocation.date)
         )
-        if revocation.reason != "unspecified":  # RFC 5280, 5.3.1: the extension is left out instead
+        if revocation.reason != "unspecified":  # RFC 5280, 5.3.1: no extension means "unspecified"
             entry = entry.add_extension(
                 x509.CRLReason(x509.ReasonFlags(revocation.reason)), critical=False
             )
@@ -135,7 +135,7 @@ def sign_crl(
 
 
 def load_crl(data: bytes, name: str) -> RevocationList:
-    """Return the first revocation list of a PEM file, which has to state its expiry.
+    """Return the first revocation list of a PEM file, which must state when it expires.
 
     Raises:
         PkiError: the list cannot be read, or states no expiry; ``name`` names the file.
@@ -148,7 +148,7 @@ def load_crl(data: bytes, name: str) -> RevocationList:
 
 
 def _revoked_in(crl: x509.CertificateRevocationList) -> tuple[Revoked, ...]:
-    """Return what a list revokes; an entry with the reason removeFromCRL revokes nothing."""
+    """Return the entries of a list; entries with the reason removeFromCRL are left out."""
     return tuple(entry for entry in map(_revoked, crl) if entry.reason in REASONS)
 
 
@@ -158,7 +158,7 @@ def last_update(crl: x509.CertificateRevocationList) -> datetime:
 
 
 def next_update(crl: x509.CertificateRevocationList) -> datetime | None:
-    """Return the time at which a revocation list expires, in UTC; None if it states none."""
+    """Return the time at which a revocation list expires, in UTC; None if no time is stated."""
     return cast("datetime | None", tolerant.date(crl, "next_update"))
 
 
@@ -174,7 +174,7 @@ def read_list(data: bytes, name: str) -> x509.CertificateRevocationList:
 
 
 def read_lists(data: bytes, name: str) -> tuple[x509.CertificateRevocationList, ...]:
-    """Return all revocation lists of a PEM file, which may have certificates, too.
+    """Return all revocation lists of a PEM file, which may also contain certificates.
 
     Raises:
         PkiError: a list, or a block before it, cannot be read; ``name`` names the file.
@@ -223,15 +223,15 @@ def _read_in_full(crl: x509.CertificateRevocationList) -> x509.CertificateRevoca
 def embedded_lists(data: bytes) -> list[bytes]:
     """Return the revocation lists in a CA file, each as a PEM document.
 
-    OpenSSL reads all lists in the file; a list has to begin at the beginning of a line (pem_lib.c).
+    OpenSSL reads all lists in the file that begin at the start of a line (pem_lib.c).
     """
     return [CRL_MARK + text for text in (b"\n" + data).split(b"\n" + CRL_MARK)[1:]]
 
 
 def names_issuers(crl: x509.CertificateRevocationList) -> bool:
-    """Return whether an entry of the list names a CA that issued the revoked certificate.
+    """Return whether an entry of the list names the CA that issued the revoked certificate.
 
-    Such a list is indirect: it can revoke certificates of several CAs (certificateIssuer).
+    Such a list is indirect: its entries can be certificates of several CAs (certificateIssuer).
     """
     return any(
         ext.oid == CRLEntryExtensionOID.CERTIFICATE_ISSUER
@@ -245,7 +245,8 @@ def lists_as_revoked(crl: x509.CertificateRevocationList, serial: int) -> bool:
 
     An entry with the reason removeFromCRL revokes nothing (OpenSSL 3, x509_vfy.c, cert_crl).
     """
-    if serial < 0:  # RFC 5280 forbids it, OpenSSL accepts it, and the search below raises
+    # RFC 5280 forbids negative numbers, OpenSSL accepts them, and the search below raises for them.
+    if serial < 0:
         entry = next(
             (
                 revoked_certificate
@@ -280,8 +281,8 @@ _OF_USERS = x509.IssuingDistributionPoint(
 def refusal_of(crl: x509.CertificateRevocationList) -> str:
     """Return why OpenSSL cannot use a list, as a clause; "" if it can.
 
-    With such a list, no certificate is verified.  Source: OpenSSL 3, x_crl.c (crl_set_issuers,
-    crl_cb) and x509_vfy.c (get_crl_score).
+    A list that cannot be used makes every verification fail.  Source: OpenSSL 3, x_crl.c
+    (crl_set_issuers, crl_cb) and x509_vfy.c (get_crl_score).
     """
     for ext in crl.extensions:
         if ext.critical and ext.oid not in _READ_IF_CRITICAL:
@@ -303,17 +304,17 @@ def signed_by(crl: x509.CertificateRevocationList, authority: x509.Certificate) 
 
 
 def may_sign_lists(authority: x509.Certificate) -> bool:
-    """Return whether a CA's keyUsage permits signing CRLs; True if it has no keyUsage."""
+    """Return whether a CA's keyUsage permits signing CRLs; also True for a CA without keyUsage."""
     usage = extension(authority, x509.KeyUsage)
     return usage is None or usage.crl_sign
 
 
 @lru_cache(maxsize=8)
 def newest_list(data: bytes, authorities: bytes) -> x509.CertificateRevocationList | None:
-    """Return the newest revocation list in ``data``, of those that one of ``authorities`` signed.
+    """Return the newest of the revocation lists in ``data`` that a CA in ``authorities`` signed.
 
-    The list number decides; None if there is none, or a file cannot be read.  A list that revokes
-    nothing is false: compare with None.
+    The list with the highest number is the newest.  Returns None if there is no list, or if a file
+    cannot be read.  Compare the result with None: a list without entries is falsy.
     """
     try:
         signers = load_certificates(authorities, "the identity CAs")
@@ -325,7 +326,7 @@ def newest_list(data: bytes, authorities: bytes) -> x509.CertificateRevocationLi
 
 
 class Revocations(NamedTuple):
-    """Number of a revocation list, and the serial numbers on it; -1 and nothing without a list."""
+    """The number of a revocation list, and its serial numbers; -1 and none without a list."""
 
     number: int = -1
     serials: frozenset[int] = frozenset()
@@ -333,13 +334,14 @@ class Revocations(NamedTuple):
 
 @lru_cache(maxsize=256)
 def newest_revocations(signer: bytes, *files: bytes) -> Revocations:
-    """Return what the newest list in ``files`` revokes, of the lists that the CA ``signer`` signed.
+    """Return what the newest list in ``files`` revokes, among the lists that ``signer`` signed.
 
-    A file that cannot be read has no list.
+    ``signer`` is the certificate of a CA, as PEM.  An unreadable file counts as a file without
+    lists.
     """
     lists = [crl for data in files if (crl := newest_list(data, signer)) is not None]
     newest = max(lists, key=list_number, default=None)
-    if newest is None:  # a list that revokes nothing is false
+    if newest is None:  # a list without entries is falsy
         return Revocations()
     return Revocations(list_number(newest), frozenset(e.serial for e in _revoked_in(newest)))
 
@@ -396,7 +398,7 @@ class ListRefusal(NamedTuple):
 
 
 class _Score(NamedTuple):
-    """How well a list fits a certificate; OpenSSL compares the fields in this order.
+    """How well a list fits a certificate; scores compare field by field, in this order.
 
     Source: OpenSSL 3, x509_vfy.c (get_crl_score).
     """
@@ -412,7 +414,7 @@ def list_refusal(
 ) -> ListRefusal | None:
     """Return why OpenSSL refuses ``chain[0]`` with these lists at the time ``moment``, or None.
 
-    ``chain`` leads to a self-signed CA, and is valid without lists.
+    ``chain`` leads to a self-signed CA, and is already known to be valid apart from revocation.
     """
     certificate = chain[0]
     best = _best_list(chain, lists, moment)
@@ -447,7 +449,7 @@ def list_refusal(
 
 
 def _revokes(crl: x509.CertificateRevocationList, certificate: x509.Certificate) -> bool:
-    """Return whether a list revokes a certificate; an entry removeFromCRL revokes nothing."""
+    """Return whether a list revokes a certificate; an entry with removeFromCRL revokes nothing."""
     if not _entries(_Content(crl)).name_issuers:
         return lists_as_revoked(crl, certificate.serial_number)
     issuers: list[x509.Name] | None = None
@@ -471,7 +473,7 @@ def _best_list(
 ) -> tuple[x509.CertificateRevocationList, x509.Certificate, _Score] | None:
     """Return the list that OpenSSL uses for ``chain[0]``, with its issuer and score, or None.
 
-    It is the list that fits best, and of several the newest (get_crl_sk).
+    OpenSSL uses the list with the highest score, and the newest list among equals (get_crl_sk).
     """
     best: tuple[x509.CertificateRevocationList, x509.Certificate, _Score] | None = None
     for crl in lists:
@@ -497,8 +499,8 @@ def _issuer(
 ) -> x509.Certificate | None:
     """Return the CA in ``chain`` that issued the revocation list, or None.
 
-    Returns None, too, if the issuer's name in the list is not that of the issuer of ``chain[0]``.
-    As crl_akid_check in OpenSSL.
+    The result is also None if the list and ``chain[0]`` name different issuers.  Source: OpenSSL 3,
+    x509_vfy.c (crl_akid_check).
     """
     if not same_name(crl.issuer, chain[0].issuer):
         return None
@@ -531,7 +533,7 @@ def _identifies(identifier: x509.AuthorityKeyIdentifier, authority: x509.Certifi
 
 
 class _Content:
-    """A hashable revocation list: the key of caches, because enclaves have the same list."""
+    """A hashable revocation list, so that caches work for all enclaves with the same list."""
 
     def __init__(self, crl: x509.CertificateRevocationList) -> None:
         self.crl = crl
@@ -544,7 +546,7 @@ class _Content:
 
 
 class _Entries(NamedTuple):
-    """Facts about the extensions of a list and of its entries.
+    """Properties of the extensions of a list and of its entries.
 
     ``has_unknown``: the list or an entry has a critical extension that OpenSSL does not know.
     ``name_issuers``: entries name the CAs whose certificates they revoke.
@@ -576,7 +578,7 @@ def _is_in_scope(
     crl: x509.CertificateRevocationList,
     point: x509.IssuingDistributionPoint | None,
 ) -> bool:
-    """Return whether a list is for the certificate, by its distribution point.
+    """Return whether a list covers the certificate, by the distribution point of the list.
 
     Source: OpenSSL 3, x509_vfy.c (crl_crldp_check).
     """
@@ -607,7 +609,7 @@ def _same_place(place: x509.DistributionPoint, point: x509.IssuingDistributionPo
     if place.full_name is not None and point.full_name is not None:
         ours = [_general_name(name) for name in place.full_name]
         return any(_general_name(name) in ours for name in point.full_name)
-    return False  # names relative to the issuer: not decided here, and seldom used
+    return False  # sros does not compare names relative to the issuer, which are rare
 
 
 def _general_name(name: x509.GeneralName) -> object:

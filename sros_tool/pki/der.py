@@ -1,7 +1,8 @@
 """A small reader and writer of DER (X.690), for what `cryptography` does not parse.
 
-`cryptography` creates CMS signatures but cannot yet verify them: the reader extracts the parts that
-its verification primitives need.  The writer is for keys that are encrypted by scrypt.
+`cryptography` creates CMS signatures but cannot yet verify them.  So this reader extracts the key,
+the signed bytes and the signature, which `cryptography` can verify.  The writer encodes private
+keys encrypted with scrypt.
 """
 
 from __future__ import annotations
@@ -90,7 +91,8 @@ def split_all(data: bytes) -> list[bytes]:
 def normalized(data: bytes) -> bytes:
     """Return the first value in BER ``data`` (X.690, 8), re-encoded with DER lengths.
 
-    The values inside a constructed value are re-encoded, too.  OpenSSL reads both forms alike.
+    The values inside a constructed value are re-encoded, too.  OpenSSL reads the BER form and the
+    result alike.
 
     Raises:
         PkiError: the value is truncated, too deep, or has a form that this reader does not support.
@@ -101,7 +103,7 @@ def normalized(data: bytes) -> bytes:
 def first_part(data: bytes) -> bytes:
     """Return the first value inside a constructed value (BER), with its original bytes.
 
-    These are the bytes that a signature covers.
+    In certificates and revocation lists, the signature covers these bytes.
 
     Raises:
         PkiError: a value is truncated, or has a form that this reader does not support.
@@ -158,7 +160,11 @@ def _normalized(data: bytes, start: int, depth: int) -> tuple[bytes, int]:
 
 
 def integer(value: Value) -> int:
-    """Return the number in an INTEGER; raise `PkiError` for other tags, and longer forms."""
+    """Return the number in an INTEGER.
+
+    Raises:
+        PkiError: the value has another tag, or its content is not the shortest form.
+    """
     if value.tag != INTEGER:
         raise PkiError("a DER value is not a number")
     number = int.from_bytes(value.content, "big", signed=True)

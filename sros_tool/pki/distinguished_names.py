@@ -1,6 +1,7 @@
 """Distinguished names: reading and comparing them as OpenSSL does (RFC 5280, 7.1; x_name.c).
 
-``object_names.txt`` has all names of objects of OpenSSL 3.0, which the tested DDS vendors use.
+``object_names.txt`` has the names of all object identifiers in OpenSSL 3.0, which the tested DDS
+vendors use.
 """
 
 from __future__ import annotations
@@ -25,12 +26,15 @@ _ENCODINGS = {
     0x1C: "utf-32-be",
     0x1E: "utf-16-be",
 }
-"""ASN.1 string type → encoding, for types compared as text; all others are compared by bytes."""
+"""Maps an ASN.1 string type, whose values are compared as text, to its encoding.
+
+Values of other types are compared by bytes.
+"""
 _SPACES = re.compile(rb"[ \t\n\v\f\r]+")
 
 
 def same_name(first: x509.Name, second: x509.Name) -> bool:
-    """Return whether names are equal; string types, case, blanks and empty parts do not count."""
+    """Return whether names are equal, regardless of string types, case, blanks and empty parts."""
     return canonical(first) == canonical(second)
 
 
@@ -41,7 +45,7 @@ def canonical_issuer(certificate: x509.Certificate) -> tuple[bytes, ...]:
 
 
 def canonical(name: x509.Name) -> tuple[bytes, ...]:
-    """Return the parts (RDNs) of a name in a form in which equal names are equal."""
+    """Return the parts (RDNs) of a name, normalized: equal names have equal results."""
     return canonical_der(name.public_bytes())
 
 
@@ -72,7 +76,10 @@ def _attribute(attribute: der.Value) -> bytes:
 
 @cache
 def short_names() -> Mapping[str, str]:
-    """Return OpenSSL's short names by OID; it prints any other attribute in hexadecimal."""
+    """Return OpenSSL's short names of attributes by OID.
+
+    OpenSSL prints attributes without a short name in hexadecimal.
+    """
     data = Path(__file__).with_name("object_names.txt").read_text(encoding="ascii")
     return dict(line.split(" ") for line in data.splitlines())
 
@@ -89,9 +96,9 @@ _IN_NAMES = (0x03, 0x0C, 0x12, 0x13, 0x14, 0x16, 0x1C, _BMP_STRING)
 def reading(unreadable: str, why: str, remedy: str = "") -> Iterator[None]:
     """Turn all errors of `cryptography` in the ``with`` block into a `PkiError` with these texts.
 
-    For a damaged or hostile document it raises errors of more than ten classes, most of them at the
-    first use of a part (``subject``, ``extensions``, ``public_key()``).  So use each part that is
-    needed later inside the block.
+    For a damaged or hostile document, `cryptography` raises errors of more than ten classes, mostly
+    at the first use of a part (``subject``, ``extensions``, ``public_key()``).  So the block has to
+    use every part that is needed later.
     """
     try:
         yield
@@ -109,8 +116,8 @@ def may_be_read_error(error: BaseException) -> bool:
 def read_name(name: x509.Name) -> None:
     """Parse every part of a distinguished name that sros shows, compares or copies.
 
-    Raises one of the errors that `reading` handles: also for a value that OpenSSL takes for no part
-    of a name, such as a time.
+    Raises one of the errors that `reading` handles, also for a value of a type that OpenSSL does
+    not read in names, such as a time.
     """
     name.rfc4514_string()
     read_name_der(name.public_bytes())

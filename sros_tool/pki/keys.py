@@ -51,10 +51,11 @@ _AES_256_CBC = "2.16.840.1.101.3.4.1.42"
 def _encrypted(key: bytes, passphrase: str) -> bytes:
     """Return a PKCS#8 key, given in DER, as encrypted PEM (PBES2 with scrypt and AES-256-CBC).
 
-    `cryptography` can read this form, but writes keys with 2048 rounds of PBKDF2, whose passphrases
-    are quickly guessed.  Source: RFC 5958, 3; RFC 8018, 6.2 and A.4; RFC 7914, 7.
+    `cryptography` can read this form, but cannot write it: its own encryption uses 2048 rounds of
+    PBKDF2, with which passphrases are quickly guessed.  Source: RFC 5958, 3; RFC 8018, 6.2 and A.4;
+    RFC 7914, 7.
     """
-    import textwrap  # no key is written by most verbs
+    import textwrap  # most verbs write no key
 
     from cryptography.hazmat.primitives.ciphers import Cipher
     from cryptography.hazmat.primitives.ciphers.algorithms import AES
@@ -93,9 +94,9 @@ def load_key(pem: bytes, name: str, passphrase: Callable[[], str] | None = None)
     ``passphrase`` is called if the key is encrypted.
 
     Raises:
-        PkiError: the key cannot be read; it is encrypted, and ``passphrase`` is None or wrong; it
-            is neither an EC nor an RSA key; or OpenSSL would take so long that no signal could end
-            it.
+        PkiError: the key cannot be read; the key is encrypted, and ``passphrase`` is None or
+            returns a wrong one; the key is neither EC nor RSA; or OpenSSL would need so long for
+            the key that the process seems to hang.
     """
     key = load_any_key(pem, name, passphrase)
     if not isinstance(key, (ec.EllipticCurvePrivateKey, rsa.RSAPrivateKey)):
@@ -128,7 +129,7 @@ def load_any_key(
     else:
         try:
             key = serialization.load_pem_private_key(pem, None, unsafe_skip_rsa_key_validation=True)
-        except Exception as error:  # of many classes: see `reading`
+        except Exception as error:  # may have one of many classes: see `reading`
             raise _unreadable_key_error(name) from error
     return _validated(key, name) if isinstance(key, rsa.RSAPrivateKey) else key
 
@@ -148,7 +149,7 @@ _PSS = der.encode_oid("1.2.840.113549.1.1.10")
 
 
 def check_key(content: bytes, label: str = "") -> None:
-    """Raise an error unless ``content`` (DER) is a private key with the PEM ``label``."""
+    """Raise an error unless ``content`` (DER) is a private key of the kind that ``label`` names."""
     if len(content) > _MAX_BYTES:
         raise ValueError("too large")
     data, _ = der.split(content)
@@ -165,7 +166,7 @@ def _unreadable_key_error(name: str, reason: str = "") -> PkiError:
 
 
 def _key_block(data: bytes, name: str) -> bytes:
-    """Return the first private key of a PEM file as OpenSSL reads it, as a standard PEM block."""
+    """Return the private key that OpenSSL reads first in a PEM file, as a standard PEM block."""
     damaged = False
     try:
         for block in pem_file.blocks(data):
@@ -193,7 +194,8 @@ def _key_block(data: bytes, name: str) -> bytes:
     if block.headers and not encrypted:
         raise _unreadable_key_error(name, "it has other PEM headers than those of an encrypted key")
     label, der_key = block.label, block.content
-    if not encrypted:  # OpenSSL ignores what follows the key, and which form the label promises
+    # OpenSSL ignores bytes after the key, and reads the key even if the label names another form.
+    if not encrypted:
         with suppress(PkiError):
             der_key, _ = der.split(block.content)
             kinds = [part.tag for part in der.children(der.first_value(der_key).content)]
@@ -207,7 +209,7 @@ def _key_block(data: bytes, name: str) -> bytes:
 
 
 KEY_LABELS = ("PRIVATE KEY", "RSA PRIVATE KEY", "EC PRIVATE KEY", "DSA PRIVATE KEY")
-"""The PEM labels of private keys that are not encrypted, unless a header says so."""
+"""The PEM labels of unencrypted private keys; a header can still say that the key is encrypted."""
 _KINDS: dict[str, type] = {
     "RSA PRIVATE KEY": rsa.RSAPrivateKey,
     "EC PRIVATE KEY": ec.EllipticCurvePrivateKey,
@@ -218,12 +220,17 @@ _TRADITIONAL = b"Proc-Type: 4,ENCRYPTED"
 _MAX_BYTES = 16 * 1024
 _MAX_RSA_BITS = 4096
 _MAX_ROUNDS = 2_000_000
-_MAX_SCRYPT_MEMORY, _MAX_SCRYPT_WORK = 2**19, 2**22  # N * r, of 128 bytes each; N * r * p
+# Limits of N * r, in units of 128 bytes, and of N * r * p.
+_MAX_SCRYPT_MEMORY, _MAX_SCRYPT_WORK = 2**19, 2**22
 _ENCRYPTED = re.compile(rb"-----BEGIN ENCRYPTED PRIVATE KEY-----([^-]*)")
 
 
 def _validated(key: rsa.RSAPrivateKey, name: str) -> rsa.RSAPrivateKey:
-    """Validate an RSA key that was loaded unvalidated; refuse sizes that would take minutes."""
+    """Return an RSA key that was loaded without validation, validated now.
+
+    Raises:
+        PkiError: the key is invalid, or so large that validation would take minutes.
+    """
     if key.key_size > _MAX_RSA_BITS:
         raise PkiError(
             f"the private key {name} has {key.key_size} bits",
@@ -238,16 +245,19 @@ def _validated(key: rsa.RSAPrivateKey, name: str) -> rsa.RSAPrivateKey:
 
 _INITIAL_VALUE = re.compile(rb"^DEK-Info: *([^,\s]*),([0-9A-Fa-f]*)", re.MULTILINE)
 _HEX_DIGITS = {b"DES-CBC": 16, b"DES-EDE3-CBC": 16}
-"""Hexadecimal digits of the initialization vector of 64-bit block ciphers; RFC 1421, 4.6.1.3."""
+"""Maps a cipher with 64-bit blocks to the hexadecimal digits of its initialization vector.
+
+Source: RFC 1421, 4.6.1.3.
+"""
 
 
 def _check_derivation(pem: bytes, name: str) -> None:
-    """Refuse an encrypted key for which trying a passphrase takes hours or gigabytes.
+    """Raise `PkiError` if testing one passphrase of an encrypted key takes hours or gigabytes.
 
     Source: RFC 5958, 3; RFC 8018, A; RFC 7914, 7.
     """
     if (match := _INITIAL_VALUE.search(pem)) and len(match[2]) < _HEX_DIGITS.get(match[1], 32):
-        raise _unreadable_key_error(name)  # `cryptography` panics
+        raise _unreadable_key_error(name)  # `cryptography` would panic
     for block in _ENCRYPTED.findall(pem):
         try:
             scrypt, numbers = _derivation(block)
@@ -269,9 +279,9 @@ def _check_derivation(pem: bytes, name: str) -> None:
 
 
 def _derivation(block: bytes) -> tuple[bool, list[int]]:
-    """Return whether a PEM block's key derivation is scrypt, and the derivation's cost parameters.
+    """Return whether the key of a PEM block is derived by scrypt, and the cost parameters.
 
-    For scrypt these are N, r and p, for others the rounds, perhaps with more after them.
+    For scrypt, the parameters are N, r and p; for others, the number of rounds comes first.
 
     Raises:
         ValueError, PkiError: the block is damaged.
@@ -281,12 +291,13 @@ def _derivation(block: bytes) -> tuple[bool, list[int]]:
     return scrypt, list(_integers(scheme))
 
 
-_FEWEST_ROUNDS = 600_000  # OWASP Password Storage Cheat Sheet (2025), of PBKDF2 with SHA-256
+# For PBKDF2 with SHA-256, by the OWASP Password Storage Cheat Sheet (2025).
+_FEWEST_ROUNDS = 600_000
 _LEAST_SCRYPT_WORK = 2**17  # N * r * p of `openssl pkcs8 -scrypt`
 
 
 def few_rounds(pem: bytes) -> str:
-    """Return why the passphrase of an encrypted key is quick to guess, as a clause, or "".
+    """Return a clause that says why an encrypted key's passphrase is quick to guess, or "".
 
     Source: RFC 8018, 4.2; OpenSSL 3.0, openssl-pkcs8 (2048 rounds) and PEM_write_bio_PrivateKey
     (one round of MD5).
@@ -306,7 +317,7 @@ def few_rounds(pem: bytes) -> str:
 
 
 def _integers(data: bytes, depth: int = 3) -> Iterator[int]:
-    """Yield the integers in ``data``, in order, also those in sequences."""
+    """Yield the integers in ``data`` in order, including those in nested sequences."""
     for value in der.children(data):
         if value.tag == der.INTEGER:
             yield der.integer(value)
@@ -351,7 +362,7 @@ _FERMAT_ROUNDS = 100
 
 
 def key_problem(key: PublicKey) -> str:
-    """Return why a key that a stranger made must not be certified, as a clause, or "".
+    """Return a clause that says why a key from an untrusted request must not be certified, or "".
 
     Sources: NIST SP 800-56B rev. 2, 6.2 (exponents); CA/Browser Forum, Baseline Requirements,
     6.1.1.3 and 6.1.6 (close primes, ROCA: CVE-2017-15361).

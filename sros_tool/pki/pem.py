@@ -1,6 +1,6 @@
 """PEM as OpenSSL 3, used by every DDS vendor, reads it (pem_lib.c); detection of file types.
 
-OpenSSL reads less than other programs (RFC 7468 leaves it to them): a block begins and ends at the
+OpenSSL is stricter than other programs, which RFC 7468 permits: a block begins and ends at the
 start of a line, and a damaged block hides all blocks after it.
 """
 
@@ -18,7 +18,7 @@ CERTIFICATES = ("CERTIFICATE", "X509 CERTIFICATE", "TRUSTED CERTIFICATE")
 """Labels of certificates; a block with the last label can also contain trust settings."""
 
 _PIECE = re.compile(rb"[^\n]{0,253}\n|[^\n]{1,254}")
-"""Matches a line as OpenSSL reads it: a whole line, or 254 characters of a longer line."""
+"""Matches a line as OpenSSL reads it: a whole line, or the next 254 characters of a longer line."""
 _BEGIN = re.compile(rb"-----BEGIN (.*)-----", re.DOTALL)
 _END = b"-----END "
 _NOT_AT_START = re.compile(rb"[^\n]-----BEGIN ")
@@ -27,7 +27,7 @@ _ALONE = re.compile(
     rb"-----BEGIN ([A-Z0-9 ]{1,60})-----\n((?:[A-Za-z0-9+/]{1,76}\n)*[A-Za-z0-9+/]{1,76}={0,2}\n)"
     rb"-----END \1-----\n"
 )
-"""Matches a file with a single block without headers: the common form, read fast."""
+"""Matches a file that consists of one block without headers, the common case."""
 _BLANKS = bytes(range(0x21))
 _BETWEEN = b" \t\r\n"
 _BOM = b"\xef\xbb\xbf"
@@ -46,15 +46,16 @@ def blocks(data: bytes) -> Iterator[Block]:
     """Yield the blocks of a PEM file, in order.
 
     Raises:
-        PkiError: a block is damaged, so OpenSSL does not read what follows; or its first line ends
-            with a byte beyond ASCII, which OpenSSL drops on some processors only.
+        PkiError: a block is damaged, so that OpenSSL does not read the blocks after it; or the
+            first line of a block ends with a non-ASCII byte, which OpenSSL drops only on some
+            processors.
     """
     if single := _ALONE.fullmatch(data):
         label = single[1].decode("ascii")
         yield Block(label, b"", _decoded(single[2], label))
         return
     pieces = iter(_PIECE.findall(data))
-    start = True  # a byte order mark is dropped here, and behind each block
+    start = True  # OpenSSL drops a byte order mark at the start of the file and after each block
     for piece in pieces:
         line = (piece.removeprefix(_BOM) if start else piece).rstrip(_BLANKS)
         if b"\0" in line and line.startswith(b"-----BEGIN "):
@@ -95,7 +96,7 @@ def missing_block_reason(data: bytes, label: str) -> str:
 
 
 def _block(label: bytes, pieces: Iterator[bytes]) -> Block:
-    """Parse a block after its BEGIN line: optional headers and an empty line, then the content."""
+    """Parse a block after its BEGIN line: optional headers and an empty line, then content."""
     name = label.decode("utf-8", "replace")[:80]
     parts: list[list[bytes]] = [[]]
     split = short = False
@@ -121,7 +122,7 @@ def _block(label: bytes, pieces: Iterator[bytes]) -> Block:
     if line != _END + label + b"-----":
         raise PkiError(f"the block {name} in it does not end with '-----END {name}-----'")
     if len(parts) == 1 and any(b":" in part for part in parts[0]):
-        parts.append([])  # headers alone
+        parts.append([])  # the block has headers only
     headers = b"\n".join(parts.pop(0)) if len(parts) == 2 else b""
     return Block(label.decode("utf-8", "replace"), headers, _decoded(b"\n".join(parts[0]), name))
 
@@ -153,7 +154,7 @@ _MARKS = (
     (b"ecdsa-sha2-", "a public key of OpenSSH"),
     (b"pkcs11:", "the URI of a key on a token"),
 )
-"""First bytes of a file → the kind of file, as a noun with its article."""
+"""Maps the first bytes of a file to the kind of the file, as a noun with its article."""
 
 _LABEL = re.compile(rb"^-----BEGIN ([^\r\n]{1,60})-----[ \t\r]*$", re.MULTILINE)
 _OF_LABEL = {
@@ -190,7 +191,7 @@ _MOST = 4096
 
 
 def kind_of(data: bytes) -> str:
-    """Return the kind of a file by its content, such as "a private key"; "" if unknown."""
+    """Return the kind of a file by its content, such as "a private key"; "" if it is unknown."""
     for mark, kind in _MARKS:
         if data.startswith(mark):
             return kind
@@ -228,7 +229,7 @@ def _kind_of_message(text: bytes) -> str:
 
 
 def _kind_of_der(data: bytes) -> str:
-    """Return the kind of a DER file, by its structure; "" if unknown."""
+    """Return the kind of a DER file by its structure; "" if it is unknown."""
     try:
         whole, _ = der.split(data)
         parts = der.children(der.first_value(der.normalized(whole)).content)

@@ -5,8 +5,8 @@ header ``Content-Type: text/plain``, SHA-256, and the embedded certificate of th
 (DDS-Security 1.1, 9.4.1.1; OpenSSL ``smime -sign -text``).  Opaque messages, which have the content
 inside the signature (``-nodetach``), are read as well, because every vendor accepts them.
 
-What OpenSSL rejects is never accepted: of MIME, only headers and boundaries that all programs read
-in the same way are read, and of CMS, only DER (tests/integration/forged_signatures.py).
+A message that OpenSSL rejects is never accepted.  So only MIME headers and boundaries that all
+programs read alike are read, and only CMS in DER (tests/integration/forged_signatures.py).
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ from sros_tool.pki.pem import ENCRYPTED_MESSAGE, SIGNED_MESSAGE, kind_of
 _BOM = "\ufeff".encode()
 _TEXT_HEADER = b"Content-Type: text/plain\r\n\r\n"
 
-# The grammar of the MIME headers that are read: what OpenSSL's reader (asn_mime.c) and RFC 2045
-# understand in the same way.  A longer line is read by OpenSSL as several lines.
+# Accepted MIME headers: those that OpenSSL's reader (asn_mime.c) and RFC 2045 understand alike.
+# OpenSSL splits a longer line into several lines.
 _FOLD = re.compile(rb";[ \t]{0,9}\n[ \t]{1,9}(?=\S)")
 _FIELD = re.compile(rb"([A-Za-z][A-Za-z-]*):[ \t]{0,9}([!-~](?:[ -~]{0,900}[!-~])?)")
 _PARAMETER = rb"""; {0,9}([\w-]+)=("[ !#-'*-\[\]-~]+"|[\w'+,./:=?-]+)"""
 _TYPE = re.compile(rb"([\w-]+/[\w-]+)((?:" + _PARAMETER + rb")*)")
 _PARAMETERS = re.compile(_PARAMETER)
-_BOUNDARY = re.compile(rb"[\w'+,./:=?-]{2,200}")  # OpenSSL reads no boundary of one character
+_BOUNDARY = re.compile(rb"[\w'+,./:=?-]{2,200}")  # OpenSSL ignores a boundary of one character
 _BASE64 = re.compile(
     rb"(?:(?:[A-Za-z0-9+/]{4}){1,19}\n)*"
     rb"(?:[A-Za-z0-9+/]{4}){0,18}[A-Za-z0-9+/]{2}(?:[A-Za-z0-9+/]{2}|[A-Za-z0-9+/]=|==)\n*"
@@ -65,7 +65,7 @@ _NULL = 0x05
 _ANY_VALUES = (
     der.SEQUENCE, der.OCTET_STRING, der.UTC_TIME, der.GENERALIZED_TIME, _NULL
 )  # fmt: skip
-"""Types of attributes and parameters that OpenSSL re-encodes without changing a byte."""
+"""Types of values in attributes and parameters that OpenSSL re-encodes without any change."""
 
 
 _DIGESTS: dict[bytes, hashes.HashAlgorithm] = {
@@ -78,7 +78,7 @@ _DIGESTS: dict[bytes, hashes.HashAlgorithm] = {
         (hashes.SHA3_256(), "2.16.840.1.101.3.4.2.8"),
         (hashes.SHA3_384(), "2.16.840.1.101.3.4.2.9"),
         (hashes.SHA3_512(), "2.16.840.1.101.3.4.2.10"),
-        # Read, never written: weak.
+        # This hash is read but never written, because it is weak.
         (hashes.SHA224(), "2.16.840.1.101.3.4.2.4"),
         (hashes.SHA512_224(), "2.16.840.1.101.3.4.2.5"),
         (hashes.SHA3_224(), "2.16.840.1.101.3.4.2.7"),
@@ -86,12 +86,15 @@ _DIGESTS: dict[bytes, hashes.HashAlgorithm] = {
         (hashes.MD5(), "1.2.840.113549.2.5"),  # noqa: S303
     )
 }
-"""Hashes of a signature.  Some releases of OpenSSL also take the names of signatures with RSA."""
+"""Maps an OID to the hash of a signature.
+
+Some releases of OpenSSL also use the OIDs of signatures with RSA in this place.
+"""
 
 
 def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> bytes:
-    """Return the S/MIME message of ``document``, signed with ``key`` of ``certificate``."""
-    import secrets  # reading does not need it, and is frequent
+    """Return ``document`` as an S/MIME message, signed with the ``key`` of ``certificate``."""
+    import secrets  # only signing needs this import, and most runs only read
 
     content = _TEXT_HEADER + document.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n")
     boundary = b"----" + secrets.token_hex(16).upper().encode()
@@ -114,8 +117,9 @@ def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> byt
 def _cms(content: bytes, certificate: x509.Certificate, key: PrivateKey) -> bytes:
     """Return a detached CMS signature of ``content`` in DER (RFC 5652, 5.1 and 5.3).
 
-    It has the form that `cryptography` gives it from release 42 on: earlier ones write capabilities
-    that are not as RFC 8551, 2.5.2, has them.  The attributes are in the order of a DER set.
+    The form is that of `cryptography` from release 42 on; earlier releases write the S/MIME
+    capabilities in a form that differs from RFC 8551, 2.5.2.  The attributes are in the order of a
+    DER set.
     """
     certificate_der, issuer_and_serial = _signer_parts(certificate)
     attributes = b"".join((
@@ -151,7 +155,7 @@ def _cms(content: bytes, certificate: x509.Certificate, key: PrivateKey) -> byte
 
 
 def _now() -> bytes:
-    """Return the current time as a UTCTime; no reader uses the time of signing."""
+    """Return the current time as a UTCTime, for the signing time, which no reader uses."""
     return time.strftime("%y%m%d%H%M%SZ", time.gmtime()).encode()
 
 
@@ -170,7 +174,7 @@ def _algorithm(dotted: str, *parameters: bytes) -> bytes:
 
 
 def _attribute(kind: bytes, value: bytes) -> bytes:
-    """Encode an attribute with one value; ``kind`` is the content of its identifier."""
+    """Encode an attribute with one value; ``kind`` is the content of the attribute's OID."""
     return der.encode(der.SEQUENCE, der.encode(der.OID, kind), der.encode(der.SET, value))
 
 
@@ -180,12 +184,12 @@ _RSA = _algorithm("1.2.840.113549.1.1.1", der.encode(_NULL))
 _TYPE_OF_DATA = _attribute(_CONTENT_TYPE, der.encode(der.OID, _DATA))
 _AES_CBC = [_algorithm(f"2.16.840.1.101.3.4.1.{number}") for number in (42, 22, 2)]
 _CAPABILITIES = _attribute(_SMIME_CAPABILITIES, der.encode(der.SEQUENCE, *_AES_CBC))
-"""AES with 256, 192 and 128 bits, in the mode CBC."""
+"""The S/MIME capabilities: AES-CBC with keys of 256, 192 and 128 bits."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Signature:
-    """A signature in a signed message; ``digest`` is its hash algorithm."""
+    """A signature in a signed message; ``digest`` is the hash algorithm."""
 
     digest: hashes.HashAlgorithm
     _signed_attributes: bytes
@@ -211,7 +215,7 @@ class Signature:
     def is_intact(self, content: bytes, signer: x509.Certificate) -> bool:
         """Return whether the signature of ``content`` verifies with the key of ``signer``.
 
-        It is verified once, however many vendors ask.
+        The result is cached, because every vendor asks for it.
         """
         known = self._verified.get((content, signer))
         if known is None:
@@ -221,9 +225,9 @@ class Signature:
     def _verify(self, content: bytes, signer: x509.Certificate) -> bool:
         """Return whether the signature verifies, without using the cache of `is_intact`.
 
-        The kind of the key decides how it is verified.  OpenSSL ignores the algorithm that the
-        message names, so it accepts RSA-PSS only from keys that are only for RSA-PSS, and never
-        Ed25519 (pk7_doit.c, PKCS7_signatureVerify).
+        As in OpenSSL, the kind of the key decides the algorithm; the algorithm that the message
+        names is ignored.  So RSA-PSS is accepted only from keys that are restricted to RSA-PSS, and
+        Ed25519 never (pk7_doit.c, PKCS7_signatureVerify).
         """
         if self._signed_attributes and not self.digest_matches(content):
             return False
@@ -242,11 +246,11 @@ class Signature:
 
 
 class SignedDocument(NamedTuple):
-    """A ``.p7s`` that was read; its content is not to be trusted before `verify`.
+    """A parsed ``.p7s`` file; do not trust the content before `verify`.
 
     ``content`` is the signed part, with CRLF line ends and the MIME header; ``document`` is the
-    same without the header.  ``certificates`` are the embedded certificates.  OpenSSL, and with it
-    every vendor, verifies all of its ``signatures``; mostly there is one.
+    same without the header.  ``certificates`` are the embedded certificates.  OpenSSL, and so every
+    vendor, verifies all ``signatures`` of a document, which usually has one.
     """
 
     content: bytes
@@ -256,12 +260,12 @@ class SignedDocument(NamedTuple):
 
     @property
     def text(self) -> bytes:
-        """The document with LF line ends, as it was before it was signed: S/MIME has CRLF."""
+        """The document with LF line ends, as before signing (S/MIME uses CRLF)."""
         return self.document.replace(b"\r\n", b"\n")
 
     @property
     def digest(self) -> str:
-        """The name of the weakest hash algorithm of its signatures."""
+        """The name of the weakest hash algorithm among the signatures."""
         return min((signature.digest for signature in self.signatures), key=_bits).name
 
     def signer(self) -> x509.Certificate | None:
@@ -269,14 +273,14 @@ class SignedDocument(NamedTuple):
         return self.signatures[0].signer_among(self.certificates)
 
     def verify(self, authority: x509.Certificate) -> None:
-        """Verify that ``authority`` signed this document, and that it is the only signer.
+        """Verify that ``authority`` signed this document, and that nobody else signed it.
 
-        Stricter than Cyclone DDS 0.10.2 and Fast DDS 2.9.1, which accept any signer with a chain to
-        the authority (the CVE-2023-24011 class; both tested).
+        Cyclone DDS 0.10.2 and Fast DDS 2.9.1 are less strict: they accept any signer with a chain
+        to the authority (the CVE-2023-24011 class; both tested).
 
         Raises:
-            PkiError: another certificate signed it, too, its signature does not match its content,
-                or it is signed with MD5.
+            PkiError: another certificate also signed the document, a signature does not match the
+                content, or a signature uses MD5.
         """
         for signature in self.signatures:
             signer = signature.signer_among(self.certificates)
@@ -302,7 +306,7 @@ class SignedDocument(NamedTuple):
         return problem
 
     def weakness(self) -> str:
-        """Return the weak hash of a signature as a clause, or ""."""
+        """Return the weak hash of a signature as a clause, or "" if no hash is weak."""
         weak = any(
             _bits(signature.digest) < _bits(hashes.SHA256()) for signature in self.signatures
         )
@@ -314,7 +318,7 @@ class SignedDocument(NamedTuple):
 
 
 def _wrong_signer_clause(signer: x509.Certificate | None, authority: x509.Certificate) -> str:
-    """Return a clause on the wrong signer; ``signer`` is None if it is not embedded."""
+    """Return a clause about the wrong signer; None stands for a signer without a certificate."""
     name = authority.subject.rfc4514_string()
     if signer is None:
         return f"not by the permissions CA {name}, but by a signer whose certificate it lacks"
@@ -343,7 +347,7 @@ _Read = TypeVar("_Read")
 
 
 def _cached(read: Callable[[_Part], _Read]) -> Callable[[_Part], _Read]:
-    """Cache the parser's results for short parts, which are equal in all of a keystore's files."""
+    """Cache a parser's results for short parts, which many files of a keystore share."""
     remembered = lru_cache(maxsize=64)(read)
 
     def read_or_remember(part: _Part) -> _Read:
@@ -360,7 +364,7 @@ def parse(message: bytes) -> SignedDocument:
 
 
 def parse_new(message: bytes) -> SignedDocument:
-    """Return a message that was just signed, read as by `parse` but without its cache."""
+    """Return a message that was just signed, parsed as by `parse` but without the cache."""
     content, signature = _split(message)
     try:
         return _parse_cms(signature, content)
@@ -386,10 +390,10 @@ def _document(content: bytes) -> bytes:
 
 @_cached
 def _media_type(header: bytes) -> tuple[bytes, Mapping[bytes, bytes]]:
-    """Return the type in a MIME header, in lower case, and its parameters.
+    """Return the type in a MIME header, in lower case, and the parameters.
 
-    Return an empty type if the header has none or several, or if any of its lines has a form that
-    programs read in different ways.
+    The type is empty if the header has no type or several types, or if programs read one of the
+    lines in different ways.
     """
     fields = [_FIELD.fullmatch(line) for line in _FOLD.sub(b"; ", header).split(b"\n")]
     named = [field[2] for field in fields if field and field[1].lower() == b"content-type"]
@@ -404,7 +408,7 @@ def _media_type(header: bytes) -> tuple[bytes, Mapping[bytes, bytes]]:
 def _split(message: bytes) -> tuple[bytes | None, bytes]:
     """Return the signed part, with CRLF line ends, and the signature in DER.
 
-    The signed part is None for an opaque message, which has it inside the signature.
+    The signed part is None for an opaque message, where it is inside the signature.
     """
     text = message.replace(b"\r\n", b"\n")
     if b"\r" in text or b"\0" in text:
@@ -416,7 +420,8 @@ def _split(message: bytes) -> tuple[bytes | None, bytes]:
         )
     head, _, body = text.partition(b"\n\n")
     if head.startswith(_BOM) and not head[len(_BOM) :].lower().startswith(b"content-type"):
-        head = head[len(_BOM) :]  # OpenSSL reads it as a part of the first header's name
+        # OpenSSL reads the byte order mark as part of the first header's name.
+        head = head[len(_BOM) :]
     kind, parameters = _media_type(head)
     if kind in _OPAQUE:
         return None, _decoded(body)
@@ -427,7 +432,8 @@ def _split(message: bytes) -> tuple[bytes | None, bytes]:
             "A signed document begins with MIME headers of the type multipart/signed; "
             f"this is {kind_of(message) or 'something else'}.",
         )
-    # Also inside of lines: OpenSSL reads a long line in pieces, each of which may begin a part.
+    # Boundaries inside a line split, too: OpenSSL reads a long line in pieces, and each piece may
+    # begin a part.
     parts = (b"\n" + body + b"\n").split(b"--" + boundary)
     if len(parts) != _PARTS or not (
         parts[0].endswith(b"\n")
@@ -447,7 +453,7 @@ def _decoded(encoded: bytes) -> bytes:
     return base64.b64decode(encoded.replace(b"\n", b""), validate=True)
 
 
-# All documents of a keystore embed the certificate of the permissions CA.
+# Cached, because all documents of a keystore embed the certificate of the permissions CA.
 _certificate = lru_cache(maxsize=16)(load_der_certificate)
 
 
@@ -457,7 +463,7 @@ def _public_key(certificate: x509.Certificate) -> object:
 
 
 def _parts(value: der.Value, *tags: int) -> list[der.Value]:
-    """Return the values in a constructed value; raise `ValueError` unless they have ``tags``."""
+    """Return the values in a constructed value; raise `ValueError` if their tags differ."""
     parts = der.children(value.content)
     if tuple(part.tag for part in parts) != tags:
         raise ValueError("not the structure of a CMS signature")
@@ -465,13 +471,16 @@ def _parts(value: der.Value, *tags: int) -> list[der.Value]:
 
 
 def _optional(values: list[der.Value], place: int, tag: int) -> list[der.Value]:
-    """Pop ``values[place]`` if it has the tag; return a list with it, else an empty list."""
+    """Remove ``values[place]`` if it has the tag, and return it in a list; else return []."""
     return [values.pop(place)] if len(values) > place and values[place].tag == tag else []
 
 
 @_cached
 def _digest_of(identifier: der.Value) -> hashes.HashAlgorithm | None:
-    """Return the hash of an AlgorithmIdentifier, whose parameters OpenSSL ignores."""
+    """Return the hash that an AlgorithmIdentifier names.
+
+    As in OpenSSL, the parameters of the algorithm are ignored.
+    """
     oid, *parameters = der.children(identifier.content)
     if (identifier.tag, oid.tag) != (der.SEQUENCE, der.OID) or len(parameters) > 1:
         raise ValueError("not an algorithm")
@@ -482,8 +491,9 @@ def _digest_of(identifier: der.Value) -> hashes.HashAlgorithm | None:
 def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
     """Parse a ContentInfo with SignedData (RFC 2315, 7 and 9; RFC 5652, 3, 5.1 and 5.3).
 
-    Only DER is read, because OpenSSL and sros might read other encodings differently.  Versions do
-    not count, as for OpenSSL.  Without ``content``, the signed part is taken from the SignedData.
+    Only DER is read, because OpenSSL and sros might read other encodings differently.  Version
+    numbers are ignored, as by OpenSSL.  Without ``content``, the signed part is taken from the
+    SignedData.
     """
     (message,) = der.children(signature)
     content_type, wrapped = _parts(message, der.OID, der.CONTEXT_0)
@@ -506,7 +516,7 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
     if content is None:
         (content,) = inside
     for unused in (value for crl_set in lists for value in der.split_all(crl_set.content)):
-        tolerant.check_list(unused)  # OpenSSL reads it, and does not use it
+        tolerant.check_list(unused)  # OpenSSL reads the list, but does not use it
     embedded = [
         value
         for certificate_set in certificate_sets
@@ -569,7 +579,7 @@ def _issuer_and_serial(identifier: der.Value) -> tuple[tuple[bytes, ...], int]:
 
 
 def _check_values(*values: der.Value) -> None:
-    """Raise `ValueError` if OpenSSL might read one of the values differently, or refuse it."""
+    """Raise `ValueError` if OpenSSL might refuse one of the values, or read it differently."""
     for value in values:
         if value.tag == der.OID:
             der.decode_oid(value)  # raises an error if OpenSSL refuses it
@@ -578,7 +588,7 @@ def _check_values(*values: der.Value) -> None:
 
 
 def _attributes(attributes: bytes) -> dict[bytes, der.Value]:
-    """Map attribute types to first values, after checking their form (RFC 5652, 11)."""
+    """Map the types of attributes to first values, and check the form of all (RFC 5652, 11)."""
     by_kind: dict[bytes, der.Value] = {}
     for attribute in der.children(attributes):
         name, values = _parts(attribute, der.OID, der.SET)

@@ -1,4 +1,4 @@
-"""Keys on PKCS#11 tokens, which are named by a URI; the token signs, and keys never leave it."""
+"""Private keys on PKCS#11 tokens, named by URIs; the token signs, and keys never leave it."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from sros_tool.owners import file_of_root
 from sros_tool.xml import read_bytes
 
 MODULE_VARIABLE = "PKCS11_MODULE_PATH"
-"""The variable that names the PKCS#11 module, for sros and for the engine of libp11."""
+"""The environment variable that names the PKCS#11 module, for sros and for the engine of libp11."""
 Secrets = Callable[[str], str]
-"""Function that returns a secret, such as a PIN, for a prompt such as "the PIN of the token X"."""
+"""A function that returns a secret for a prompt, such as "the PIN of the token X"."""
 
 
 def _module_of(parsed: TokenUri, *, named: bool) -> str:
     """Return the path of the PKCS#11 library to load; ``named``: the user gave the URI.
 
-    If somebody else named the library, for instance in the settings of a received keystore, it is
-    loaded only if it belongs to root, because loading runs its code.
+    If the URI comes from elsewhere, for instance from the settings of a received keystore, the
+    library is loaded only if root owns the file, because loading a library runs its code.
 
     Raises:
-        UsageError: no library is named, or it must not be loaded.
+        UsageError: no library is named, or the library must not be loaded.
     """
     chosen_module = os.environ.get(MODULE_VARIABLE, "")
     path = Path(parsed.module)
@@ -62,9 +62,10 @@ def _module_of(parsed: TokenUri, *, named: bool) -> str:
 
 
 def _proxy() -> str:
-    """Return the path of the library of p11-kit, which loads all registered ones; "" if missing.
+    """Return the path of p11-kit's proxy, a library that loads all registered ones; "" if missing.
 
-    libp11 also loads it if no other library is named (Debian and Ubuntu, libengine-pkcs11-openssl).
+    libp11, too, loads the proxy if no other library is named (Debian and Ubuntu,
+    libengine-pkcs11-openssl).
     """
     paths = sorted(path for folder in _PROXIES for path in Path("/").glob(folder))
     return next((str(real) for path in paths if (real := file_of_root(path))), "")
@@ -76,8 +77,9 @@ _PROXIES = ("usr/lib/*/p11-kit-proxy.so", "usr/lib64/p11-kit-proxy.so", "usr/lib
 class TokenKey(ec.EllipticCurvePrivateKey):
     """A private key on a token, of the curve prime256v1.
 
-    `cryptography` signs certificates, documents and revocation lists with it as with other keys.
-    ``place`` names the key.  If the key is only planned, ``private`` is None and it cannot sign.
+    `cryptography` signs certificates, documents and revocation lists with this key as with any
+    other.  ``place`` names the key.  ``private`` is None for a key that is only planned, which
+    cannot sign.
     """
 
     def __init__(self, private: Any, public: ec.EllipticCurvePublicKey, place: TokenUri) -> None:
@@ -94,7 +96,7 @@ class TokenKey(ec.EllipticCurvePrivateKey):
     def never_left(self) -> bool:
         """Whether the token says that the key was made on the token and cannot be exported."""
         if self._private is None:
-            return True  # one that is only planned, perhaps without the package for tokens
+            return True  # a planned key, perhaps without the package for tokens
         from pkcs11 import Attribute, PKCS11Error
 
         try:
@@ -120,7 +122,7 @@ class TokenKey(ec.EllipticCurvePrivateKey):
         return self._public.key_size
 
     def sign(self, data: Any, signature_algorithm: ec.EllipticCurveSignatureAlgorithm) -> bytes:
-        """Return a DER signature by the token (CKM_ECDSA over a digest computed here)."""
+        """Return a DER signature made by the token (CKM_ECDSA); the digest is computed here."""
         import pkcs11
 
         if self._private is None:
@@ -134,7 +136,8 @@ class TokenKey(ec.EllipticCurvePrivateKey):
             digest = hasher.finalize()
         try:
             raw = self._private.sign(digest, mechanism=pkcs11.Mechanism.ECDSA)
-        except (pkcs11.PKCS11Error, RuntimeError, OSError) as error:  # it was taken out
+        # Such as after the token was removed.
+        except (pkcs11.PKCS11Error, RuntimeError, OSError) as error:
             raise _unusable_token_error(self.place, error) from error
         half = len(raw) // 2
         return encode_dss_signature(
@@ -142,7 +145,7 @@ class TokenKey(ec.EllipticCurvePrivateKey):
         )
 
     def signs_for(self, public: object) -> bool:
-        """Return whether a signature by the token verifies with ``public``, a certificate's key."""
+        """Return whether ``public``, a certificate's key, verifies what the token signs."""
         if not isinstance(public, ec.EllipticCurvePublicKey):
             return False
         message, algorithm = random.token_bytes(32), ec.ECDSA(hashes.SHA256())
@@ -177,9 +180,9 @@ def holds_token_key(uri: str, secrets: Secrets, *, named: bool) -> bool:
     Args:
         uri: the URI of the key.
         secrets: returns the PIN.
-        named: whether the user of this process gave the URI, who may name any library; otherwise,
-            such as for a URI in a keystore's settings, the library is only loaded if it belongs to
-            root.
+        named: whether the user of this process gave the URI, and so chose the library.  The library
+            of any other URI, such as in a keystore's settings, is loaded only if root owns the
+            file.
 
     Raises:
         UsageError: the URI is not valid, or its library must not be loaded.
@@ -216,7 +219,7 @@ def create_token_key(uri: str, secrets: Secrets, *, named: bool) -> TokenKey:
 
 
 def make_enclave_key(place: TokenUri, secrets: Secrets) -> TokenKey:
-    """Return the key that the user named; generate the key if the token does not have it.
+    """Return the key that the user named; generate the key if it is not on the token.
 
     Raises:
         UsageError: no library is named.
@@ -237,7 +240,7 @@ def open_enclave_key(place: TokenUri, secrets: Secrets) -> TokenKey:
 
 
 def planned_key(place: TokenUri) -> TokenKey:
-    """Return a stand-in for a key that a dry run would create; no token is opened."""
+    """Return a placeholder for a key that a dry run would create; no token is opened."""
     return TokenKey(None, ec.generate_private_key(ec.SECP256R1()).public_key(), place)
 
 
@@ -298,7 +301,8 @@ def _unusable_token_error(parsed: TokenUri, error: Exception) -> PkiError:
     )
 
 
-# One login per token and process: (module, token) to the session, and whether it can write.
+# Maps (module, token) to the session and whether the session can write: one login per token and
+# process.
 _sessions: dict[tuple[str, str], tuple[Any, bool]] = {}
 
 
@@ -334,7 +338,7 @@ def _create(session: Any, parsed: TokenUri) -> None:
         local=True,
     )
     parameters.generate_keypair(
-        id=random.token_bytes(16),  # libp11 finds the public key by it
+        id=random.token_bytes(16),  # libp11 finds the public key by this id
         label=parsed.object,
         store=True,
         private_template={
@@ -355,7 +359,7 @@ def _pin(parsed: TokenUri, secrets: Secrets) -> str:
 
 
 _SCHEME = "pkcs11:"
-# RFC 7512, 2.3.  ``pin-value`` is missing on purpose, see `refuse_pin`.
+# RFC 7512, 2.3.  ``pin-value`` is left out on purpose, see `refuse_pin`.
 _PATH_ATTRIBUTES = frozenset(
     {"id", "library-description", "library-manufacturer", "library-version", "manufacturer"}
     | {"model", "object", "serial", "slot-description", "slot-id", "slot-manufacturer"}
@@ -365,14 +369,15 @@ _QUERY_ATTRIBUTES = frozenset({"module-name", "module-path", "pin-source"})
 _OF_ENCLAVE = (frozenset({"token", "object", "type"}), frozenset({"module-path", "pin-source"}))
 _OF_FILE = (_OF_ENCLAVE[0], frozenset({"pin-source"}))
 _MOST_BYTES = 2000
-_LONGEST_TOKEN, _LONGEST_OBJECT = 32, 128  # bytes; CK_TOKEN_INFO of PKCS#11, and enough
+# In bytes: the limit of CK_TOKEN_INFO in PKCS#11, and a limit that leaves enough room.
+_LONGEST_TOKEN, _LONGEST_OBJECT = 32, 128
 
 
 class TokenUri(NamedTuple):
     """The parts of a ``pkcs11:`` URI that sros uses.
 
-    ``object`` is the label of the key, ``module`` the path of the PKCS#11 library, or "", and
-    ``pin_source`` the path of a file with the PIN, or "".
+    ``object`` is the label of the key.  ``module`` is the path of the PKCS#11 library, or "".
+    ``pin_source`` is the path of a file with the PIN, or "".
     """
 
     token: str
@@ -382,7 +387,7 @@ class TokenUri(NamedTuple):
 
 
 def is_token_uri(place: str) -> bool:
-    """Return whether the place of a key is a ``pkcs11:`` URI, in letters of any case (RFC 3986)."""
+    """Return whether ``place`` is a ``pkcs11:`` URI, in upper or lower case (RFC 3986)."""
     return place[: len(_SCHEME)].lower() == _SCHEME
 
 
@@ -432,7 +437,7 @@ def parse_token_uri(uri: str) -> TokenUri:
 def parse_enclave_uri(uri: str, name: str) -> TokenUri:
     """Parse the URI of an enclave's key; ``object`` defaults to the enclave's name, ``name``.
 
-    Only what sros uses and Fast DDS reads is accepted, so that both find the same key.
+    Only attributes that both sros and Fast DDS read are accepted, so that both find the same key.
 
     Raises:
         UsageError: the URI is not valid, or has another attribute.
@@ -461,8 +466,8 @@ def parse_enclave_uri(uri: str, name: str) -> TokenUri:
 def token_file(parsed: TokenUri) -> bytes:
     """Return the content of a ``key.p11``: one line, which Fast DDS gives to OpenSSL.
 
-    The module is not in it: libp11 0.4.12 refuses the attribute, and takes the module from
-    ``PKCS11_MODULE_PATH`` (libp11, eng_parse.c and eng_back.c).
+    The line does not name the module: libp11 0.4.12 refuses this attribute, and takes the module
+    from ``PKCS11_MODULE_PATH`` (libp11, eng_parse.c and eng_back.c).
     """
     uri = f"{_SCHEME}token={_encoded(parsed.token)};object={_encoded(parsed.object)};type=private"
     if parsed.pin_source:
@@ -471,9 +476,9 @@ def token_file(parsed: TokenUri) -> bytes:
 
 
 def read_token_file(data: bytes) -> TokenUri:
-    """Return the key that a ``key.p11`` names; errors do not show the content (PIN).
+    """Return the URI in a ``key.p11``; errors do not quote the content, which may contain a PIN.
 
-    The RMWs read its first word, so nothing may follow.
+    RMWs read only the first word of the file, so nothing may follow the URI.
 
     Raises:
         PkiError: the file is not one PKCS#11 URI that sros and Fast DDS read alike.
@@ -501,7 +506,7 @@ def _encoded(text: str) -> str:
 
 
 def _attributes(parts: Sequence[str], known: Set[str]) -> dict[str, str]:
-    """Decode the attributes of a part of a URI; errors do not show values, which may be secret."""
+    """Decode the attributes of a part of a URI; errors do not quote values, which may be secret."""
     attributes: dict[str, str] = {}
     for part in filter(None, parts):
         name, _, value = part.partition("=")
@@ -518,11 +523,11 @@ def _attributes(parts: Sequence[str], known: Set[str]) -> dict[str, str]:
 
 # ── the file with a PIN ────────────────────────────────────────────────────────────────────
 
-_LONGEST_PIN = 256  # bytes; CK_TOKEN_INFO of PKCS#11 says which lengths a token takes
+_LONGEST_PIN = 256  # in bytes; CK_TOKEN_INFO of PKCS#11 says which lengths a token accepts
 
 
 def pin_file_problem(place: TokenUri) -> str:
-    """Return why the file with the PIN of a token cannot be used, as a clause; "" if it can."""
+    """Return a clause that says why the PIN file of a token cannot be used; "" if it can."""
     if not place.pin_source:
         return ""
     path = Path(place.pin_source)
@@ -540,7 +545,7 @@ def pin_file_problem(place: TokenUri) -> str:
 
 
 def pin_line_break(place: TokenUri) -> str:
-    """Return a clause on the effect of a line break after the PIN; "" if there is no line break."""
+    """Return a clause about the effect of a line break after the PIN; "" if there is none."""
     try:
         pin = read_bytes(Path(place.pin_source), "file with the PIN", max_bytes=_LONGEST_PIN)
     except DocumentError:

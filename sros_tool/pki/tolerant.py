@@ -1,10 +1,10 @@
-"""Read certificates and revocation lists that OpenSSL 3.0 reads, and `cryptography` does not.
+"""Readers of certificates and revocation lists that OpenSSL 3.0 reads, but `cryptography` does not.
 
-OpenSSL reads BER, invalid versions, unknown keys and signatures, and odd strings and dates; it
-checks most of them only when it verifies a chain.  It decodes an extension by its ASN.1 template
+OpenSSL reads BER, invalid versions, unknown keys and signatures, and odd strings and dates; most of
+these are checked only when a chain is verified.  OpenSSL decodes an extension by its ASN.1 template
 alone (X509V3_EXT_d2i): BER is accepted, trailing data is ignored, and contradicting values are no
-error.  The classes of `cryptography` cannot be subclassed, so the classes here have those of their
-members that sros uses.
+error.  The classes of `cryptography` cannot be subclassed, so the classes here have the same
+members, as far as sros uses them.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class _Part(NamedTuple):
 
 
 class TolerantName:
-    """A distinguished name with values that its string types do not allow."""
+    """A distinguished name with values that their declared string types do not allow."""
 
     def __init__(self, data: bytes) -> None:
         read_name_der(data)
@@ -70,7 +70,7 @@ class TolerantName:
 
     @property
     def rdns(self) -> list[list[_Part]]:
-        """The parts of the name (RDNs), a list of attributes each."""
+        """The parts of the name (RDNs), each as a list of attributes."""
         rdns = []
         for rdn in der.children(der.first_value(self._data).content):
             pairs = [der.children(attribute.content) for attribute in der.children(rdn.content)]
@@ -86,7 +86,7 @@ class TolerantName:
         return rdns
 
     def get_attributes_for_oid(self, oid: ObjectIdentifier) -> list[_Part]:
-        """Return the attributes of a kind."""
+        """Return the attributes of a type."""
         return [part for rdn in self.rdns for part in rdn if part.oid == oid]
 
     def rfc4514_string(self) -> str:
@@ -104,7 +104,7 @@ class TolerantName:
 
 
 class _Signed:
-    """A signed DER value of a CA: the signed part, the algorithm and the signature."""
+    """The common parts of certificates and revocation lists: signed part, algorithm, signature."""
 
     _LABEL = b""
 
@@ -142,7 +142,7 @@ class _Signed:
         return b"\n".join([b"-----BEGIN %b-----" % label, *lines, b"-----END %b-----\n" % label])
 
     def fingerprint(self, algorithm: hashes.HashAlgorithm) -> bytes:
-        """Return the hash of the original DER bytes."""
+        """Return the hash of the original bytes in DER."""
         digest = hashes.Hash(algorithm)
         digest.update(self._data)
         return digest.finalize()
@@ -162,7 +162,7 @@ class _Signed:
 
 
 class _TolerantCertificate(_Signed):
-    """A certificate; see `cryptography.x509.Certificate` for the members."""
+    """A certificate; its members are those of `cryptography.x509.Certificate`."""
 
     _LABEL = b"CERTIFICATE"
 
@@ -198,7 +198,7 @@ class _TolerantCertificate(_Signed):
 
     @property
     def tbs_certificate_bytes(self) -> bytes:
-        """The signed part, as it was read."""
+        """The signed part, in its original bytes."""
         return self._signed_bytes()
 
     def public_key(self) -> object:
@@ -207,7 +207,7 @@ class _TolerantCertificate(_Signed):
 
 
 class _TolerantEntry(NamedTuple):
-    """An entry of a list; see `cryptography.x509.RevokedCertificate` for the members."""
+    """An entry of a list; its members are those of `cryptography.x509.RevokedCertificate`."""
 
     serial_number: int
     revocation_date_utc: datetime
@@ -215,7 +215,7 @@ class _TolerantEntry(NamedTuple):
 
 
 class _TolerantList(_Signed):
-    """A revocation list; see `cryptography.x509.CertificateRevocationList` for the members."""
+    """A revocation list; its members are those of `cryptography.x509.CertificateRevocationList`."""
 
     _LABEL = b"X509 CRL"
 
@@ -245,7 +245,7 @@ class _TolerantList(_Signed):
 
     @property
     def tbs_certlist_bytes(self) -> bytes:
-        """The signed part, as it was read."""
+        """The signed part, in its original bytes."""
         return self._signed_bytes()
 
     def __iter__(self) -> Iterator[_TolerantEntry]:
@@ -263,7 +263,7 @@ def read_certificate(data: bytes) -> x509.Certificate:
     """Return a certificate, given in BER, that `cryptography` refuses to read.
 
     Raises:
-        PkiError, ValueError: OpenSSL does not read it either.
+        PkiError, ValueError: OpenSSL refuses the certificate, too.
     """
     return cast(x509.Certificate, _TolerantCertificate(data))
 
@@ -272,7 +272,7 @@ def read_list(data: bytes) -> x509.CertificateRevocationList:
     """Return a revocation list, given in BER, that `cryptography` refuses to read.
 
     Raises:
-        PkiError, ValueError: OpenSSL does not read it either.
+        PkiError, ValueError: OpenSSL refuses the list, too.
     """
     return cast(x509.CertificateRevocationList, _TolerantList(data))
 
@@ -281,7 +281,7 @@ def check_list(data: bytes) -> None:
     """Check that OpenSSL can read a revocation list.
 
     Raises:
-        PkiError, ValueError: OpenSSL does not read it.
+        PkiError, ValueError: OpenSSL refuses the list.
     """
     value, _ = der.split(data)
     try:
@@ -291,7 +291,7 @@ def check_list(data: bytes) -> None:
 
 
 def is_tolerated(certificate: x509.Certificate) -> bool:
-    """Return whether a certificate was read by this module, because `cryptography` refuses it."""
+    """Return whether this module read the certificate, because `cryptography` refused it."""
     return isinstance(certificate, _TolerantCertificate)
 
 
@@ -317,7 +317,7 @@ def version_of(certificate: x509.Certificate) -> int:
 
 
 def unread_date(certificate: x509.Certificate) -> str:
-    """Return the name of a date of a certificate that OpenSSL cannot compare, or ""."""
+    """Return which date of a certificate OpenSSL cannot compare (attribute name), or ""."""
     tolerated = certificate if isinstance(certificate, _TolerantCertificate) else None
     return next(iter(tolerated.unread_dates), "") if tolerated else ""
 
@@ -325,9 +325,9 @@ def unread_date(certificate: x509.Certificate) -> str:
 def date(
     of: x509.Certificate | x509.CertificateRevocationList | x509.RevokedCertificate, name: str
 ) -> Any:
-    """Return the date in the attribute ``name``, in UTC; None if a revocation list lacks it.
+    """Return the date in the attribute ``name``, in UTC; None for a date that a list lacks.
 
-    `cryptography` 41 has the dates without a time zone.
+    `cryptography` 41 has only attributes for dates without a time zone.
     """
     try:
         return getattr(of, f"{name}_utc")
@@ -340,7 +340,7 @@ def _name(data: bytes) -> x509.Name:
     """Return a distinguished name, given in DER, even with values that its types do not allow.
 
     Raises:
-        PkiError, ValueError: OpenSSL does not read it either.
+        PkiError, ValueError: OpenSSL refuses the name, too.
     """
     with suppress(ValueError):
         name = _certificate_with(subject=data).subject
@@ -353,8 +353,8 @@ def _name(data: bytes) -> x509.Name:
 def _entries(values: list[der.Value]) -> Iterator[_TolerantEntry]:
     """Yield the entries of a revocation list.
 
-    Extensions of an entry are decoded up to the first damaged one, as in OpenSSL (x_crl.c,
-    crl_set_issuers).
+    As in OpenSSL (x_crl.c, crl_set_issuers), the extensions of an entry are decoded up to the first
+    damaged extension.
     """
     damaged = False
     for value in values:
@@ -379,7 +379,7 @@ def _sequence(value: der.Value) -> list[der.Value]:
 
 
 def _algorithm(value: der.Value) -> ObjectIdentifier:
-    """Return the identifier of an algorithm; its parameters may be anything that is one value."""
+    """Return the OID of an algorithm; the parameters may be any single value."""
     identifier, *parameters = _sequence(value)
     if len(parameters) > 1:
         raise ValueError("not an algorithm")
@@ -395,7 +395,7 @@ def _check_bits(value: der.Value) -> None:
 
 
 def _only(value: der.Value) -> der.Value:
-    """Return the only value inside a value with an explicit tag."""
+    """Return the single value inside an explicitly tagged value."""
     (inner,) = der.children(value.content)
     return inner
 
@@ -408,7 +408,7 @@ def _public_key(data: bytes) -> object:
 
 
 def _date(value: der.Value) -> datetime | None:
-    """Parse a date in UTC; None for a form of date that OpenSSL cannot compare."""
+    """Parse a date in UTC; None for a date in a form that OpenSSL cannot compare."""
     digits, form = _DIGITS.get(value.tag), _TIMES.get(value.tag)
     if digits is None or form is None:
         raise ValueError("not a date")
@@ -416,7 +416,7 @@ def _date(value: der.Value) -> datetime | None:
     if not (len(text) == digits + 1 and text[:digits].isdigit() and text[digits:] == b"Z"):
         return None
     if text[:4] == b"0000" and value.tag == der.GENERALIZED_TIME:
-        text = b"0001" + text[4:]  # the first year that Python has
+        text = b"0001" + text[4:]  # Python's first year is 1
     with suppress(ValueError):
         if value.tag == der.UTC_TIME:
             century = b"19" if int(text[:2]) >= _FIRST_YEAR % 100 else b"20"
@@ -430,7 +430,7 @@ def _date(value: der.Value) -> datetime | None:
 
 _ENUMERATED = 0x0A
 _GENERAL_NAMES = (0xA0, 0x81, 0x82, 0xA3, 0xA4, 0xA5, 0x86, 0x87, 0x88)
-"""The tags of the kinds of a GeneralName (RFC 5280, 4.2.1.6)."""
+"""The tags of the alternatives of a GeneralName (RFC 5280, 4.2.1.6)."""
 _USER, _CA, _INDIRECT, _ATTRIBUTES = 0x81, 0x82, 0x84, 0x85
 """The tags of the flags of an issuingDistributionPoint (RFC 5280, 5.2.5)."""
 _DECODED = frozenset(
@@ -462,7 +462,10 @@ class _LooseConstraints(x509.BasicConstraints):
 
 
 class _LooseKeyIdentifier(x509.AuthorityKeyIdentifier):
-    """An authorityKeyIdentifier that may name an issuer without a serial number, or the reverse."""
+    """An authorityKeyIdentifier that has an issuer or a serial number, but not both.
+
+    `cryptography` demands both or neither.
+    """
 
     def __init__(
         self, key: bytes | None, issuer: list[x509.GeneralName] | None, serial: int | None
@@ -472,12 +475,12 @@ class _LooseKeyIdentifier(x509.AuthorityKeyIdentifier):
 
     @property
     def authority_cert_issuer(self) -> list[x509.GeneralName] | None:
-        """The names of the CA that issued the certificate of the authority."""
+        """The names of the CA that issued the authority's own certificate."""
         return self._issuer_names
 
     @property
     def authority_cert_serial_number(self) -> int | None:
-        """The serial number of the certificate of the authority."""
+        """The serial number of the authority's own certificate."""
         return self._serial
 
 
@@ -488,7 +491,7 @@ class UnreadableName(x509.GeneralName):
 
 
 class ContradictoryPoint(x509.ExtensionType):
-    """An issuingDistributionPoint that is only for certificates of two kinds at once."""
+    """An issuingDistributionPoint that is limited to two kinds of certificates at once."""
 
     oid = ExtensionOID.ISSUING_DISTRIBUTION_POINT
 
@@ -505,13 +508,17 @@ _Loose = Callable[[bytes], x509.ExtensionType | None]
 def _read(
     parts: Iterable[der.Value], strict: _Strict, loose: Mapping[ObjectIdentifier, _Loose]
 ) -> x509.Extensions:
-    """Parse extensions in DER; raise `PkiError` if one of ``parts`` is not an extension."""
+    """Parse extensions in DER.
+
+    Raises:
+        PkiError: one of ``parts`` is not an extension.
+    """
     known = [_parts(part) for part in parts]
     count = [oid for oid, _, _ in known]
     extensions = []
     for oid, critical, content in known:
         value: x509.ExtensionType | None = x509.UnrecognizedExtension(oid, content)
-        if count.count(oid) == 1:  # one that is there twice is decoded by nobody
+        if count.count(oid) == 1:  # OpenSSL decodes no extension that occurs twice
             value = _value(oid, content, strict, loose)
         if value is not None:
             extensions.append(x509.Extension(oid, critical, value))
@@ -539,7 +546,11 @@ def _value(
     strict: _Strict,
     loose: Mapping[ObjectIdentifier, _Loose],
 ) -> x509.ExtensionType | None:
-    """Return the value of an extension; None if its value is empty and it can be left out."""
+    """Return the value of an extension, decoded strictly or else by a looser reader.
+
+    The result is None for an empty value that can be ignored, and an UnrecognizedExtension for a
+    value that neither reader can decode.
+    """
     ways: list[Callable[[bytes], x509.ExtensionType | None]] = [
         lambda data: strict(_encoded(oid, data))[0].value
     ]
@@ -570,10 +581,12 @@ _ONE = der.encode_integer(1)
 def _certificate_with(
     *, algorithm: bytes = _ED25519, subject: bytes = _NOBODY, extension: bytes = b""
 ) -> x509.Certificate:
-    """Return a minimal certificate with these DER parts, so that `cryptography` parses them.
+    """Return a minimal certificate with the given parts (DER).
+
+    `cryptography` parses a name, an algorithm or an extension only inside of a certificate.
 
     Raises:
-        ValueError: `cryptography` does not read a part.
+        ValueError: `cryptography` cannot read a part.
     """
     extensions = der.encode(0xA3, der.encode(der.SEQUENCE, extension)) if extension else b""
     signed = der.encode(
@@ -628,11 +641,11 @@ def _key_usage(content: bytes) -> x509.KeyUsage:
     if value.tag != der.BIT_STRING or not value.content or value.content[0] > 7:
         raise ValueError("not a BIT STRING")
     bits = "".join(f"{octet:08b}" for octet in value.content[1:])
-    if value.content[0] and bits:  # OpenSSL clears the bits that do not count
+    if value.content[0] and bits:  # OpenSSL clears the unused bits of the last byte
         bits = bits[: -value.content[0]]
     flags = [bit == "1" for bit in bits[: len(_USAGES)].ljust(len(_USAGES), "0")]
     usage = dict(zip(_USAGES, flags, strict=True))
-    # These say how keys are agreed upon, and the class has them only next to that.
+    # `x509.KeyUsage` accepts these two flags only together with key_agreement.
     usage["key_agreement"] |= usage["encipher_only"] or usage["decipher_only"]
     return x509.KeyUsage(**usage)
 
