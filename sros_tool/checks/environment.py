@@ -282,7 +282,7 @@ def _enclave_findings(
     if governed and domain is not None and domain not in governed:
         text = f"the governance of '{root}' is for domain {governed}, not for {domain}"
         yield DOMAIN_NOT_GOVERNED.found(DOMAIN, text)
-        domain = None  # so that it is not reported again for the enclave
+        domain = None  # reported here, so not again for the enclave
     for role in (IDENTITY, PERMISSIONS):
         if (root / ca_key(role)).exists():
             yield CA_KEY_HERE.found(KEYSTORE, f"'{root / ca_key(role)}' exists")
@@ -321,7 +321,7 @@ def _governed_domains(keystore: OpenedKeystore) -> DomainSet | None:
         message = keystore.read(GOVERNANCE_P7S, "governance document")
         signed = keystore.files.signed(message)
         return parse_governance(signed.document).domains().closed()
-    except SrosError:  # reported for the enclave, which has its own copy in an export
+    except SrosError:  # reported for each enclave, which has a copy of the file in an export
         return None
 
 

@@ -109,8 +109,8 @@ def _merge_robots(
 
 
 _MOST_ROBOTS = 10
-_FEWEST_ENCLAVES = 2  # more enclaves with the same finding; fewer are shown one by one
-_MOST_SIMILAR = 5  # findings that differ in further robots; more become one
+_FEWEST_ENCLAVES = 2  # only more enclaves than this are merged into one finding
+_MOST_SIMILAR = 5  # more findings that differ in another robot become one
 
 
 def _kinds(group: tuple[Finding, ...], fleet: Fleet) -> _Kinds:
@@ -325,7 +325,7 @@ def keystore_metrics(
     Raises:
         KeystoreError: the path is not a keystore, or some enclaves cannot be listed.
     """
-    # A check without metrics does not load what only they need.
+    # Imported here, because only metrics need these modules.
     from sros_tool.keystore.expiry import survey
     from sros_tool.prometheus import Metric, Sample
 
@@ -333,7 +333,7 @@ def keystore_metrics(
     expiries = [*_shared_expiries(keystore), *_enclave_expiries(keystore, lifetimes)]
     earliest: dict[str, datetime] = {}
     settings = None
-    with suppress(SrosError):  # which a finding says
+    with suppress(SrosError):  # a finding reports the error
         settings = keystore.settings
     for expiry in expiries:
         if settings and expiry.enclave and settings.longest_validity(expiry.enclave) is not None:
@@ -406,7 +406,7 @@ def _shared_expiries(keystore: OpenedKeystore) -> Iterator[Expiry]:
             for certificate in keystore.authority(role)[:1]:
                 yield Expiry(f"{role}_ca", "", validity_of(certificate).not_after)
     if (keystore.root / GOVERNANCE_P7S).exists():
-        # It names no moment: it is valid for as long as the CA that signed it.
+        # The governance has no expiry of its own: it is valid as long as the CA that signed it.
         with suppress(SrosError):
             authority = keystore.ca_certificate(PERMISSIONS)
             keystore.governance_by(authority)

@@ -305,7 +305,7 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         name = statement.name
         if not statement.allows or is_expression(name) or name in GLOBAL_TOPICS:
             return False
-        # The other side may name the whole action.
+        # The counterpart may be in a right to the whole action.
         return not sides[other].meets(name) and not action_part(name)[1]
 
     alone = [
@@ -340,7 +340,8 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             for candidate in offered[name]
             if candidate.right.right == other
         ]
-        # A node has, say, a topic and a service of one name.
+        # The same node may use one name for a topic and a service, so its own names are no
+        # suggestions.
         candidates = [
             candidate for candidate in candidates if candidate.profile is not statement.profile
         ]
@@ -360,7 +361,8 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             yield _misspelt_name_finding(statement, other, candidates)
         else:
             hint = f"; {_candidates_text(same_end)}" if same_end else ""
-            if similar := spelled(other).similar_names(statement.name):  # of which all are used
+            # All of the similar names are used.
+            if similar := spelled(other).similar_names(statement.name):
                 hint = f"; perhaps you mean {' or '.join(similar[:_NAMES_SHOWN])} ({other})"
             yield statement.found(NO_COUNTERPART, f"no enclave may {other} {statement.name}{hint}")
     for statement in checked_policy.statements:
@@ -797,9 +799,9 @@ def _missing_common_part_cause(lacking: Sequence[_Lacking]) -> Cause:
     copy = "" if copied else f"Run `sros policies --copy {target}`, and "
     at = f"line{'s' * (len(lines) > 1)} {names_text([str(line) for line in lines])}"
     place = "the <profile> of every node" if plural else "its <profile>"
-    if plural and len(lines) == len(nodes):  # one in each line, as sed edits the first of a line
+    if plural and len(lines) == len(nodes):  # sed edits only the first match in a line
         addresses = "".join(f"{line}ba;" for line in lines)
-        # The line of a <profile> is the one where its start tag ends, perhaps begun before.
+        # libxml2 gives a <profile> the line where its start tag ends; the tag may begin earlier.
         edit = quote(f"{addresses}b;:a;s#(<profile |^)([^<>]*[^/<>])?>#&{_INCLUDE}#")
         put = f"put the line in this command into {place} ({at}): "
         remedy = f"{copy}{put}`sed -E -i {edit} {quote(str(file))}`"
@@ -1381,7 +1383,7 @@ def _shared_namespaces(fleet: Fleet) -> Iterator[str]:
         if met := _robots_on_one_domain(inside):
             yield f"{met[0].name} and {met[1].name} have the namespace {namespace}"
         above = namespace
-        while above := above.rpartition("/")[0]:  # a robot in / is meant to be above the others
+        while above := above.rpartition("/")[0]:  # a robot in / may contain the others
             if met := _robots_on_one_domain(inside, robots.get(above, [])):
                 outer, inner = (robot.name for robot in met)
                 yield (
@@ -1391,7 +1393,7 @@ def _shared_namespaces(fleet: Fleet) -> Iterator[str]:
 
 
 def _robots_in_unknown_groups(named: Collection[str], fleet: Fleet) -> str:
-    """Return a clause on robots whose group is misspelled, or missing; "" if there are none.
+    """Return a clause on robots with a misspelled group or without a group; "" if there are none.
 
     ``named`` are the groups in the policies, with "" for enclaves of all robots.  Other groups may
     belong to policies that were not named.  So a group counts only if no other robot has it, and
@@ -1535,7 +1537,7 @@ class _IncludeGraph:
             try:
                 includes = list(self._includer.load(file).iter(*_INCLUDES))
             except DocumentError:
-                includes = []  # it stands in a fallback that was not needed, or does not exist
+                includes = []  # the file is in an unused fallback, or does not exist
             targets = (self._target(file, element) for element in includes)
             self._direct[file] = frozenset(target for target in targets if target)
         return self._direct[file]
@@ -1544,7 +1546,7 @@ class _IncludeGraph:
         try:
             return self._includer.target(element, IncludedFile(file))
         except PolicyError:
-            return None  # it stands in <metadata>, or in a fallback that was not needed
+            return None  # the include is in <metadata>, or in an unused fallback
 
 
 # ── names that are nearly equal ────────────────────────────────────────────────────────────
@@ -1552,7 +1554,7 @@ class _IncludeGraph:
 
 _PARTS = re.compile(r"([/_])")
 _DIGITS = re.compile(r"\d+")
-_SHORTEST = 4  # letters of a part: /arm_l and /arm_r are two arms, and min and max two words
+_SHORTEST = 4  # letters of a part; shorter parts, as in /arm_l and /arm_r, differ on purpose
 
 
 _MOST_SAME_ENDS = 8
@@ -1599,14 +1601,14 @@ class NearNames:
     def names_with_same_end(self, name: str) -> list[str]:
         """Return the sorted names with the same last part as ``name``, except itself.
 
-        None if there are many: then the part means nothing, or each robot of a fleet has it.
+        Empty if there are many: a last part that many names share says nothing.
         """
         names = self._by_last.get(name.rpartition("/")[2], ())
         return sorted({*names} - {name}) if len(names) <= _MOST_SAME_ENDS else []
 
 
 def _name_ends(name: str) -> Iterator[str]:
-    """Yield the ends of a name that consist of at least two parts, without the whole name."""
+    """Yield each proper suffix of a name that has at least two parts."""
     parts = name.split("/")[1:]
     for at in range(1, len(parts) - 1):
         yield "/" + "/".join(parts[at:])
@@ -1620,7 +1622,8 @@ def _keys(name: str) -> Iterator[str]:
         if len(part) < _SHORTEST - 1:
             continue
         before, after = "".join(parts[:index]), "".join(parts[index + 1 :])
-        for at in range(len(part) + 1):  # with the letter at this place left out, at last none
+        # The part without each of its letters, and at last the whole part.
+        for at in range(len(part) + 1):
             yield f"{before}{part[:at]}{part[at + 1 :]}\0{after}"
 
 
@@ -1642,7 +1645,7 @@ def _is_near(first_name: str, second_name: str) -> bool:
 
 
 def _is_typed(a: str, b: str) -> bool:
-    """Return whether two names are near other than in capitals and separators."""
+    """Return whether two names differ by a typing error, not only in capitals and separators."""
     return _without_separators(a) != _without_separators(b) and _is_near(a, b)
 
 
@@ -1655,7 +1658,7 @@ def _one_edit(a: str, b: str) -> bool:
     return a[at + 1 :] == b[at + 1 :] or changed_places
 
 
-_MOST_ENCLAVES = 1000  # of each policy: signing must not wait for the check of a whole fleet
+_MOST_ENCLAVES = 1000  # per policy; checking a whole fleet would delay signing
 
 
 def signed_findings(

@@ -171,7 +171,8 @@ def _file_findings(process: Process, *, now: datetime, zone: tzinfo) -> Iterator
         yield PROCESS_NOT_SEEN.found(process.label, text)
         return
     newer = list(newer_files(process, enclave))
-    changed = () if order_unknown(process) else newer  # most likely, it loaded these files
+    # If the order is unknown, the process most likely loaded the newer files.
+    changed = () if order_unknown(process) else newer
     loaded = _loaded_files(enclave, changed, process.started)
     if revoked := loaded.revoked:
         yield PROCESS_REVOKED.found(process.label, f"the certificate of {name} was {revoked}")
@@ -223,8 +224,8 @@ def _required_files(enclave: ProcessEnclave) -> Sequence[str]:
 def newer_files(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
     """Yield the names of the files that changed, or were removed, since a process started.
 
-    The certificate tells which key the process has loaded: a change of the key's file alone is one
-    of its mode or place, or the key does not fit, and no process starts with it.
+    The key's file does not count: the certificate shows which key was loaded. If only the key's
+    file changed, its mode or place changed, or the key does not fit and no process starts with it.
     """
     files = enclave.files
     if process.is_zenoh:
@@ -247,7 +248,7 @@ def may_lack_list(process: Process, enclave: ProcessEnclave, *, has_list: bool =
     """Return whether a process may have loaded another revocation list, or other CAs.
 
     If only the enclave's own documents are newer than the process, it has loaded the same list.
-    With ``has_list``, any list since its start revokes the same.
+    With ``has_list``, all lists since the start of the process revoke the same certificates.
     """
     moved = any(moment > process.started for moment in enclave.moved.values())
     same_files = _OWN_FILES | ({CRL_FILE} if has_list else set())
@@ -373,7 +374,7 @@ def _certificates_in(enclave: ProcessEnclave, file: str) -> tuple[x509.Certifica
     with suppress(SrosError):
         certificates = load_certificates(data, file) if data else ()
         for certificate in certificates:
-            validity_of(certificate)  # an error for dates that no DDS accepts
+            validity_of(certificate)  # raises an error for dates that no DDS accepts
         return certificates
     return ()
 
@@ -440,7 +441,7 @@ def _unsecured_because(process: Process) -> str:
     moments = [moment for moment in enclave.moved.values() if moment > process.started]
     if enclave.is_there and not enclave.lacking:
         return ""
-    if moments:  # its files may have been there
+    if moments:  # its files may have been complete at its start
         return ""
     fault = f"has no {', '.join(enclave.lacking)}" if enclave.is_there else "is not there"
     keystore = plain(enclave.keystore, _LONGEST_PATH)
@@ -738,13 +739,13 @@ _HARMLESS_OVERRIDES = (
     *("transport/unicast/open_timeout", "transport/unicast/accept_timeout"),
     *("transport/unicast/accept_pending", "transport/unicast/max_sessions"),
 )
-"""Settings of Zenoh, with those below them, that do not decide whom a process hears."""
+"""Zenoh settings that, with all settings below them, do not change whom a process hears."""
 
 
 def _zenoh_changes(process: Process) -> Iterator[str]:
     """Yield, as clauses, the settings of a Zenoh process that sros does not set for its enclave.
 
-    Settings that are known to be harmless are left out, and paths where the enclave is not known.
+    Settings that are known to be harmless are left out; paths, too, if the enclave is not known.
 
     Raises:
         SrosError: the enclave is in a place that cannot be given to Zenoh.
@@ -837,7 +838,7 @@ def _unsecured_node_findings(
     asks = environment.get(ENABLE) not in (None, "", "false") or set_without_enable(environment)
     if asks or not _is_open(environment):
         for node in nodes:
-            if not node.network:  # the others are named as such, with their security
+            if not node.network:  # nodes in other networks have a finding of their own
                 yield NODE_OPEN.found(node.label, f"it runs {_domain_text(node)}")
         return
     if finding_per_node:
@@ -892,8 +893,8 @@ def _other_keystore_findings(
 ) -> Iterator[Finding]:
     """Yield findings about DDS processes that trust another identity CA than their neighbors.
 
-    The CA of most neighbors counts; in the network and domain of ``environment``, the CA of its
-    enclave.
+    The right CA is the CA of most neighbors; in the network and domain of ``environment``, it is
+    the CA of this environment's enclave.
     """
     own_domain = ("", environment.get(DOMAIN) or "0") if environment is not None else None
     own_keys = _authorities_here(environment) if environment is not None else frozenset()
@@ -914,7 +915,7 @@ def _other_keystore_findings(
 
 
 def other_folder_findings(processes: Iterable[Process], folder: Path) -> Iterator[Finding]:
-    """Yield a finding for each process that runs in an enclave of ``folder`` from another one."""
+    """Yield a finding for each process in an enclave of ``folder`` with files of another folder."""
     for process in processes:
         assert process.enclave
         root = _plain_path(process.enclave.keystore)

@@ -237,7 +237,7 @@ _COMPARISON = 20
 
 
 def configuration_findings(path: Path) -> Iterator[Finding]:
-    """Yield the findings in a Zenoh configuration; one that cannot be read is a finding too."""
+    """Yield the findings in a Zenoh configuration; an unreadable file is a finding, too."""
     data = read_bytes(path, "Zenoh configuration")
     try:
         document = parse_configuration(data, str(path))
@@ -403,7 +403,7 @@ def _overlapping_subjects(
 ) -> Iterator[tuple[AclSubject, AclSubject]]:
     limit = ComparisonLimit()
     kinds: dict[tuple[str, ...], list[AclSubject]] = {}
-    for subject in subjects:  # two that state the same properties match the same process as one
+    for subject in subjects:  # subjects with the same properties match the same processes
         stated = tuple(name for name in PROPERTIES if getattr(subject, name) is not None)
         kinds.setdefault(stated, []).append(subject)
     for kind, other_kind in combinations(kinds.values(), 2):

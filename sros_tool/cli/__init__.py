@@ -58,7 +58,7 @@ def main(arguments: list[str] | None = None, *, name: str = "sros") -> None:
         with without_secrets():
             color = False if os.environ.get("NO_COLOR") else None
             status = program.main(arguments, prog_name=name, standalone_mode=False, color=color)
-        if sys.stdout:  # None where it was closed
+        if sys.stdout:  # None if it was closed at the start
             sys.stdout.flush()
     except BrokenPipeError:
         _give_up_stdout()

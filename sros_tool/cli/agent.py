@@ -202,7 +202,7 @@ def _init(
         make_agent_folder(folder)
         digest = pin_root(agent_folder(folder), root, now=now())
         write_settings(folder, settings)
-        # What was reached before, and was wrong, were perhaps another source and inbox.
+        # The recorded results may be those of another source and inbox.
         write_state(folder, replace(read_state(folder), fetched=None, sent=None, problems=()))
     if as_json:
         changes = file_change(path, existed=existed)

@@ -104,9 +104,9 @@ def audit(
 
     Nothing is denied: DDS has no permissive mode, so sros observes the ROS graph and decides about
     every endpoint as the DDS vendor would. A node is looked up in the enclave that the graph shows,
-    or else in the enclave whose profiles name it. Observes until the graph stops changing; use
-    --watch to see what nodes do only later. Several policies count as one. The default is the
-    keystore of $ROS_SECURITY_KEYSTORE.
+    or else in the enclave whose profiles name it. By default, sros observes until the graph stops
+    changing; --watch also sees endpoints that nodes create later. Several policies count as one.
+    The default is the keystore of $ROS_SECURITY_KEYSTORE.
 
     Example:
       $ sros audit robot.xml
@@ -159,7 +159,7 @@ def audit(
     reported: set[str] = set()
 
     def report(observation: Observation) -> None:
-        # Nodes of the policy may still appear: no line says yet that one of them is meant.
+        # Unseen nodes may still appear, so no line suggests yet that a node has another name.
         for key, line in replace(judge(observation), unseen=()).lines().items():
             if key not in reported:
                 reported.add(key)

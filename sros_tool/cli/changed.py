@@ -1,6 +1,6 @@
 """The output of verbs that change a keystore: changes, old files that still work, next steps.
 
-The change itself goes to standard output, or what ``--json`` prints; all else to standard error.
+The change itself (with ``--json``, as JSON) goes to standard output, all else to standard error.
 """
 
 from __future__ import annotations
@@ -70,9 +70,10 @@ def print_changed(
 
 
 def enclave_lines(names: Sequence[str], text: str) -> Iterator[str]:
-    """Yield ``text`` for each enclave, or once for more than 20 of them, unless steps are logged.
+    """Yield a line for each enclave, or one line for all if they are more than 20.
 
-    ``text`` has the words ``enclave {}``.
+    ``text`` is the line, with the words ``enclave {}``. If steps are logged, each enclave has a
+    line.
     """
     import logging
 
@@ -84,7 +85,7 @@ def enclave_lines(names: Sequence[str], text: str) -> Iterator[str]:
 
 
 def first_lines(lines: Sequence[str]) -> Iterator[str]:
-    """Yield the lines about enclaves, or the first 20 of them, unless steps are logged."""
+    """Yield 20 lines about enclaves and the number of the others, or all if steps are logged."""
     import logging
 
     if logging.getLogger("sros_tool").isEnabledFor(logging.INFO):
@@ -106,7 +107,7 @@ def print_follow_up(
     """Print the next steps after a change on standard error; arguments as for `print_changed`."""
     if not result.dry_run:
         print_closed(result.root, result.changes)
-    if rights:  # on stderr, because stdout is that of ros2/sros2
+    if rights:  # on stderr: stdout has the same lines as with ros2/sros2
         _tell(rights_lines(result.root, result.rights, dry_run=result.dry_run))
     _tell(after)
     if restart:
@@ -157,7 +158,7 @@ def _change_lines(root: Path, paths: Sequence[str]) -> Iterator[str]:
     from sros_tool.keystore.reader import OpenedKeystore
 
     fleet = None
-    with suppress(SrosError):  # in a new keystore, and in an export, there is none
+    with suppress(SrosError):  # a new keystore and an export have no fleet
         fleet = load_fleet(OpenedKeystore(root))
     lines = ((f"/{path.partition('/')[2].rpartition('/')[0]}", path) for path in paths)
     yield from folded(fleet, lines)

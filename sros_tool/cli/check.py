@@ -290,7 +290,7 @@ def check(
             raise UsageError("--needs-renewal has no SARIF output", "", "Use --json.")
         return _needs_renewal(root, needs_renewal, at.now, form)
     lowest = Severity[severity.upper()]
-    if _is_named("fail_on") and fail_on != "never":  # nothing fails that is not shown
+    if _is_named("fail_on") and fail_on != "never":  # a hidden finding fails no check
         lowest = min(lowest, Severity[fail_on.upper()])
     check_one_decider()
     vendors = _vendors(vendor, distro, all_distros=all_distros)
@@ -393,7 +393,8 @@ def _requirements(
 ) -> Callable[[Callable[[Sequence[Path]], System]], list[Finding]] | None:
     """Return a function that checks the requirements of files; None without files.
 
-    The returned function gets a function that reads the policies, or the keystore, at paths.
+    The argument of the returned function is a function that reads the policies or the keystore at
+    paths.
     """
     if not files:
         return None
@@ -466,7 +467,7 @@ def _one_path(family: str, paths: tuple[Path, ...], option: str) -> Path:
 def _paths_of_systems(
     family: str, paths: tuple[Path, ...], option: str
 ) -> Sequence[Sequence[Path]]:
-    """Return the paths of the policies of one robot or fleet, and that of a keystore, if any."""
+    """Return the paths of the policies, if any, and the path of the keystore, if any."""
     from sros_tool.keystore.layout import is_keystore
 
     paths = paths or (() if family == "runtime" else (keystore_from_environment(),))
@@ -527,9 +528,9 @@ def _circumstances(
     fleet_file: Path | None = None,
     paths: Sequence[Path] = (),
 ) -> Circumstances:
-    """Return moment, domain, policies and fleet that the options of a check name.
+    """Return the moment, domain, policies and fleet that the options name.
 
-    Without --fleet, the fleet of the only keystore counts, if there are policies.
+    Without --fleet, policies are read for the fleet of the keystore, if only one is checked.
     """
     from sros_tool.checks.keystores.opened import Circumstances
     from sros_tool.cli.common import local_zone
@@ -596,7 +597,7 @@ def _vendors(
 
 
 def _refuse_besides_upgrade() -> None:
-    """Raise `UsageError` for options that --upgrade-to cannot follow."""
+    """Raise `UsageError` for options that exclude --upgrade-to."""
     parameters = click.get_current_context().params
     for option in ("requirements", "suggest", "template", "all_distros", "policies"):
         if parameters[option]:
@@ -958,7 +959,7 @@ def _watch_processes(
 
     table, news, zone = ProcessTable(), FindingNews(), local_zone(environment)
     judged: tuple[RunningProcesses, datetime] | None = None
-    # Blocked, they come only where they are waited for: no line is cut off.
+    # A blocked signal is received only by the wait below, so that it interrupts no output.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
     try:
         echo("watching the processes of this machine until SIGINT (Ctrl-C) or SIGTERM", err=True)

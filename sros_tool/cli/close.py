@@ -150,7 +150,7 @@ def close(
         )
     shell = Shell(_run, lambda line: echo(line, err=True), os.environ, now, local_zone(os.environ))
     robot = LocalRobot(folder, domain_of(domain_text), shell, without, elsewhere)
-    can_undo = undo and robot.export.exists()  # its enclaves show which processes are closed
+    can_undo = undo and robot.export.exists()  # the export shows which processes are closed
     if (apply or prove or undo) and not (robot.observed or can_undo):
         if not folder.is_dir():
             raise UsageError(
@@ -246,7 +246,7 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
     elif process.enclave in closed.absent:
         state = "not running"
     elif process.pid:
-        # Whoever was known by its enclave and does not run there is known by its command.
+        # A process first seen in its enclave, but now elsewhere, was recognized by its command.
         signs = {"elimination": "elimination", "enclave": "its command"}
         sign = signs.get(process.known_by, f"its {process.known_by}")
         state = f"process {process.pid}" + ("" if runs else f", known by {sign}")
@@ -361,7 +361,7 @@ def _show_undone(robot: LocalRobot, closed: CloseState) -> None:
         pids = [
             process.pid for process in closed.observed.processes if process.pid or process.alike
         ]
-        # Without the list of processes, nobody knows whether they run.
+        # Without the list of observed processes, "no process runs" would be a guess.
         stopped = robot.observed is not None and not (pids or closed.observed.unknown)
         state = "no process of the robot runs" if stopped else "the robot is open"
         more = ""
@@ -388,7 +388,7 @@ def _state(closed: CloseState, *, apply: bool) -> str:
 
 
 def _elsewhere(robot: LocalRobot, closed: CloseState) -> str:
-    """Return which files other machines need now, if theirs are earlier: nobody here sees those."""
+    """Return which files other machines need; sros does not see whether they have them."""
     needed = ", ".join(f"{name} ({iso(of)})" for name, of in closed.needed_elsewhere.items())
     return needed and (
         f"; on other machines, files from before these times have to be replaced, and the process "
@@ -410,7 +410,7 @@ def _until(closed: CloseState) -> str:
 
 
 def _started_together(processes: Sequence[ClosedProcess]) -> str:
-    """Return what is stopped and started by one command: a process, a launch, the containers.
+    """Return what one command stops and starts together: a process, a launch, or the containers.
 
     Returns "" if no process runs any more.
     """

@@ -647,7 +647,7 @@ def local_zone(environment: Mapping[str, str]) -> tzinfo:
     if not name and _LOCALTIME.exists():
         _, marker, name = str(_LOCALTIME.resolve()).partition("zoneinfo/")
         name = name if marker else ""
-    if name in ("UTC", "Etc/UTC"):  # most robots, which need no time zones
+    if name in ("UTC", "Etc/UTC"):  # most robots: no time zone data is read
         return UTC
     if name:
         from zoneinfo import ZoneInfo
@@ -798,7 +798,7 @@ class _Secrets:
         value = _taken.get(_PIN if is_pin else _PASSPHRASE, "")
         file = "" if is_pin else _taken.get(_PASSPHRASE_FILE, "")
         if not value and file:
-            if file not in self._lines:  # a pipe can be read once, and there may be two CAs
+            if file not in self._lines:  # a pipe can be read once, and two CA keys may need it
                 with without_progress():
                     print_notes(_new_notes(passphrase_file_notes(Path(file))))
                 self._lines[file] = _first_line(Path(file))
@@ -821,7 +821,7 @@ class _Secrets:
 
 def passphrase_file_notes(path: Path) -> Iterator[Note]:
     """Yield a note if others can read a passphrase file on this machine."""
-    with suppress(OSError):  # reading it says why
+    with suppress(OSError):  # reading the file reports the error
         mode = path.stat().st_mode
         if stat.S_ISREG(mode) and mode & 0o077:
             text = (
@@ -904,7 +904,7 @@ def _read_at_most(path: Path, count: int) -> bytes:
                 data += part
         return bytes(data)
     except OSError as error:
-        error.filename = str(path)  # not the number of the descriptor
+        error.filename = str(path)  # instead of the descriptor's number
         raise
     finally:
         os.close(handle)

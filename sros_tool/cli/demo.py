@@ -173,7 +173,7 @@ def demo(
     which also needs a router. The node says at once whether it is secured. In an enclave, it needs
     only the right for its topic, whatever its nodes are called. A listener reads
     std_msgs/msg/String, and counts the messages of any other type that the topic has; a talker
-    reports if no node can read its type, and sends another one with --type. Of the options, only
+    reports if no node can read its type, and sends another type with --type. Of the options, only
     --backend, --topic and --type apply.
 
     Example:

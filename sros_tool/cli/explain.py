@@ -116,7 +116,7 @@ def _complete_enclave(
 
     arguments = (
         ctx.params.get("arguments") or ctx.args
-    )  # click fills only args if an option lacks its value
+    )  # while an option lacks its value, click fills only ctx.args
     named = ctx.params.get("keystore") or (arguments[0] if arguments else "")
     root = Path(named or os.environ.get(KEYSTORE_VARIABLE, ""))
     names = search_enclaves(root)[0] if is_keystore(root) else ()
@@ -329,7 +329,7 @@ def explain(
     if who and by_machine:
         _note_unknown_distribution()
     if who:
-        asking = asking._replace(domain=domain_of(domain))  # all domains, unless asked
+        asking = asking._replace(domain=domain_of(domain))  # without --domain, all domains
         chosen = None if why_zenoh else chosen_vendor(vendor, distro, os.environ)
         question, only = _question_to_all(rest, kind), (patterns, robots)
         if policy:
@@ -474,7 +474,7 @@ def _stated_distribution(keystore: OpenedKeystore | None, enclave: str) -> Distr
 
     if keystore is None:
         return None
-    with suppress(SrosError):  # which `sros check` reports
+    with suppress(SrosError):  # `sros check` reports the error
         stated = stated_distributions(keystore, enclave) if keystore.settings else ()
         return find_distribution(stated[0]) if len(stated) == 1 else None
     return None
@@ -698,7 +698,7 @@ def _change_lines(answer: Answer) -> Iterator[str]:
             yield f"    add {place}, with placeholders for the robot's name and namespace"
         else:
             yield f"    save as {ADDITION}"
-        lines = change.document.splitlines()  # without the XML declaration, which is the default
+        lines = change.document.splitlines()  # the XML declaration is left out: it is the default
         yield from (f"      {line}" for line in lines if not line.startswith("<?xml"))
 
 

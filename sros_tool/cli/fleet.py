@@ -155,7 +155,7 @@ def _report(folder: Path, robot: str, restarted: bool) -> None:
         moment = now()
         names = list_enclaves(folder)
         confirmation = make_confirmation(folder, robot, now=moment)
-        # After the files are read, so that no file that is brought meanwhile counts as loaded.
+        # Look at processes after reading the files: files that arrive in between are not loaded.
         processes = _processes_here(folder, names, now())
         running = (f"{problem}." for problem in processes.problems)
         problems = (*running, *installed_sentences(folder, names, moment))
@@ -169,7 +169,7 @@ def _report(folder: Path, robot: str, restarted: bool) -> None:
         *processes.elsewhere,
         *enclaves_to_restart((), processes.list_states, complete=True),
     }
-    # Where nothing runs in these enclaves, this may be another machine than the robot.
+    # If no process runs in these enclaves, this machine may not be the robot.
     seen = {*states.values()} - {RunningFiles.NOT_SEEN}
     is_known = restarted or (bool(seen) and processes.complete)
     if restart or is_known:
@@ -356,7 +356,7 @@ def _collect(
     if problem:
         raise problem
     if collected.not_signed:
-        if not any(robot.requests for robot in collected.robots):  # which name the reason
+        if not any(robot.requests for robot in collected.robots):  # their lines name the reason
             echo(f"not signed: {collected.not_signed}", err=True)
         return NOT_DONE
     is_published = published is None or published.is_complete(moment)
@@ -648,9 +648,9 @@ def _status(
       $ sros fleet status keystore --prometheus -o /var/lib/.../fleet.prom
 
     The exit status is 0 if every robot that is not revoked has confirmed the files that it should
-    have, no restart is due, no agent reports a problem, and robots still accept what was published,
-    of which no file is missing in its folder. Otherwise it is 1. With --fail-on vulnerabilities, it
-    is also 1 if a robot has a DDS to upgrade.
+    have, no restart is due, no agent reports a problem, no published file is missing, and robots
+    still accept the published files. Otherwise it is 1. With --fail-on vulnerabilities, it is also
+    1 if a robot has a DDS to upgrade.
     """
     from sros_tool.checks.vulnerabilities import is_fixed_later, robot_findings
     from sros_tool.keystore.fleet_status import fleet_status
@@ -889,7 +889,7 @@ def _remedies(status: FleetStatus, to_dos: Collection[str]) -> Mapping[str, str]
 
 
 def _bringing(root: Path, robots: Sequence[RobotStatus]) -> str:
-    """Return how renewed files get to robots: most of those that fetch get what is published."""
+    """Return how renewed files get to robots: by a publication, a delivery, or both."""
     from sros_tool.keystore.fleet import publish_command
 
     publish = publish_command(root)
@@ -921,7 +921,7 @@ def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     when = f"{end:%Y-%m-%d}" if time_left > timedelta(days=1) else iso(end)
     label = "first expiry on a robot" if time_left > timedelta(0) else "expired on a robot since"
     short_lived = [name for robot in soon for name in robot.short_lived]
-    named = short_lived[:_MOST_GROUPS]  # names of enclaves need no quotes
+    named = short_lived[:_MOST_GROUPS]  # enclave names need no quotes
     named += ["..."] * (len(short_lived) > _MOST_GROUPS)
     command = f"`sros renew {quote(str(root))} {' '.join(named)}`, then "
     if not all(robot.short_lived for robot in soon):
@@ -929,7 +929,7 @@ def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     if kind == "crl":
         command = f"`sros crl {quote(str(root))} --refresh`, then "
     if not any("current" in robot.files.get(kind, ()) for robot in soon):
-        command = ""  # the keystore has renewed them
+        command = ""  # the keystore has renewed these files
     bring = f"{command}{_bringing(root, soon)}"
     if not command and all(robot.has_release for robot in soon):
         bring = "new files are published; the column `to do` says what to do"
@@ -984,7 +984,8 @@ def _groups(compared_fleet: ComparedFleet, robots: Sequence[str]) -> list[_Group
     groups = []
     for (state, to_do, *_), group in robots_by_texts.items():
         what = _joined_durations({robot.robot: clauses_by_robot[robot.robot] for robot in group})
-        each = "each: " if len(group) > 1 and what[:1].isdigit() else ""  # not their sum
+        # "each": the number is that of each robot, not the sum.
+        each = "each: " if len(group) > 1 and what[:1].isdigit() else ""
         groups.append(_Group(group, state, to_do, f"{each}{what}"))
     return [*groups, _Group(current, "current", "", "")] if current else groups
 
@@ -1253,7 +1254,7 @@ def _details(robot: RobotStatus) -> Iterator[str]:
     for file in pending[:_MOST_LINES]:
         issued = f" of {file.since}" if file.since else ""
         owner_clause = f" of {file.robot or file.enclave}" if file.enclave else ""
-        # Of a keystore from a backup, the robots may have the list that it lost.
+        # Robots may have the list that a keystore restored from a backup has lost.
         is_lost = file.surplus and file.kind == "crl" and file.state == "unknown"
         action = "find out who signed" if is_lost else file.action
         yield f"  {action} {file.path}: {file.state}{issued}{owner_clause}"

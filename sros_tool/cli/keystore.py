@@ -834,7 +834,7 @@ def update_keystore(
     if layout and shared and not update.done:
         raise UsageError("update_keystore cannot do more to separate the CAs", shared)
     undone = present.edits.clauses() if discard_edits else ()
-    # What the first stage issued is not old; only another domain makes permissions of it old.
+    # The next stage replaces permissions, which --revoke-old revokes, only for another domain.
     options = {
         "--template": [template_name] if template_name is not None else [],
         "--set": values,
@@ -848,7 +848,7 @@ def update_keystore(
     command = " ".join(map(quote, ("sros", "update_keystore", str(root), *words, *flags)))
     _show_update(update, undone, command, as_json)
     refused = bool(update.looser) and not allow_looser
-    if refused:  # only a dry run comes here
+    if refused:  # only in a dry run; else an error was raised
         echo("this would be refused: it needs --allow-looser", err=True)
     return 1 if refused else 0
 
@@ -887,8 +887,8 @@ def _show_update(
 ) -> None:
     """Print an update.
 
-    ``undone`` are clauses about the edits by hand that it undoes, ``command`` is the command of the
-    stage that is left.
+    ``undone`` are clauses about the edits by hand that the update undoes, ``command`` is the
+    command of the remaining stage.
     """
     if as_json:
         from sros_tool.keystore.lifecycle.shown import TemplateChange

@@ -275,8 +275,8 @@ def crl(
     DDS refuses every participant once the list has expired, so the exit status is 1 if it expires
     within 30 days, or within a third of its validity, if that is shorter.
 
-    With --refresh --crl FILE, a keystore that was restored from a backup revokes again what a list
-    of the time after the backup revokes, such as crl.pem of a robot.
+    With --refresh --crl FILE, a keystore that was restored from a backup revokes again the
+    certificates in FILE: a revocation list made after the backup, such as a robot's crl.pem.
 
     Example:
       $ sros crl keystore

@@ -101,9 +101,9 @@ def merge_policy(
 
     Comments, includes, metadata and layout of POLICY do not change. POLICY can be without enclaves
     (`<enclaves/>`). A right is added only if the enclave does not have it yet; rights from includes
-    and wildcards count. Where a profile of OTHER includes common parts, a new profile of POLICY
-    includes those in POLICY's folder. Publish and subscribe are separate rights. A DENY always
-    stays and always wins over an ALLOW; contradictions between the policies are reported.
+    and wildcards count. Where a profile of OTHER includes common parts, the new profile in POLICY
+    includes the same parts from POLICY's folder. Publish and subscribe are separate rights. A DENY
+    always stays and always wins over an ALLOW; contradictions between the policies are reported.
 
     Example:
       $ sros merge_policy robot.xml learned.xml --in-place
@@ -175,7 +175,7 @@ def merge_policy(
 
 _MOST_ADDED = 20
 _MOST_OF_ENCLAVE = 2
-"""A merge lists all rights up to the first number, else so many rights of each enclave."""
+"""A merge lists up to so many rights; if there are more, so many of each enclave."""
 
 
 def _print_added(merged: Merged) -> None:
@@ -253,10 +253,10 @@ def diff_policy(
     or Zenoh configurations such as router.json5. Permissions and Zenoh rules are shown in ROS
     terms; the signature of permissions is verified if the permissions CA is next to them. "!" marks
     a right of B whose counterpart, such as the subscriber, only A has. If A or B covers only some
-    enclaves, as an export does, only these are compared. A note names Zenoh routers that a policy
-    lacks and that have no more rights than every node needs: they do not count. Lines that differ
-    only in the robot of a fleet are shown as one. Two policies are also compared by the protection
-    that they demand, two keystores by their governance.
+    enclaves, as an export does, only these are compared. Zenoh routers that a policy lacks are no
+    difference if they have no more rights than every node needs; a note names them. Lines that
+    differ only in the robot of a fleet are shown as one. Two policies are also compared by the
+    protection that they demand, two keystores by their governance.
 
     The exit status is 1 if they differ, or if DDS would refuse A or B.
 
@@ -267,8 +267,8 @@ def diff_policy(
     with a governance that controls all access. If A is a policy, a keystore B that protects less
     than the template production counts as giving more access; a policy B never lowers the
     protection. The last line says what is assumed and what is left out, such as dates. "!" marks a
-    DENY that B lacks, of names that B does not allow: it gives no access, so that the exit status
-    is 0, but `sros review` fails for it.
+    DENY of A that B lacks, for names that B does not allow. A missing DENY alone gives no access,
+    so the exit status is 0, but `sros review` fails.
 
     Example:
       $ sros diff_policy robot.xml keystore
@@ -381,8 +381,9 @@ def rights_markdown(
 
 
 def enclave_lines(difference: SourcesDifference, fleet: Fleet | None) -> list[str]:
-    """Return the lines for enclaves without rights that only one side has, and for enclaves whose
-    ROS domains differ; equal lines of robots are merged.
+    """Return lines for enclaves without rights on one side only, and for differing ROS domains.
+
+    Equal lines of robots are merged.
     """
     from sros_tool.fleet.robots import folded
 
@@ -833,7 +834,7 @@ class PlacedChange(NamedTuple):
     text: str
     place: Source | None
     is_denial: bool = False
-    """Whether it is a DENY that is gone, and no access."""
+    """Whether the change is a dropped DENY, and not added access."""
 
 
 def placed_changes(

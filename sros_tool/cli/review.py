@@ -66,7 +66,7 @@ _ALLOWED_BY = {
     "requirements-before": "option --dropped-requirements allow",
     "signed": "review: whoever changes a policy seldom has the keys of the CAs",
 }
-"""What allows the findings of steps; for other kinds, it is the option for new access."""
+"""Maps kinds of steps to what allows their findings; for other kinds, --new-access allow does."""
 
 
 class _Lines(_PathsType):
@@ -541,7 +541,7 @@ def _step_findings(result: Review, step: ReviewStep, request: ReviewRequest) -> 
 def _access_findings(change: AccessChange, path: str) -> Iterator[Finding]:
     """Yield a finding for each line of HEAD with new access, or without a DENY of BASE.
 
-    What has no line is at ``path``.
+    A finding without a line is placed at ``path``.
     """
     from sros_tool.checks.review import DROPPED_DENIAL, NEW_ACCESS
     from sros_tool.cli.policy import placed_changes
@@ -574,7 +574,7 @@ def _text(result: Review) -> list[str]:
 
 def _lines_to_read(step: ReviewStep) -> list[str]:
     """Return what a reviewer has to read: new access and dropped requirements, even if they are
-    allowed; rights that nobody answers any more; findings.
+    allowed; rights that lost their counterpart; findings.
     """
     from sros_tool.checks.formats import folded_findings
     from sros_tool.checks.kind import ChosenFindings

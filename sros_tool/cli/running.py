@@ -93,7 +93,8 @@ _ACCEPT_KEY = click.option(
 class _FailingClosed(Verb):
     """A verb whose output a shell evaluates; on failure the output keeps nodes from starting.
 
-    That includes wrong options: a shell evaluates whatever is printed, and ignores the exit status.
+    Wrong options count as a failure, too: a shell evaluates whatever is printed, and ignores the
+    exit status.
     """
 
     def make_context(
@@ -384,7 +385,7 @@ def run(
         print_notes(secured.enclave_notes)
     sys.stdout.flush()
     sys.stderr.flush()
-    for ignored in (signal.SIGPIPE, signal.SIGXFSZ):  # Python ignores them, and COMMAND would too
+    for ignored in (signal.SIGPIPE, signal.SIGXFSZ):  # ignored by Python; COMMAND would inherit it
         signal.signal(ignored, signal.SIG_DFL)
     os.execve(program, command, environment)
 
@@ -626,7 +627,7 @@ def _late_renewal_notes(keystore: OpenedKeystore) -> Iterator[Note]:
     from sros_tool.validity import elapsed, soon_limit
 
     for what, validity in _validities(keystore):
-        # A day, the delay of the timer, and the delivery.
+        # The job runs once a day; the timer's delay and the delivery add to this.
         if soon_limit(validity) < timedelta(days=2):
             text = (
                 f"{what} are valid for {elapsed(validity)}, and count as expiring soon only "
@@ -640,7 +641,7 @@ def _late_renewal_notes(keystore: OpenedKeystore) -> Iterator[Note]:
 def _validities(keystore: OpenedKeystore) -> Iterator[tuple[str, timedelta]]:
     """Yield the validities that the settings choose, and the shortest one of files to be renewed.
 
-    A CA service, or the end of a CA, can make it shorter than the settings choose.
+    A CA service, or the expiry of a CA, can make a validity shorter than the settings choose.
     """
     from sros_tool.keystore.expiry import survey
 

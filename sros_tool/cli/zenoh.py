@@ -1,4 +1,4 @@
-"""The verb that gives a keystore its Zenoh network, and the files with which Zenoh enforces it."""
+"""The verb `zenoh`: the Zenoh network of a keystore, and the files by which Zenoh enforces it."""
 
 from __future__ import annotations
 

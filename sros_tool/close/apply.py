@@ -75,7 +75,10 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
 def _write_drop_ins(
     robot: LocalRobot, observed: ObservedProcesses, *, dry_run: bool
 ) -> list[FileChange]:
-    """Write the drop-ins of the units, show it, and return what changes.  Raises `SrosError`."""
+    """Write the drop-ins of the units, print their paths, and return the changes.
+
+    Raises `SrosError`.
+    """
     paths = [f"{unit}.d/{DROP_IN}" for unit in sorted(observed.units)]
     files = {path: read_bytes(robot.start / "units" / path, "unit").decode() for path in paths}
     _drop_ins_of(robot, observed)
@@ -97,7 +100,7 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
         if not dry_run:
             remove_file(path)
     units = {path.parent.name.removesuffix(".d") for path in drop_ins}
-    # Without a drop-in, a unit is not open yet if an earlier --undo was killed before the restart.
+    # A unit without a drop-in still runs closed if an earlier --undo was killed before the restart.
     units |= {process.unit for process in observed.processes if not running.is_open(process)} - {""}
     _restart_units(robot, observed, units, dry_run=dry_run)
     started = [process for process in observed.processes if process.unit in units and process.pid]
@@ -136,7 +139,7 @@ def _readable_policy(robot: LocalRobot) -> Policy | None:
     """Return the policy; None, with its error shown, if it cannot be read."""
     try:
         return robot.read_policy()
-    except SrosError as error:  # a broken file must not keep the robot closed
+    except SrosError as error:  # opening the robot must not fail because of a broken file
         robot.shell.say(f"{error}")
         return None
 
@@ -152,7 +155,7 @@ class _RemainingProcesses:
         by_user = sorted(
             running.secured_everywhere, key=lambda secured: running.may_use_files(secured.process)
         )
-        # Of several processes in an enclave, best the process of a user who can read its files.
+        # Sorted so that, of several processes in an enclave, the last one may use its files.
         self._secured = {enclave.name: process for process, enclave in by_user}
         by_hand = observed.commands_by_hand(self._robot.folder)
         self._started_by_hand = [*chain.from_iterable(by_hand.values())]
@@ -183,7 +186,7 @@ class _RemainingProcesses:
                 )
 
     def say_how_to_start(self) -> None:
-        """Show how to start, open, processes that do not run or have another command."""
+        """Show how to start processes open that do not run, or that run by another command."""
         running, nodes = self._running, ObservedNodes(self._robot)
         known = running.with_later_processes(self._robot.processes)
         unknown = [

@@ -45,9 +45,10 @@ def assign(
 
     Processes of other domains or networks are left out.  ``process_ids`` maps participants of
     Cyclone DDS to the process ids that they state; ``origins`` has what started each process, and
-    None is for processes that run now.
+    with None, that is read from the running processes.
     """
-    by_pid = {process.pid: process for process in running}  # the last program that it ran
+    # A process may have run several programs: the last one counts.
+    by_pid = {process.pid: process for process in running}
     candidates = [
         process
         for process in by_pid.values()
@@ -65,7 +66,7 @@ def assign(
     assigned = []
     for process, enclave, known_by in claims:
         origin = origins[process.pid]
-        if units[origin.unit] != 1:  # it does not start the process alone
+        if units[origin.unit] != 1:  # the unit starts several processes
             origin = origin._replace(unit="")
         assigned.append(ClosedProcess.from_process(process, enclave, origin, known_by))
     known = {process.pid for process, _, _ in claims} | {closed.pid for closed in assigned}
@@ -98,7 +99,8 @@ def _claims(
 ) -> list[tuple[Process, str, str]]:
     """Return processes with their enclaves and how they are known, by the surest sign first.
 
-    A sign that more processes of an enclave show than it has participants shows nothing.
+    If more processes have a sign of an enclave than the enclave has participants, the sign is
+    ignored.
     """
     claims = [(process, ROUTER, "program") for process in processes if process.is_router]
     for known_by, shows_node in _KNOWN_BY.items():
@@ -183,8 +185,8 @@ def ended_processes(
     """Return the processes that ended while sros watched, with the nodes that they ran.
 
     If an enclave had several commands, its processes are left out, because one of them may be
-    another program that took the node's name.  ``observed`` are the processes that stayed; a unit
-    that starts one of them starts it alone.
+    another program that took the node's name.  ``observed`` are the processes that stayed; the unit
+    of such a process started none of the ended ones.
     """
     origins = {process.pid: origin for process, origin in ran}
     units_in_use = observed.units

@@ -88,7 +88,7 @@ class ObservedNodes:
             yield replace(node, enclaves=moved) if moved else node
 
     def expected(self, current: Observation | None = None) -> Observation:
-        """Return the nodes of enclaves in the policy, with the names that they should have.
+        """Return the nodes whose enclaves the policy has, with the names that they should have now.
 
         If the policy allows several names for an endpoint of a renamed node, the result has the
         name that the node uses in the ``current`` graph.
@@ -218,7 +218,7 @@ class ObservedNodes:
 
         The names are those of observed nodes and of nodes in the policy.
         """
-        with suppress(SrosError):  # a broken file must not keep the robot closed
+        with suppress(SrosError):  # opening the robot must not fail because of a broken file
             observed = {node_name(node) for node in self.as_observed if enclave in node.enclaves}
             in_policy = self.policy.enclave(enclave)
             profiles = in_policy.all_profiles() if in_policy else ()
@@ -240,7 +240,7 @@ def _possible_endpoints(
     if fqn.startswith(private):
         moved = f"{expand('~/', ns, name)}{fqn.removeprefix(private)}"
         return endpoint._replace(topic=prefix + moved), endpoint
-    if fqn.startswith(near):  # a DDS topic without a ROS name does not
+    if fqn.startswith(near):  # not so for a DDS topic without a ROS name
         moved = expand(fqn.removeprefix(near), ns, name)
         return endpoint, endpoint._replace(topic=prefix + moved)
     return (endpoint,)

@@ -1,7 +1,7 @@
 """Prepare everything that a robot needs to run closed, without closing it.
 
-The steps are command lines of sros.  What keeps the robot from running closed is shown with what to
-do.
+The steps are command lines of sros. Each problem that keeps the robot from running closed is shown
+with its remedy.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
             robot.remember(robot.observed)
     denied_before: Sequence[str] = ()
     if robot.export.exists() and robot.observation_file.exists():
-        with suppress(SrosError):  # the steps say what is wrong
+        with suppress(SrosError):  # the steps report the error
             denied_before = _denied_access(robot)
     done, problems, is_stopped = _do_steps(robot, duration, partial=partial, dry_run=dry_run)
     ignored = [] if dry_run else _ignore_in_git(robot)
@@ -135,7 +135,7 @@ def _ignore_in_git(robot: LocalRobot) -> list[FileChange]:
 
 
 def _remember_later_processes(robot: LocalRobot) -> None:
-    """Write the processes as they were started later, if the robot was watched, and say which.
+    """Remember processes with the commands of later starts, and print which; not before a watch.
 
     An enclave that neither the keystore nor the policy has any more belongs to no other machine.
     """
@@ -158,7 +158,7 @@ def _remember_later_processes(robot: LocalRobot) -> None:
 def _with_renamed_enclaves(robot: LocalRobot, observed: ObservedProcesses) -> ObservedProcesses:
     """Return observed processes in the enclaves to which the policy moved all of their nodes.
 
-    A process stays where it is if the policy has its enclave, or the other one has a process.
+    A process keeps its enclave if the policy still has it, or if the other enclave has a process.
     """
     nodes, moved = ObservedNodes(robot), dict[str, set[str]]()
     if robot.observation_file.exists():
@@ -217,7 +217,7 @@ def steps(robot: LocalRobot, duration: str | None) -> Iterator[CommandStep]:
     domain = ("--domain", str(robot.domain))
     learn = ["generate_policy", policy, "--enclave-per-node", *domain]
     learn += ["--watch", duration] if duration else []
-    learn += ["--dry-run"] if robot.policy.exists() else []  # it may have been edited
+    learn += ["--dry-run"] if robot.policy.exists() else []  # the user may have edited the policy
     only_errors = ("--fail-on", "error")
     policies, created = ("-p", policy, str(robot.observer)), ("--template", TEMPLATE)
     on_zenoh = robot.shell.environment.get(RMW) == RMW_ZENOH
@@ -283,7 +283,7 @@ def _enclaves_without_origin(robot: LocalRobot) -> list[str]:
 
 
 def _remove_enclaves(robot: LocalRobot) -> list[FileChange]:
-    """Remove from the export enclaves that the keystore revoked, or of other machines."""
+    """Remove from the export enclaves that were revoked, or that belong to other machines."""
     keystore = OpenedKeystore(robot.keystore)
     revoked_enclaves = [
         name for name in _enclaves_without_origin(robot) if revocation_of(keystore, name)
@@ -433,7 +433,7 @@ def _shared_node_problems(robot: LocalRobot) -> Iterator[str]:
     running, is_signed = RunningRobot(robot).processes, robot.keystore.exists()
     by_enclave: dict[str, dict[tuple[int, str], str]] = {}
     for process in robot.processes.processes:
-        # Whoever was started in the enclave did not choose it by its name.
+        # A process that was started in the enclave was not assigned by its node's name.
         if process.known_by == "enclave":
             continue
         twins, command = by_enclave.setdefault(process.enclave, {}), shlex.join(process.command)
@@ -441,7 +441,7 @@ def _shared_node_problems(robot: LocalRobot) -> Iterator[str]:
         if is_signed:
             pids = now.alike or [now.pid] * bool(now.pid)
             twins |= {(pid, ""): f"process {pid} ({command})" for pid in pids}
-        else:  # the policy was learned of the process, whether it still runs or not
+        else:  # the policy has the rights of the process, even if it has ended
             label = now.pids_text or "a process that ended"
             twins[process.pid, command] = f"{label} ({command})"
     for enclave, twins in by_enclave.items():

@@ -78,7 +78,7 @@ class ClosedProcess(NamedTuple):
     ) -> ClosedProcess:
         """Return a running process with its enclave and what started it."""
         pid, command = process.program
-        if process.is_demo_router:  # what it was started with fits this one start
+        if process.is_demo_router:  # the arguments of this start would not fit another one
             command = _DEMO_ROUTER
         start = enclave, pid, command, origin.folder, process.user, origin.unit
         rmw = _rmw_to_start(process)
@@ -97,7 +97,7 @@ class ClosedProcess(NamedTuple):
 
     @property
     def pids_text(self) -> str:
-        """The process by its id, or those of which it is one, as text; "" if it does not run."""
+        """The id of the process, or the ids that fit equally, as text; "" if it does not run."""
         if self.alike:
             return (
                 f"that of the processes {enumerated([*map(str, self.alike)])} which is this robot's"
@@ -106,7 +106,7 @@ class ClosedProcess(NamedTuple):
 
     @property
     def lacks_enclave_argument(self) -> bool:
-        """Whether its command has to name the enclave, which others look for on Zenoh."""
+        """Whether its command has to name the enclave, because other Zenoh nodes look for it."""
         is_node = self.rmw == RMW_ZENOH and not self.is_router
         return is_node and named_enclave(self.command) != self.enclave
 
@@ -118,7 +118,7 @@ class ClosedProcess(NamedTuple):
         if self.is_router and process.is_router:
             return True
         rmws = {self.rmw, _rmw_to_start(process)}
-        if len(rmws - {""}) > 1 or rmws == {"", RMW_ZENOH}:  # a process without any is on DDS
+        if len(rmws - {""}) > 1 or rmws == {"", RMW_ZENOH}:  # a process that names no RMW is on DDS
             return False
         words = command_without_enclave(process.program[1], self.enclave)
         return words == command_without_enclave(self.command, self.enclave)
@@ -128,9 +128,9 @@ class ClosedProcess(NamedTuple):
     ) -> ClosedProcess:
         """Return a copy with the id that the process has now, in its ROS domain and network.
 
-        A process in its enclave of the ``export`` goes before open ones.  A process that may run,
-        but could not be examined, keeps its id, and so does a process that its unit restarts; a
-        process that ended while sros watched has none.
+        A process that runs in its enclave of the ``export`` is preferred to open ones.  A process
+        that may run, but could not be examined, keeps its id, and so does a process that its unit
+        restarts; a process that ended while sros watched has none.
         """
         in_domain = [other for other in running.processes if is_in_domain(other, domain)]
         in_enclave = [
@@ -144,7 +144,7 @@ class ClosedProcess(NamedTuple):
             )
         ]
         if in_enclave:
-            pids = [self.pid] if self.pid in pids else pids[:1]  # all of them are right
+            pids = [self.pid] if self.pid in pids else pids[:1]  # each of them runs in the enclave
         elif self.pid not in pids and len(pids) > 1:
             pids = [pid for pid in pids if process_origin(pid).folder == self.folder] or pids
         unseen = {process.pid for process in running.unseen}
@@ -200,7 +200,7 @@ def _rmw_to_start(process: Process) -> str:
 
 
 def _shell_word(word: str) -> str:
-    """Quote a word for a shell; what could control a terminal, or is not UTF-8, by `printf`."""
+    """Quote a word for a shell, by `printf` if it could control a terminal or is not UTF-8."""
     if visible(word) == word:
         return shlex.quote(word)
     octal = re.sub(rb"[^A-Za-z0-9_./ ]", lambda byte: b"\\%03o" % ord(byte[0]), os.fsencode(word))
@@ -293,8 +293,9 @@ class ObservedProcesses(NamedTuple):
     def enclaves_outside(self, policy: Policy) -> list[str]:
         """Return the enclaves of observed processes with nodes that the policy does not have.
 
-        A Zenoh router has no node, so no policy has its enclave.  What first ran in its enclave was
-        added to the policy by hand, and not observed.
+        Zenoh routers are left out: they have no node, so no policy has their enclave. Processes
+        that were first seen in their enclave are left out, too: their enclave was added by hand,
+        not observed.
         """
         nodes = {
             process.enclave
@@ -304,7 +305,7 @@ class ObservedProcesses(NamedTuple):
         return sorted(nodes.difference(enclave.path for enclave in policy.enclaves))
 
     def command_of_new(self, export: Path, enclave: str) -> str:
-        """Return the shell command for a process of an enclave of which none was observed."""
+        """Return the shell command for a process in an enclave without an observed process."""
         rmw = next((process.rmw for process in self.processes if process.rmw), "")
         return f"{shlex.join(run_words(export, enclave, rmw))} COMMAND"
 
@@ -339,7 +340,7 @@ class ObservedProcesses(NamedTuple):
 
 def is_in_domain(process: Process, domain: int) -> bool:
     """Return whether a process may be in a ROS domain, in the network of this process."""
-    # A domain that rcl cannot read can be any for a program without it.
+    # If the variable has no number, rcl refuses it, but a program without rcl may use any domain.
     may_be_in = process.domain == str(domain) or not process.domain.isdecimal()
     return may_be_in and not process.network
 

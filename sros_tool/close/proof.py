@@ -99,13 +99,13 @@ def _proof_of_files(robot: LocalRobot) -> Proof:
     if holds is False:
         reason = f"{_errors_text(robot)}; then run `{robot.close_command}`, and restart the "
         reason += "processes"
-    if holds and robot.keystore.exists():  # an export from before a revocation has no error
+    if holds and robot.keystore.exists():  # an outdated export has no error of its own
         try:
             _, value = robot.shell.read_json((*robot.export_words(), "--dry-run", "--json"))
             changes = [change["path"] for change in value["changes"]]
         except UnavailableError as error:
             holds, reason = None, f"they cannot be compared with the keystore: {error}"
-        except SrosError as error:  # such as a revocation list that was put back
+        except SrosError as error:  # such as an older revocation list
             holds, reason = False, f"the keystore does not export them: {error}"
         else:
             if changes:
@@ -152,8 +152,8 @@ def _errors_text(robot: LocalRobot) -> str:
 def _proof_of_requirements(robot: LocalRobot) -> Iterator[Proof]:
     """Decide the requirements for the enclaves that the processes use.
 
-    With processes on other machines, or a demand for an enclave that the export does not have, also
-    for the enclaves of the keystore, or of the policy.
+    Also decide them for the enclaves of the keystore (or policy) if processes run on other
+    machines, or a requirement names an enclave that the export does not have.
     """
     if not robot.requirements.exists():
         return
@@ -174,7 +174,7 @@ def _demands_more_enclaves(robot: LocalRobot) -> bool:
 
 
 def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) -> Proof:
-    """Look for nodes as an open listener; before, the same listener saw all nodes.
+    """Look for nodes as an open listener, which saw all nodes before the robot was closed.
 
     Seeing none means something only if the observer ``hears`` the robot in its enclave now.
     """
@@ -193,7 +193,7 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
 
 
 def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
-    """Look for processes that are open, or that something is wrong with.
+    """Look for open processes, and for processes with findings.
 
     ``number`` enclaves have a process with the current files.
     """
@@ -232,7 +232,7 @@ def _process_findings(running: RunningRobot) -> list[Finding]:
 
 
 def _guests(running: RunningRobot) -> Iterator[str]:
-    """Yield processes that are not the robot's: with files of others, or open in other domains."""
+    """Yield processes in enclaves of other folders, and open processes in other domains."""
     known_pids = {process.pid for process, _ in running.secured}
     in_domain = running.in_domain
     for process in in_domain:
@@ -246,7 +246,7 @@ def _guests(running: RunningRobot) -> Iterator[str]:
 
 
 def _why_missing(running: RunningRobot, missing: Sequence[str], observed: ObservedProcesses) -> str:
-    """Return which enclaves have no process, or an open one, and what the others lack."""
+    """Return which enclaves have no process or an open one, and why others do not count."""
     robot = running.robot
     outdated = {name: found for name, found in running.not_current.items() if name in missing}
     causes = {
@@ -284,7 +284,7 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
 
 
 def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection[str]) -> Proof:
-    """Compare what an observer in an enclave sees now with what was seen before.
+    """Compare the nodes that an observer in an enclave sees now with those of the open robot.
 
     Processes of the enclaves ``away`` do not run; ``running`` are the processes of the other
     enclaves at the beginning of the proof.
@@ -392,7 +392,7 @@ class _TalkComparison:
 
 
 def _renamed_text(nodes: ObservedNodes, current: Observation | None, *, fails: bool) -> str:
-    """Return which nodes were compared under new names, and which ones not at all, as text."""
+    """Return, as text, which nodes were compared under new names, and which were not compared."""
     renamed, text = nodes.renamed, ""
     if renamed:
         names = [f"{old} as {expand('~', *renamed[old])}" for old in sorted(renamed)]
@@ -418,7 +418,7 @@ def _renamed_text(nodes: ObservedNodes, current: Observation | None, *, fails: b
 
 
 def _watch_again(nodes: ObservedNodes) -> str:
-    """Return a clause that says how nodes are watched that ran only closed."""
+    """Return a clause on how to watch nodes that have only run closed so far."""
     close = nodes.robot.close_command
     return f"the open robot was watched again: {close} --undo, {close} --for 1m"
 
@@ -434,7 +434,7 @@ def _ended_since(running: RunningRobot) -> dict[str, str]:
 
 
 def _unseen_text(running: RunningRobot, node: str, enclave: str) -> str:
-    """Return a node that an enclave has a profile for, and what to do if it does not exist."""
+    """Return an unseen node, for which an enclave has a profile, and what to do about it."""
     for process, process_enclave in running.secured:
         if (
             process_enclave.name == enclave
@@ -498,7 +498,8 @@ def _lonely_endpoints(
 ) -> list[str]:
     """Return moved endpoints, as text, that no other node talks to under their new name.
 
-    Of the nodes ``before``, another one talked to them; ``denied`` endpoints are left out.
+    Only endpoints count that another node in ``before`` talked to; ``denied`` endpoints are left
+    out.
     """
     refused = _denied_endpoints(denied)
     talked, talks = (

@@ -33,8 +33,8 @@ _MOST_LINES = 20
 def access_lines(policy: Policy, folder: Path) -> list[str]:
     """Return a line for each name in a policy: its senders and its receivers.
 
-    Names that are used only as every node uses them (the common parts) are left out.  What moves
-    the robot stands first, with all of its senders.
+    Names are left out if all their uses are those of every node (the common parts).  Names that
+    move the robot come first, with all of their senders.
     """
     sides = _sides(policy, folder)
     kinds = [*RIGHTS]
@@ -83,7 +83,7 @@ def _sides(policy: Policy, folder: Path) -> Mapping[tuple[str, str], Sequence[_S
     def may(enclave: str, right: str, name: str) -> bool:
         if rules.allow(enclave, right, name):
             return True
-        # A denial of some of the names leaves the others.
+        # If some names are denied, the wildcard still allows the others.
         is_allowed = Right(enclave, ALLOW, right, name) in expressions
         return is_allowed and not rules.cover(Right(enclave, DENY, right, name))
 

@@ -98,8 +98,9 @@ class RunningRobot:
     def runs_open(self, process: ClosedProcess, since: datetime | None = None) -> bool:
         """Return whether a process like the observed one runs without security.
 
-        With ``since``, it must have run since then.  If the observed process belongs to a unit, the
-        other one has to belong to this unit: any user can start one with the same command.
+        With ``since``, the process must have run since that moment.  If the observed process
+        belongs to a unit, the other one has to belong to this unit: any user can start one with the
+        same command.
         """
         return any(
             process.fits(other)
@@ -143,7 +144,7 @@ class RunningRobot:
     def may_use_files(self, process: Process) -> bool:
         """Return whether a process is of a user who can read the enclaves.
 
-        Another user's process can only claim to run in one.
+        A process of another user can only claim to run in an enclave.
         """
         return process.user in (0, self.robot.export.stat().st_uid)
 
@@ -173,7 +174,7 @@ class RunningRobot:
         return f"{warning}{newer} changed, or got another mode, after the start of"
 
     def with_later_processes(self, observed: ObservedProcesses) -> ObservedProcesses:
-        """Return observed processes as they were started later, and those in other enclaves.
+        """Return observed processes with the commands of later starts, and those of other enclaves.
 
         Only processes of users who can read the enclaves count, because sros proposes to run their
         commands.
@@ -308,8 +309,10 @@ class CloseState(NamedTuple):
     without: Sequence[str]
     """The enclaves of `--without`, of which no process has to run."""
     needed_elsewhere: Mapping[str, datetime]
-    """The enclaves of other machines, and when their files in the keystore changed last, in UTC: a
-    machine that got earlier ones still trusts what was revoked since, and needs these."""
+    """The enclaves of other machines, and when their files in the keystore changed last, in UTC. A
+    machine with earlier files still trusts certificates that were revoked since, and needs the
+    current files.
+    """
     valid_until: datetime | None
     """When the first enclave of the export expires, in UTC; null without an export."""
     expires_soon: Sequence[str]
@@ -334,7 +337,7 @@ class CloseState(NamedTuple):
 
     @property
     def is_signed(self) -> bool:
-        """Whether the steps came to the end, so that the policy is what is signed."""
+        """Whether all steps were done, so that the signed permissions are those of the policy."""
         return all(step.state != "open" for step in self.steps)
 
     @property
@@ -363,7 +366,7 @@ class CloseState(NamedTuple):
 
 
 def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
-    """Return the processes of the enclaves that the policy has, as they run now."""
+    """Return how far the robot is closed now; only enclaves of ``policy`` count."""
     running = RunningRobot(robot)
     secured = {
         name: name in running.current_enclaves

@@ -81,8 +81,8 @@ def check_watchable(robot: LocalRobot) -> None:
 def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
     """Watch the robot by a verb, and write its nodes and processes into the folder.
 
-    Return, as sentences, which nodes have no enclave, and which of the observed rights an earlier
-    policy lacks.
+    Return, as sentences, which nodes have no enclave, and which observed rights the existing policy
+    lacks.
 
     Raises:
         SrosError: no node was observed.
@@ -109,7 +109,7 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
     robot.shell.say(f"saw {counted(len(nodes), 'node')}, and {number} of this machine")
     if others := running.in_other_domains():
         robot.shell.say(others)
-    if os.path.lexists(robot.observed_policy):  # of an earlier watch
+    if os.path.lexists(robot.observed_policy):  # a file of an earlier watch
         remove_file(robot.observed_policy)
     without_enclave = [node.fqn for node in all_nodes if not node.enclaves and not is_tool(node)]
     problems = [_without_enclave_text(robot, without_enclave)] if without_enclave else []
@@ -156,7 +156,7 @@ def _remember(robot: LocalRobot, document: str, observed: ObservedProcesses) -> 
     enclaves_here = {process.enclave for process in observed.processes}
     not_here = (robot.not_here - enclaves_here).union(robot.named_elsewhere)
     robot.check_elsewhere()
-    # What does not run now is still started by its command.
+    # A process that does not run now is still started by its remembered command.
     absent = robot.policy_enclaves() - enclaves_here - not_here
     kept = [process for process in robot.processes.processes if process.enclave in absent]
     remembered = observed._replace(processes=[*observed.processes, *kept])
@@ -249,7 +249,7 @@ def _lacking_text(robot: LocalRobot, nodes: Sequence[ObservedNode]) -> str:
 def _likely_meanings(
     lacking: Iterable[Right], used: Collection[Right], policy: Collection[Right]
 ) -> Iterator[str]:
-    """Yield clauses on names of a policy that nodes probably mean by those that it lacks.
+    """Yield clauses on names of a policy that probably correspond to names that it lacks.
 
     ``used`` are the rights that the nodes use, and ``policy`` those of the policy.
     """
@@ -267,7 +267,7 @@ def _likely_meanings(
 def _lost_namespaces(nodes: Sequence[ObservedNode], policy: Policy) -> Iterator[str]:
     """Yield a clause for each node that the policy has only in one other namespace.
 
-    A namespace does not count if a node of this name was seen there, too.
+    Namespaces in which a node of this name was seen are left out.
     """
     observed_names = {node_name(node) for node in nodes}
     namespaces: dict[str, set[str]] = {}

@@ -1,7 +1,7 @@
 """Check the enclaves in a folder on a robot: whether and until when processes can run in them.
 
-`verify_arrival` is for whoever brings them there, the functions below it are for what the robot
-reports later.
+`verify_arrival` is for the delivery of enclaves; the functions below it are for the robot's later
+reports.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class VerifiedFolder(NamedTuple):
 )
 @dataclass(frozen=True, slots=True)
 class ArrivedEnclave:
-    """An enclave on a robot: whether a process can run in it, in which domains, until when.
+    """An enclave on a robot: whether, in which domains and until when a process can run in it.
 
     It is enough if one vendor accepts the enclave; a refusal by another vendor is a finding.
     ``place`` is the PKCS#11 URI of a key on a token.
@@ -166,8 +166,8 @@ def verify_arrival(
 ) -> Arrival:
     """Check the enclaves in a folder on a robot, or one enclave.
 
-    The findings are errors, warnings and unanswered signing requests, without whose answer an
-    enclave does not work.
+    The findings are errors, warnings and signing requests without an answer, because the enclave
+    does not work before the answer.
 
     Args:
         path: a folder with enclaves, or the folder of an enclave.
@@ -289,7 +289,7 @@ def _enclave(
     evaluation = evaluated(name, folder, state, moment=now, domain=domain, zone=zone)
     state = evaluation.state
     loadable = not (state.problems or evaluation.stopped())
-    # On the robot, where there is no ledger, a key that is missing is lost.
+    # A folder without a ledger is on a robot, where a missing key is a lost key.
     has_ledger = (keystore.root / LEDGER).is_file()
     elsewhere = has_ledger and state.key_on_robot and not state.problems_in_keystore
     until = state.valid_until()

@@ -134,7 +134,7 @@ def _authority_findings(
         yield INTERMEDIATE.found(subject, f"{name} is issued by {issuer}. {refused}", file)
     elif role == PERMISSIONS and (fault := next(purpose_faults(chain[:1]), "")):
         yield CA_PURPOSE.found(subject, fault, file)
-    signs_documents = role == PERMISSIONS  # no vendor asks for small keys then (tested)
+    signs_documents = role == PERMISSIONS  # no vendor refuses such a key for its algorithm (tested)
     for finding in key_findings(certificate, subject, file, owner_clause=f"{name} has"):
         if finding.kind is not KEY_ALGORITHM or not signs_documents:
             yield finding
@@ -384,8 +384,7 @@ def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
 
 
 _SHOWN, _MOST_LEFT = 5, 20
-"""Maximum numbers in a finding's text: of enclaves for each removed robot, and of removed
-robots.
+"""Maximum numbers in a finding's text: enclaves of each removed robot, and removed robots.
 """
 
 

@@ -330,7 +330,7 @@ def _validity_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iter
         for moment in (grant.not_before, grant.not_after)
     )
     if begin is None or end is None:
-        return  # TIME_FORMAT reports it
+        return  # the finding TIME_FORMAT reports the dates
     if not begin <= int(now.timestamp()) <= end:
         zone, dates = enclave.keystore.at.zone, f"{_utc(begin)} to {_utc(end)}"
         utc_dates = f"in {zone} Fast DDS reads these dates as {dates}"
@@ -441,7 +441,7 @@ def _domain_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterat
         return
     allowed, wanted = grant.domains(), governed
     if grant.default_allow and not allowed.ranges:
-        return  # the default is for every domain
+        return  # by default, permissions are for every domain
     with suppress(SrosError):
         wanted = EnclaveDomains(governed, enclave.keystore.fleet).of(enclave.name)
     if allowed == wanted:
@@ -452,7 +452,7 @@ def _domain_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterat
         return
     text += f"the governance for {governed}"
     fewer = bool(allowed.ranges) and all(domain in governed for domain in allowed)
-    # On a robot nothing says what was meant, and no node talks in a domain that it should not.
+    # In an export, fewer domains may be intended, and no node can use a wrong domain.
     kind = FEWER_DOMAINS if fewer and not enclave.keystore.is_original else DOMAINS
     yield kind.found(enclave.name, text, file)
 
@@ -639,7 +639,7 @@ def check_governance(
 
 @dataclass(frozen=True, slots=True)
 class _Chosen:
-    """Tells whether a template's settings lead to a governance with the same finding."""
+    """Tells whether a template chooses settings whose governance has the same finding."""
 
     kind: FindingKind
     text: str
@@ -673,8 +673,8 @@ def governance_findings(
     for rule in governance.domain_access_rules:
         subject = f"domain {rule.domains}"
         for kind, text in _rule_findings(rule, vendors):
-            # A template may choose open topics; no template chooses to lose messages, or a rule
-            # that does nothing.
+            # A template may choose open topics, but none chooses lost messages or a rule without
+            # effect.
             flaw = kind in (SIGNED_PAYLOAD, UNREACHABLE_TOPIC_RULE)
             by = "" if flaw else keystore.accepts(kind, _Chosen(kind, text, domains, vendors))
             yield kind.found(subject, text, file, accepted=by)

@@ -270,7 +270,7 @@ def check_enclave(enclave: CheckedEnclave) -> Iterator[Finding]:
     if grant:
         yield from _rights_findings(enclave, grant)
     state = enclave.state
-    known = len(enclave.keystore.authorities) > 1  # then `check_authorities` compares them
+    known = len(enclave.keystore.authorities) > 1  # `check_authorities` compares both CAs
     if not known and state.identity_ca and state.permissions_ca:
         file = enclave.file("identity_ca.cert.pem")
         cas = (state.identity_ca, state.permissions_ca)
@@ -364,7 +364,7 @@ def _rights_findings(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]
         if denied := _denied_before_everything(grant):
             yield ONLY_DENIALS.found(enclave.name, f"{text} but {names_text(denied)}", file)
         else:
-            # No template accepts it: whoever checks a keystore asks whether its robot is closed.
+            # No template accepts this finding, because the question is whether the robot is closed.
             accepted = keystore.accepts(EVERYTHING, lambda _: False)
             yield EVERYTHING.found(enclave.name, text, file, accepted=accepted)
     elif not (enclave.folder / ROUTER_FILE).exists() and any(

@@ -320,13 +320,13 @@ def _folder_findings(
             yield from _write_access_findings(path, info, trusted_users)
             yield from _open_folder(path, root, info.st_mode, original)
         if parent == root and AGENT in folders:
-            folders.remove(AGENT)  # of `sros agent`, closed to others
+            folders.remove(AGENT)  # the folder of `sros agent` is closed to others
         inside = os.path.relpath(parent, root)
         for name in sorted(files):
             path = os.path.join(parent, name)
             try:
                 info = os.lstat(path)
-            except FileNotFoundError:  # removed since, as a writing process removes its lock
+            except FileNotFoundError:  # removed meanwhile, such as a lock
                 continue
             if stat.S_ISLNK(info.st_mode):
                 yield from links.check(path)
@@ -388,7 +388,7 @@ def _interrupted_change_finding(parent: Path, root: str) -> Finding:
 
 def _open_folder(path: str, root: str, mode: int, original: bool) -> Iterator[Finding]:
     inside = Path(path).relative_to(root)
-    # Others cannot enter what is below a closed top folder.
+    # Below a closed top folder, other users cannot enter any folder.
     asked = inside.parts[0] in _KEY_FOLDERS and (len(inside.parts) == 1 or not original)
     if asked and mode & 0o077 and not mode & stat.S_IWOTH:
         text, remedy = f"its mode is {stat.S_IMODE(mode):04o}", f"Run `chmod 700 {quote(path)}`."
@@ -467,7 +467,7 @@ def _content(keystore: CheckedKeystore, path: str) -> bytes:
     except SrosError as error:
         if isinstance(error.__cause__, OSError):
             raise error.__cause__ from None
-        return b""  # it is no regular file any more
+        return b""  # no longer a regular file
 
 
 def _is_kept(keystore: CheckedKeystore, path: str, info: os.stat_result) -> bool:
@@ -477,7 +477,7 @@ def _is_kept(keystore: CheckedKeystore, path: str, info: os.stat_result) -> bool
     try:
         return _holds_key(keystore, path, info)
     except OSError:
-        return False  # reported as one that cannot be read
+        return False  # another check reports an unreadable file
 
 
 def _stray_file_findings(

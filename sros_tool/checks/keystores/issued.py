@@ -282,7 +282,7 @@ def check_issued(
             text = "they have the same certificate: the files of one were copied to the others"
             remedy = _RESTORE if keystore.looks_like_original else "Export these enclaves again."
         yield KEY_TWICE.found(", ".join(names), text, remedy=remedy)
-    # A subject with a unique part matches no other one.
+    # A subject name with a unique part matches no other subject name.
     plain = {summary.name for summary in summaries if not summary.unique}
     names = [summary.name for summary in summaries]
     pairs = [(inner, outer) for inner, outer in mistaken_names(names) if inner in plain]
@@ -428,7 +428,7 @@ def _ledger_findings(
     for entry in entries:
         if entry.what == "permissions":
             signed[entry.enclave].append(entry.sha256)
-    with suppress(SrosError):  # as above
+    with suppress(SrosError):  # a ledger that cannot be read is unread
         for name, expiry in sorted(removed_enclaves(keystore.opened, keystore.at.now).items()):
             text = f"the ledger has a certificate that is valid until {expiry}"
             yield REMOVED.found(name, text, keystore.shown(LEDGER))

@@ -134,13 +134,13 @@ def keystore_findings(
                 differs = any(finding.kind is DIFFERS for finding in findings)
                 shared = [] if differs else about_governance
                 findings += check_vendors(evaluation, [*about_authorities, *shared, *findings])
-            if not at.on_robot and name not in wanted:  # a policy knows more exactly of its nodes
+            if not at.on_robot and name not in wanted:  # a policy says which nodes the enclave has
                 findings = with_start_finding(evaluation, findings)
             all_findings += findings
             if summary := summary_of(enclave):
                 issued.append(summary)
             grant = enclave.state.grant
-            if grant and not keystore.is_original:  # a keystore of many robots has too many names
+            if grant and not keystore.is_original:  # a keystore may have too many robots for this
                 topics[name] = names_without_wildcards(grant)
             tick()
         return all_findings, issued, topics
@@ -231,9 +231,9 @@ def with_joined_findings(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def _governing(keystore: CheckedKeystore, names: Sequence[str]) -> tuple[str, bytes]:
-    """Return the first enclave that has the keystore's signed governance, and this governance.
+    """Return the first enclave with the keystore's signed governance, and this governance.
 
-    For an export, it is the first enclave.
+    For an export, return those of its first enclave.
     """
     common = keystore.governance
     for name in names:
@@ -259,7 +259,7 @@ def _governance_findings(
             file = enclave.file(GOVERNANCE_FILE)
             yield from governance_findings(keystore, enclave.state.governance, file, vendors)
         return
-    with suppress(SrosError):  # `sros create_enclave` reports it
+    with suppress(SrosError):  # `sros create_enclave` reports the error
         document = keystore.opened.files.signed(keystore.governance).document
         governance = parse_governance(document, GOVERNANCE_P7S)
         file = keystore.shown(GOVERNANCE_P7S)

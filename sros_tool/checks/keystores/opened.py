@@ -76,7 +76,7 @@ class Circumstances:
     advisories: tuple[Advisory, ...] | None = None
     """Known DDS vulnerabilities; None for those that ship with sros."""
     sample: Sequence[str] | None = None
-    """The enclaves of a keystore that are checked with the keystore itself; None for all."""
+    """Names of the enclaves to check together with the keystore itself; None for all."""
     on_robot: bool = False
     """Whether a keystore is on a robot, where it must not have a CA key."""
     opened: dict[Path, OpenedKeystore] = field(default_factory=dict, repr=False, compare=False)
@@ -158,7 +158,7 @@ class CheckedKeystore:
     def edits(self) -> HandEdits:
         """Edits by hand in the settings and in the fleet file."""
         signed: Governance | None = None
-        with suppress(SrosError):  # what is wrong with it is a finding of each enclave
+        with suppress(SrosError):  # a faulty settings file is a finding of each enclave
             signed = self.opened.governance
         return hand_edits(self.opened, self.ledger, self.settings, signed)
 

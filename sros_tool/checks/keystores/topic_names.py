@@ -119,7 +119,7 @@ def is_for_ros(grant: Grant) -> bool:
 
 @lru_cache(maxsize=8192)
 def ros_name_problem(text: str) -> str:
-    """Return a clause that says why the expression ``text`` matches no ROS name; "" if it can.
+    """Return a clause on why the expression ``text`` matches no ROS name; "" if it matches one.
 
     Blanks around the text are ignored.
     """

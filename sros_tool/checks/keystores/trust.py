@@ -109,7 +109,7 @@ permissions."""
 
 
 class _Party:
-    """An enclave's certificates of both roles: the CAs that it trusts, and what it presents."""
+    """The CAs that an enclave trusts, its certificate, and the signer of its permissions."""
 
     def __init__(self, certificate: x509.Certificate, trusted_cas: tuple[bytes, bytes]) -> None:
         self.certificate = certificate
@@ -130,7 +130,7 @@ def _certificates(data: bytes) -> _Certificates:
 
 
 Targets = Mapping[str, tuple[OpenedKeystore, Sequence[str]]]
-"""Maps what the user named to a keystore or export, and the enclaves in it."""
+"""Maps each path, as the user wrote it, to its keystore or export and the enclaves in it."""
 
 
 def findings_between(
@@ -138,8 +138,8 @@ def findings_between(
 ) -> Iterator[Finding]:
     """Yield findings about keystores and exports whose nodes do not communicate with each other.
 
-    What cannot be read is a finding of another check, and so are files that are not valid ``now``:
-    if the files of two enclaves are never valid together, one of the two is always reported.
+    Other checks report unreadable files, and files that are not valid ``now``: of two enclaves
+    whose files are never valid at the same time, one always has such a file.
 
     Args:
         targets: the keystores and exports, as the user named them.
@@ -177,7 +177,7 @@ def _strangers(
         for targets_alike in names_by_kinds.values()
     }
     roles = range(1 if on_zenoh else len(ROLES))
-    # Which targets each one is refused by, in which roles; targets with the same are one group.
+    # Maps each target to the targets that refuse it, with the roles; equal entries form a group.
     refused_by: dict[str, dict[str, tuple[int, ...]]] = {shown: {} for shown in parties}
     for first_target, other in combinations(parties, 2):
         if refused := _refused_roles(parties[first_target], parties[other], roles):
@@ -230,7 +230,7 @@ def _parties(keystore: OpenedKeystore, enclaves: Sequence[str]) -> Iterator[tupl
             party = _Party(certificate, trusted)
             issuers = tuple(issued_by(certificate, authority) for authority in party.trusted[0])
             message = keystore.read(folder / PERMISSIONS_FILE, "permissions document")
-            # Which of several CAs signed them differs only in a rotation.
+            # Only in a rotation can enclaves that trust the same CAs have another issuer or signer.
             if (shown := (party.trusted, issuers)) in seen and len(party.trusted[1]) == 1:
                 continue
             seen.add(shown)
@@ -277,10 +277,10 @@ def _names_revoked(data: bytes, keystore: OpenedKeystore, enclaves: Sequence[str
 
 
 def _earlier_lists(targets: Targets, now: datetime) -> Iterator[Finding]:
-    """Yield findings about targets without what the list of another target revokes.
+    """Yield findings about targets that accept certificates which another target's list revokes.
 
-    A later list may lack what the ledger of the keystore knows to have expired; without a keystore
-    among the targets, nothing shows what that is.
+    A later list may lack certificates that have expired. The ledger of a keystore shows which ones;
+    without a keystore among the targets, every missing certificate counts as expired.
     """
     holders: dict[tuple[_Certificates, bytes, bytes], dict[str, None]] = defaultdict(dict)
     for shown, (keystore, enclaves) in targets.items():
@@ -291,7 +291,7 @@ def _earlier_lists(targets: Targets, now: datetime) -> Iterator[Finding]:
                 listed = b""
                 if (folder / CRL_FILE).exists():
                     listed = keystore.read(folder / CRL_FILE, "revocation list")
-                # In a rotation, the file of the CAs has a list, too.
+                # In a rotation, the file of the identity CAs also contains a revocation list.
                 holders[_certificates(trusted), trusted, listed][shown] = None
     found: dict[tuple[str, str], str] = {}
     for (authorities, *own_files), earlier in holders.items():
@@ -326,9 +326,10 @@ def _earlier_lists(targets: Targets, now: datetime) -> Iterator[Finding]:
 def _unexpired(
     serials: frozenset[int], authority: x509.Certificate, targets: Targets, now: datetime
 ) -> frozenset[int]:
-    """Return the serials that no keystore of the CA ``authority`` can rightly have dropped.
+    """Return the serial numbers of certificates that are not expired, by the ledgers of a CA.
 
-    None if there is no keystore, or the CA is a CA service, which knows more certificates.
+    Empty if no keystore of the CA ``authority`` is a target, or if it is a CA service, which also
+    issues certificates that no ledger has.
     """
     may_be_expired = True
     for keystore, _ in targets.values() if serials else ():

@@ -198,7 +198,8 @@ def check_vendors(
         if findings := list(_refusal_findings(evaluation, participants, known_findings)):
             yield from findings
             return
-        # Vendors decide alike on usual names in a document as sros writes it, and each topic costs.
+        # Comparing each topic takes time, and vendors decide alike on usual names in documents as
+        # sros writes them.
         if evaluation.portable and not any(_is_about_rules(finding) for finding in known_findings):
             continue
         ids = {finding.id for finding in known_findings}
@@ -249,7 +250,7 @@ def _refusal_findings(
     if all_refuse:
         errors = [
             finding for finding in known_findings if finding.kind.severity is ERROR
-        ]  # also accepted
+        ]  # errors by kind, also those that the keystore's template accepts
         if all(
             any(_is_named(refusal_cause, errors) for refusal_cause in cause)
             for cause in causes.values()
@@ -461,7 +462,7 @@ def with_start_finding(
     has_denials = any(not rule.allow for rule in grant.rules)
     for domain, participants in evaluation.by_domain.items():
         running = [p for p in participants.values() if not p.causes()]
-        # Vendors decide alike on a document as sros writes it.
+        # Vendors decide alike on documents as sros writes them, so one vendor is enough.
         asked = running[:1] if evaluation.portable and not has_denials else running
         denials = [
             _ordinary_node_denial(participant, grant, described=described) for participant in asked
@@ -569,7 +570,7 @@ def _nodes_to_try(grant: Grant, wanted: str) -> Iterator[str]:
         for expression in _allowed_to_publish(grant):
             if not overlap(expression, wanted):
                 continue
-            # Where only the service has a wildcard, its node is the example.
+            # If only the part after the node's name has a wildcard, that node is the example.
             beginning = expression.partition("*")[0].rpartition("/")[0]
             topic = f"{beginning}/{_TYPES}Reply"
             if not is_expression(topic) and overlap(topic, wanted) and overlap(expression, topic):

@@ -130,7 +130,7 @@ def check_own_zenoh(enclave: CheckedEnclave) -> Iterator[Finding]:
         if ZENOH in enclave.keystore.at.vendors:
             yield _found(MISSING, enclave, f"{SESSION_FILE} is missing", SESSION_FILE)
         return
-    from sros_tool.keystore.zenoh_files import open_zenoh  # most keystores have no such files
+    from sros_tool.keystore.zenoh_files import open_zenoh  # most keystores have no Zenoh files
 
     yield from _configuration_findings(
         enclave, open_zenoh(enclave.folder, enclave.name, enclave.state)
@@ -167,7 +167,7 @@ def check_network(
 
     try:
         domains = keystore.opened.domains
-    except SrosError:  # a finding of each enclave
+    except SrosError:  # each enclave's check reports the error
         return
     try:
         drift = zenoh_drift(keystore.opened, network, domains, authorities[0], keystore.at.now)
