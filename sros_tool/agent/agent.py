@@ -12,6 +12,7 @@ import http.client
 import os
 import ssl
 import time
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -20,11 +21,12 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar
 from urllib.parse import quote, urlsplit
 
+from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from sros_tool.agent.connection import REFUSALS, GuardedConnection, ended_tls
 from sros_tool.agent.fetch import ClientCertificate, FetchError, FetchProblem, fetch_release
-from sros_tool.agent.install import Installation, install_release, release_time
+from sros_tool.agent.install import Installation, install_release, present_lists, release_time
 from sros_tool.agent.running import (
     EnclaveProcesses,
     Systemd,
@@ -81,8 +83,14 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import read_certificate
 from sros_tool.keystore.transaction import recover_keystore
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import make_request, validity_of
-from sros_tool.pki.crl import list_number, load_crl, newest_list, read_lists
+from sros_tool.pki.certificates import (
+    authority_key,
+    load_certificates,
+    make_request,
+    pem,
+    validity_of,
+)
+from sros_tool.pki.crl import list_number, load_crls, newest_list, read_lists
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 from sros_tool.pki.token import Secrets, open_enclave_key
 from sros_tool.runtime.processes import RunningProcesses, boot_id
@@ -486,7 +494,7 @@ class _Round:
             return Installation()
         names = tuple({*release.enclaves(), *search_enclaves(self._folder)[0]})
         keys = _waiting_keys(self._folder, names)
-        replaced = self._revocation_list(names)
+        replaced = self._revocation_lists(names)
 
         def before(ran: Sequence[str]) -> None:
             self._keep_replaced_list(replaced)
@@ -783,7 +791,7 @@ class _Round:
 
     def _list_to_send(self, names: Iterable[str]) -> str | None:
         """Return a revocation list that the keystore may have lost; None if it has the list."""
-        return self._replaced_list() if self._is_in_step else self._revocation_list(names)
+        return self._replaced_list() if self._is_in_step else self._revocation_lists(names)
 
     def _replaced_list(self) -> str | None:
         """Return the kept revocation list that a release replaced by a shorter one, or None."""
@@ -806,24 +814,29 @@ class _Round:
 
     def _drop_replaced_list(self, names: Iterable[str]) -> None:
         """Remove the kept revocation list if the current list revokes the same certificates."""
-        kept, present = self._replaced_list(), self._revocation_list(names)
+        kept, present = self._replaced_list(), self._revocation_lists(names)
         if kept and present and _revoked(kept) <= _revoked(present):
             with suppress(OSError):
                 remove_file(agent_folder(self._folder) / _REPLACED_LIST)
 
-    def _revocation_list(self, names: Iterable[str]) -> str | None:
-        """Return the newest revocation list of these enclaves as PEM; None without one."""
-        lists = []
+    def _revocation_lists(self, names: Iterable[str]) -> str | None:
+        """Return the newest revocation list of each CA of these enclaves as PEM; None without one.
+
+        In a rotation, the list of the second CA is in the file of the CAs.
+        """
         with Folder(self._folder) as opened:
-            for name in names:
-                with suppress(SrosError, OSError):
-                    place = enclave_folder(name)
-                    data = opened.read_inside(f"{place}/{CRL_FILE}")
-                    newest = newest_list(data, opened.read_inside(f"{place}/{IDENTITY_CA_FILE}"))
-                    lists += [newest] if newest is not None else []
-        if not lists:
+            files = {tuple(present_lists(opened, name).items()) for name in names}
+        by_authority: defaultdict[str, list[x509.CertificateRevocationList]] = defaultdict(list)
+        for documents in map(dict, files):
+            with suppress(SrosError):
+                authorities = documents.get(IDENTITY_CA_FILE, b"")
+                for authority in load_certificates(authorities, IDENTITY_CA_FILE):
+                    lists = (newest_list(data, pem(authority)) for data in documents.values())
+                    by_authority[authority_key(authority)] += (e for e in lists if e is not None)
+        newest = (max(lists, key=list_number) for _, lists in sorted(by_authority.items()) if lists)
+        text = "".join(crl.public_bytes(Encoding.PEM).decode() for crl in newest)
+        if not text:
             return None
-        text = max(lists, key=list_number).public_bytes(Encoding.PEM).decode()
         if len(text) > LONGEST_LIST:
             self._problems.append(
                 "The revocation list here is too long for the message of this robot."
@@ -942,9 +955,10 @@ def _trust_digest(folder: Folder, path: str) -> str:
 
 
 def _revoked(text: str) -> frozenset[int]:
-    """Return the serial numbers in a revocation list (PEM); none if it cannot be read."""
+    """Return the serial numbers in revocation lists (PEM); none if one cannot be read."""
     with suppress(SrosError):
-        return frozenset(entry.serial for entry in load_crl(text.encode(), "here").revoked)
+        lists = load_crls(text.encode(), "here")
+        return frozenset(entry.serial for crl in lists for entry in crl.revoked)
     return frozenset()
 
 

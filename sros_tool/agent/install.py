@@ -140,7 +140,7 @@ def install_release(
     enclaves = release.enclaves()
     with Folder(folder) as opened:
         for name, files in enclaves.items():
-            _check_lists(name, files, _present_lists(opened, name))
+            _check_lists(name, files, present_lists(opened, name))
         changes: dict[str, _Change] = {}
         kept: dict[str, str] = {}
         for name, files in sorted(enclaves.items()):
@@ -284,7 +284,7 @@ def _check_lists(name: str, files: Mapping[str, bytes], present: Mapping[str, by
         )
 
 
-def _present_lists(folder: Folder, name: str) -> dict[str, bytes]:
+def present_lists(folder: Folder, name: str) -> dict[str, bytes]:
     """Return the files of an enclave that may have revocation lists, as far as it has them."""
     present: dict[str, bytes] = {}
     for file in LIST_FILES:

@@ -102,7 +102,9 @@ _MOMENT = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z\Z"
 _REQUEST = re.compile(
     r"-----BEGIN CERTIFICATE REQUEST-----\n[A-Za-z0-9+/=\n]+-----END CERTIFICATE REQUEST-----\n\Z"
 )
-_LIST = re.compile(r"-----BEGIN X509 CRL-----\n[A-Za-z0-9+/=\n]+-----END X509 CRL-----\n\Z")
+_LISTS = re.compile(
+    r"(?:-----BEGIN X509 CRL-----\n[A-Za-z0-9+/=\n]+-----END X509 CRL-----\n){1,8}\Z"
+)
 _PEM = re.compile(rb"-----BEGIN CERTIFICATE-----([A-Za-z0-9+/=\s]*)-----END CERTIFICATE-----")
 
 
@@ -185,9 +187,9 @@ class Confirmation:
     whose processes may lack the revocation list, unless these are all: processes of the other
     enclaves lack only their own new documents.  ``boot`` is a SHA-256 that changes with each start
     of the computer.  ``problems`` are short sentences, and ``requests`` signing requests (PEM) for
-    certificates that expire.  ``crl`` is the newest revocation list (PEM) on the robot, if this
-    list may differ from the list that was published last: a keystore that was restored from a
-    backup learns its later revocations from the list.
+    certificates that expire.  ``crl`` is the newest revocation list (PEM) of each
+    identity CA on the robot, if these may differ from the lists that were published last: a
+    keystore that was restored from a backup learns its later revocations from them.
     """
 
     robot: str
@@ -801,8 +803,8 @@ def _list_from(value: Any, most: int, what: str) -> list[Any]:
 
 
 def _crl_from(value: Any) -> str:
-    if not (isinstance(value, str) and len(value) <= LONGEST_LIST and _LIST.match(value)):
-        raise _FormError("its crl is not one revocation list in PEM")
+    if not (isinstance(value, str) and len(value) <= LONGEST_LIST and _LISTS.match(value)):
+        raise _FormError("its crl is not a few revocation lists in PEM")
     return value
 
 

@@ -140,7 +140,19 @@ def load_crl(data: bytes, name: str) -> RevocationList:
     Raises:
         PkiError: the list cannot be read, or states no expiry; ``name`` names the file.
     """
-    crl = read_list(data, name)
+    return _fields_of(read_list(data, name), name)
+
+
+def load_crls(data: bytes, name: str) -> tuple[RevocationList, ...]:
+    """Return all revocation lists of a PEM file, which may have certificates, too.
+
+    Raises:
+        PkiError: as `load_crl`, for any list.
+    """
+    return tuple(_fields_of(crl, name) for crl in read_lists(data, name))
+
+
+def _fields_of(crl: x509.CertificateRevocationList, name: str) -> RevocationList:
     expiry = next_update(crl)
     if expiry is None:
         raise PkiError(f"the revocation list {name} does not say when it expires", "", _RESTORE)

@@ -38,7 +38,7 @@ from sros_tool.keystore.layout import CRL_FILE, REQUIRED_FILES
 from sros_tool.keystore.reader import read_certificate
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificates, load_request, validity_of
-from sros_tool.pki.crl import load_crl, sign_crl
+from sros_tool.pki.crl import load_crl, load_crls, sign_crl
 from sros_tool.pki.keys import load_key
 from sros_tool.runtime.processes import (
     LoadedFile,
@@ -147,6 +147,9 @@ class Robot:
         enclave = ProcessEnclave(str(here), name, files, is_there=is_there, here=here)
         started, user = self.started[name], self.user
         return Process(1, ("node",), environment, started, user=user, enclave=enclave)
+
+    def revocation_list(self, name: str = "/r1/a") -> str:
+        return (self.folder / f"enclaves{name}" / CRL_FILE).read_text()
 
     def message(self) -> Confirmation:
         """Return the last message, whose signature is verified."""
@@ -394,7 +397,7 @@ def test_a_revocation_list_that_home_may_have_lost_is_sent(home: Home, r1: Robot
     for _ in range(2):
         r1.round()
         assert r1.message().crl is None
-    mine = (r1.folder / "enclaves/r1/a" / CRL_FILE).read_text()
+    mine = r1.revocation_list()
     for other in (home.release(home.renewed.files), FetchError(FetchProblem.ROLLED_BACK, "x", "")):
         r1.release = other
         r1.round()
@@ -404,20 +407,40 @@ def test_a_revocation_list_that_home_may_have_lost_is_sent(home: Home, r1: Robot
     assert r1.message().crl is None
 
 
+def test_the_list_of_the_second_ca_in_a_rotation_is_sent_too(
+    home: Home, r1: Robot, tmp_path: Path
+) -> None:
+    """Home may have lost what was revoked before the stage at which the new CA issues."""
+    r1.release = home.revoked
+    r1.round()
+    revoked = {e.serial for e in load_crl(r1.revocation_list().encode(), "it").revoked}
+    root = copy_of(home.root, tmp_path / "home")
+    for number in (4, 5):
+        sros("rotate_ca", root, "--identity", "--next").ok()
+        r1.release = release_of(files_of(root), number, home.authority)
+        assert "/r1/b" in r1.round().changed
+    assert not load_crl(r1.revocation_list("/r1/b").encode(), "it").revoked, "of the new CA"
+    r1.release = FetchError(FetchProblem.ROLLED_BACK, "x", "")
+    r1.round()
+    lists = load_crls((r1.message().crl or "").encode(), "it")
+    assert [each.number for each in lists if revoked <= {e.serial for e in each.revoked}]
+    assert len(lists) == 2
+
+
 def test_a_revocation_list_that_is_replaced_by_one_that_revokes_less_is_sent(
     home: Home, r1: Robot, tmp_path: Path
 ) -> None:
     """As by a home that was restored from a backup, and has revoked something else since."""
     r1.release = home.revoked
     r1.round()
-    mine = (r1.folder / "enclaves/r1/a" / CRL_FILE).read_text()
+    mine = r1.revocation_list()
     root = copy_of(home.root, tmp_path / "home")
     sros("crl", root, "--refresh").ok()
     r1.release = release_of(files_of(root), 4, home.authority)
     r1.round()
     assert r1.message().crl is None, "the new list has the same entries"
     number = load_crl(mine.encode(), "it").number
-    before = (r1.folder / "enclaves/r1/a" / CRL_FILE).read_text()
+    before = r1.revocation_list()
     for later in (5, 6):
         other = sign_crl(
             read_certificate(root / "public/identity_ca.cert.pem"),

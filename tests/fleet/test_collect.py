@@ -629,19 +629,26 @@ def test_the_verb_names_the_next_step(home: Home) -> None:
     crl, now = lose_revocations(home), datetime.now(UTC)
     home.send("r1", now)
     assert "bring them" not in sros("fleet", "collect", "ks", "inbox", cwd=home.folder).err
-    home.send("r1", now, crl=crl)
+    home.send("r1", now, crl=foreign_list(home) + crl)
     ended = sros("fleet", "collect", "ks", "inbox", cwd=home.folder)
     assert "bring them there: `sros distribute_key ks --robot NAME FOLDER --force`" in ended.err
 
 
-def test_a_list_of_another_keystore_revokes_nothing(home: Home) -> None:
+def foreign_list(home: Home) -> str:
+    """Return a revocation list of another keystore, with an enclave of the same name."""
     home.run("create_keystore", "other")
     home.run("create_enclave", "other", "/r2/base")
     home.run("revoke", "other", "/r2/base")
-    foreign = (home.folder / "other/public/identity_ca.crl.pem").read_text()
+    return (home.folder / "other/public/identity_ca.crl.pem").read_text()
+
+
+def test_a_list_of_another_keystore_revokes_nothing(home: Home) -> None:
+    foreign = foreign_list(home)
     home.send("r1", crl=foreign)
     found = home.collect()
     assert found.robots[0].outcome == "kept" and not found.notes
+    home.send("r1", crl=9 * foreign)
+    assert "not a few revocation lists" in home.of("r1").why
     home.send("r1", crl=foreign.replace("\n-----END", "\nAAAA\n-----END"))
     assert home.of("r1").outcome == "kept"
     assert OpenedKeystore(home.root).revocation_list is None

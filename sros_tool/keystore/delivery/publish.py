@@ -60,6 +60,7 @@ from sros_tool.keystore.layout import (
     FLEET_ROOT,
     IDENTITY,
     IDENTITY_CA_FILE,
+    LIST_FILES,
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
     PUBLISHED,
@@ -125,6 +126,8 @@ _MOST_SUPERSEDED = 500_000
 many.
 """
 _BEFORE = "before"
+_LIST_PATHS = tuple(f"/{file}" for file in LIST_FILES)
+"""Ends of the paths of files that may have revocation lists."""
 
 
 class RobotRelease(NamedTuple):
@@ -660,7 +663,7 @@ class _Run:
                 unknown = [self._last_read()] if is_later else unknown
                 self._check_authorities(unknown[-1])
                 for path, content in chain.from_iterable(of.files.items() for of in unknown):
-                    if path.endswith(f"/{CRL_FILE}"):
+                    if path.endswith(_LIST_PATHS):
                         forgotten.add(content)
             else:
                 self._notes.append(self._not_shown_note())
@@ -949,7 +952,7 @@ class _Run:
             or any(
                 forgotten.add(content)
                 for path, content in release.files.items()
-                if path.endswith(f"/{CRL_FILE}")
+                if path.endswith(_LIST_PATHS)
             )
         ]
         return sorted(unknown, key=lambda release: release.number)

@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT
 from sros_tool.keystore.delivery.release import read_release, release_target
-from sros_tool.keystore.layout import CRL_FILE, IDENTITY, PUBLISHED
+from sros_tool.keystore.layout import IDENTITY, LIST_FILES, PUBLISHED
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.pki.crl import load_crl, signed_by
+from sros_tool.pki.crl import load_crls, signed_by
 from sros_tool.validity import iso, parse_iso
 from sros_tool.values import parse_json
 from sros_tool.xml import read_bytes
@@ -223,12 +223,12 @@ def later_revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
         for path in archives:
             with suppress(SrosError, OSError):
                 release = read_release(read_bytes(path, "archive", max_bytes=OF_ONE_ROBOT.packed))
-                lists = {data for file, data in release.files.items() if file.endswith(CRL_FILE)}
+                lists = {data for file, data in release.files.items() if file.endswith(LIST_FILES)}
                 for data in lists - read_lists:
                     read_lists.add(data)
-                    crl = load_crl(data, f"'{path}'")
-                    if any(signed_by(crl.list, authority) for authority in authorities):
-                        serials.update(entry.serial for entry in crl.revoked)
+                    for crl in load_crls(data, f"'{path}'"):
+                        if any(signed_by(crl.list, authority) for authority in authorities):
+                            serials.update(entry.serial for entry in crl.revoked)
     return frozenset(serials)
 
 

@@ -70,6 +70,7 @@ from sros_tool.pki.crl import (
     RevocationList,
     Revoked,
     load_crl,
+    load_crls,
     sign_crl,
     signed_by,
 )
@@ -131,18 +132,21 @@ class Forgotten:
     def add(self, document: bytes) -> bool:
         """Add the lists in a PEM file that the keystore has to know; return whether there are any.
 
-        Such a list revokes other certificates, or is not earlier than the keystore's list, so that
-        robots would refuse the keystore's next list.
+        The file may have certificates, too.  Such a list revokes other certificates, or is not
+        earlier than the keystore's list, so that robots would refuse the keystore's next list.
         """
         sha256 = hashlib.sha256(document).digest()
         if sha256 in self._seen:
             return False
         self._seen.add(sha256)
         try:
-            crl = load_crl(document, "of a robot")
-            signers = [ca for ca in self._authorities if signed_by(crl.list, ca)]
+            added = [self._add_list(crl) for crl in load_crls(document, "of a robot")]
         except SrosError:
             return False
+        return any(added)
+
+    def _add_list(self, crl: RevocationList) -> bool:
+        signers = [ca for ca in self._authorities if signed_by(crl.list, ca)]
         serials = {entry.serial for entry in crl.revoked}
         latest = self._latest
         is_later = self._issuing in signers and (

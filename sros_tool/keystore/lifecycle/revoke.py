@@ -33,7 +33,7 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import issued_by, key_digest
-from sros_tool.pki.crl import REASONS, SUPERSEDED, load_crl, signed_by
+from sros_tool.pki.crl import REASONS, SUPERSEDED, load_crls, signed_by
 from sros_tool.validity import iso
 from sros_tool.wording import counted, first_few
 
@@ -324,8 +324,9 @@ def refresh_crl(
     keystore = OpenedKeystore(root)
     keyring = options.get("keyring", IN_KEYSTORE)
     if crl and not keyring.ca_service(root, IDENTITY, keystore.template):
-        lost, forgotten = load_crl(crl, "that was given"), Forgotten(keystore, options["now"])
-        if not any(signed_by(lost.list, ca) for ca in keystore.authority(IDENTITY)):
+        lost, forgotten = load_crls(crl, "that was given"), Forgotten(keystore, options["now"])
+        authorities = keystore.authority(IDENTITY)
+        if not any(signed_by(each.list, ca) for each in lost for ca in authorities):
             raise KeystoreError(
                 "no identity CA of the keystore signed the revocation list that was given",
                 "Whoever wrote it could have any certificate revoked. Nothing was changed.",
