@@ -25,6 +25,7 @@ from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
+from sros_tool.pki.crl import load_crl
 from tests.support.harness import copy_of
 
 pytestmark = pytest.mark.skipif(not shutil.which("openssl"), reason="the program openssl is needed")
@@ -195,7 +196,10 @@ def test_no_older_list_takes_the_place_of_a_newer_one(
         with pytest.raises(RefusedError, match=f"older than .* the keystore has {number}"):
             check_lists(files[before], files[after], str(tmp_path))
     (remark,) = check_lists(files["revoked"], files["restored twice"], str(tmp_path))
-    assert remark.startswith("The current revocation list has 1 serial numbers")
+    (revoked,) = load_crl(files["revoked"]["enclaves/a/crl.pem"], "it").revoked
+    lost = "The current revocation list has 1 serial numbers that the new one lacks, such as {}."
+    assert remark.startswith(lost.format(f"{revoked.serial:x}")), "as inspect --history shows it"
+    assert "`sros inspect KEYSTORE --history` can" in remark
     monkeypatch.setenv("PATH", "/nonexistent")
     with pytest.raises(RefusedError, match="lacks openssl"):
         check_lists(files["revoked"], files["ks"], str(tmp_path))
