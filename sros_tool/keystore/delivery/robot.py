@@ -618,8 +618,8 @@ def _lost_revocation_notes(place: Path, answer: RequestAnswer) -> Iterator[Note]
             f"the revocation list until now revokes {counted(len(lost), 'certificate')} that the "
             f"new one lacks, such as {min(lost):x}. This is right if they have expired, which "
             "`sros inspect KEYSTORE --history` shows. If one has not, or is not there, the "
-            "keystore comes from a backup: then take the list over from another robot, with `sros crl "
-            "KEYSTORE --refresh --crl FILE`, and have the request signed again."
+            "keystore comes from a backup: then take the list over from another robot, with "
+            "`sros crl KEYSTORE --refresh --crl FILE`, and have the request signed again."
         )
         yield Note("import.list-lacks", text)
 
