@@ -29,8 +29,8 @@ from sros_tool.checks.environment import (
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.checks.vulnerabilities import vulnerability_metrics
 from sros_tool.dds.advisories import Advisory
-from sros_tool.dds.decision.grants import read_moment
-from sros_tool.dds.decision.vendors import FAST_DDS, Moments, Vendor
+from sros_tool.dds.decision.grants import read_date
+from sros_tool.dds.decision.vendors import FAST_DDS, DateRule, Vendor
 from sros_tool.dds.permissions import Grant, parse_permissions
 from sros_tool.errors import SrosError
 from sros_tool.faults import ORIGINAL_KEYSTORE, Fault
@@ -398,7 +398,7 @@ def _local_time_findings(
         return
     process_zone = _zone(process.environment.get("TZ", ""), zone)
     begin, end = (
-        read_moment(Moments.LOCAL, e, process_zone) for e in (grant.not_before, grant.not_after)
+        read_date(DateRule.LOCAL, e, process_zone) for e in (grant.not_before, grant.not_after)
     )
     if begin is None or end is None or begin <= int(now.timestamp()) <= end:
         return

@@ -1,15 +1,15 @@
 """Known vulnerabilities of DDS products, as advisories in the OSV format.
 
-The advisories that ship with sros are in ``advisories.json`` next to this module: what the history
-of eProsima/Fast-DDS says of each release line of Fast DDS (as of 2026-08-20).  An event ``fixed``
-names the first release with the fix.  A release line without a fixed release has no such event, so
-its later releases count as affected until newer advisories say otherwise.
+The advisories that ship with sros are in ``advisories.json`` next to this module: for each release
+line of Fast DDS, they say what the git history of eProsima/Fast-DDS says (as of 2026-08-20).  An
+event ``fixed`` names the first release with the fix.  A release line that was never fixed has no
+such event, so all its later releases count as affected until newer advisories name a fix.
 
 ``database_specific`` has three members.  ``needs`` is what an attack needs: ``security`` (DDS
 Security is on), ``identity`` (a certificate of the keystore's CA), ``document`` (a document that
 the permissions CA signed) or nothing but the network.  ``gives`` is its effect: ``denial``,
-``memory``, ``access`` or ``unclear``.  ``unclear_lines`` are release lines of which the history
-says nothing, which does not mean that they are not affected.
+``memory``, ``access`` or ``unclear``.  ``unclear_lines`` are release lines about which the history
+says nothing; they may be affected.
 
 Source: https://ossf.github.io/osv-schema.
 """
@@ -61,8 +61,8 @@ class Advisory(NamedTuple):
     """A known vulnerability of one product.
 
     ``needs`` and ``gives`` are words of ``database_specific``.  ``unclear_lines`` are release
-    lines, such as 2.14, that may be affected.  ``unread`` are listed versions that are not three
-    numbers, such as release candidates; they are ignored.
+    lines, such as 2.14, that may be affected.  ``unread`` are the listed versions that do not
+    consist of three numbers, such as release candidates; `affects` ignores them.
     """
 
     id: str
@@ -88,7 +88,7 @@ class Advisory(NamedTuple):
         return ".".join(map(str, last))
 
     def with_releases_of(self, other: Advisory) -> Advisory:
-        """Return the advisory with the releases of another one that has the same id."""
+        """Return this advisory with the releases of ``other``, which has the same id, added."""
         return self._replace(
             ranges=self.ranges + other.ranges,
             versions=self.versions | other.versions,
@@ -100,7 +100,7 @@ class Advisory(NamedTuple):
 class KnownVulnerabilities(NamedTuple):
     """The advisories about one release of a product.
 
-    ``known`` advisories affect the release; ``unclear`` ones perhaps.
+    ``known`` advisories affect the release; ``unclear`` advisories may affect it.
     """
 
     known: tuple[Advisory, ...]
@@ -112,8 +112,8 @@ def known_vulnerabilities(
 ) -> KnownVulnerabilities | None:
     """Return the advisories about a release, such as "2.14.5" of "Fast DDS".
 
-    ``advisories`` None stands for those that ship with sros.  Returns None if the version cannot be
-    read, or if no advisory is about the product.
+    If ``advisories`` is None, those that ship with sros are used.  Returns None if the version
+    cannot be read, or if no advisory is about the product.
     """
     numbers = version_numbers(version)
     advisories_of_library = [
@@ -147,13 +147,14 @@ def shipped_advisories() -> tuple[Advisory, ...]:
 
 
 def read_advisories(path: Path) -> tuple[Advisory, ...]:
-    """Return the advisories that ship with sros, and those in a file.
+    """Return the advisories that ship with sros together with those in a file.
 
-    An advisory in the file replaces the one with the same id, for the products that it names.
+    An advisory in the file replaces the shipped advisory with the same id, for the products that
+    the file names.
 
     Raises:
-        DocumentError: The file cannot be read, is not of the OSV format, or is about no product
-            that sros knows.
+        DocumentError: the file cannot be read, is not in the OSV format, or has no advisory about a
+            product that sros knows.
     """
     newer = parse_advisories(read_bytes(path, "advisories", max_bytes=_MOST_BYTES), f"'{path}'")
     if not newer:
@@ -172,8 +173,8 @@ def read_advisories(path: Path) -> tuple[Advisory, ...]:
 def parse_advisories(data: bytes, label: str) -> tuple[Advisory, ...]:
     """Return the advisories in OSV records; ``label`` is the name of ``data`` in errors.
 
-    Records with the same id become one advisory, which has the releases of all of them.  A
-    withdrawn record affects no release.  Products that sros does not know are left out.
+    Records with the same id become one advisory, which has the releases of all of them.  Withdrawn
+    records count as affecting no release.  Products that sros does not know are left out.
 
     Raises:
         DocumentError: the data is not in the OSV format, or states no releases of a known product.
@@ -242,7 +243,7 @@ _CVE = re.compile(r"CVE-\d{4}-\d{4,9}", re.ASCII)
 
 
 def _product(affected: Mapping[str, Any]) -> str:
-    """Return the product, by the name of the package or its repository; "" if unknown."""
+    """Return the product of an OSV ``affected`` entry, by package or repository; "" if unknown."""
     names = [_object(affected.get("package", {})).get("name", "")]
     names += [_object(part).get("repo", "") for part in _list(affected.get("ranges", []), "ranges")]
     for name in names:
@@ -256,7 +257,7 @@ def _ranges(affected: Mapping[str, Any], identity: str) -> Iterator[_Range]:
     for part in map(_object, _list(affected.get("ranges", []), "ranges")):
         kind = part.get("type")
         if kind == "GIT":
-            continue  # commits: the releases are in `versions`
+            continue  # a range of git commits: the releases are listed in ``versions``
         if kind not in ("SEMVER", "ECOSYSTEM") or not part.get("events"):
             raise ValueError(f"a range of {identity} has another type, or no events")
         introduced: Version | None = None
@@ -300,7 +301,7 @@ def _text(value: object) -> str:
 
 
 def _line(product: str, version: Version) -> str:
-    """Return the branch of releases that a version belongs to, such as 2.14 for 2.7 to 2.14."""
+    """Return the release line of a version; releases 2.7 to 2.14 of Fast DDS are line 2.14."""
     if product != "Fast DDS":
         return f"{version[0]}.{version[1]}"
     for first, line in ((3, 3), "3.6"), ((3, 0), "3.2"), ((2, 7), "2.14"):

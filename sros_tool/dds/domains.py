@@ -19,8 +19,8 @@ _ONE = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?\Z", re.ASCII)
 class DomainRange:
     """The domains from ``first`` to ``last``, both included.
 
-    In documents that others wrote, one of them may be missing (None); vendors read that
-    differently, and sros never writes it.
+    In documents that sros did not write, ``first`` or ``last`` may be missing (None); vendors
+    differ in how they read such a range.
     """
 
     first: int | None
@@ -41,7 +41,7 @@ class DomainRange:
 
 @dataclass(frozen=True, slots=True)
 class DomainSet:
-    """Domain ids, as ranges in the order of the document."""
+    """A set of domain ids, as ranges in the order of the document."""
 
     ranges: tuple[DomainRange, ...]
 
@@ -49,7 +49,7 @@ class DomainSet:
     def parse(cls, text: str, source: str = "") -> DomainSet:
         """Return the domains in a text such as ``0``, ``0,7`` or ``3-5,9``, as sorted ranges.
 
-        ``source`` says in errors where the text comes from.
+        ``source`` is where the text comes from, for errors.
 
         Raises:
             UsageError: the text is not a list of whole numbers from 0 to 230.
@@ -71,7 +71,7 @@ class DomainSet:
 
     @classmethod
     def of(cls, *pairs: tuple[int, int]) -> DomainSet:
-        """Return the set of these ranges, which are sorted and joined where they touch."""
+        """Return the set of these ranges, sorted, with overlapping and adjacent ranges joined."""
         joined: list[tuple[int, int]] = []
         for first, last in sorted(pairs):
             if joined and first <= joined[-1][1] + 1:
@@ -99,8 +99,8 @@ class DomainSet:
     def closed(self) -> DomainSet:
         """Return the set without open ranges, sorted and joined.
 
-        A range without its end has only its first domain, and one without its beginning begins at
-        0, as Fast DDS and Cyclone DDS read them.
+        As in Fast DDS and Cyclone DDS, a range without a last domain has only its first domain, and
+        a range without a first domain begins at 0.
         """
         pairs = []
         for part in self.ranges:
@@ -114,8 +114,8 @@ class DomainSet:
     ) -> tuple[int, ...]:
         """Return one domain for each group of domains that are in the same sets, sorted.
 
-        Only domains in a ``listed`` set are returned, unless a range lacks one of its ends:
-        vendors read such ranges differently.
+        Only groups within the ``listed`` sets count.  But if a range lacks one of its ends, all
+        groups count, because vendors read such a range differently.
         """
         sets = dict.fromkeys((*listed, *other_sets))
         borders = {0}
@@ -137,7 +137,10 @@ class DomainSet:
 
     @classmethod
     def parts(cls, sets: Iterable[DomainSet]) -> tuple[DomainSet, ...]:
-        """Divide the domains of closed sets into parts: no set has only some domains of a part."""
+        """Return the groups of domains that are in the same of the ``sets``, which must be closed.
+
+        So a set has either all domains of a group or none.
+        """
         ranges: dict[tuple[bool, ...], list[tuple[int, int]]] = {}
         known = tuple(dict.fromkeys(sets))
         if len(known) == 1:
@@ -151,7 +154,7 @@ class DomainSet:
         return tuple(cls.of(*pairs) for pairs in ranges.values())
 
     def __and__(self, other: DomainSet) -> DomainSet:
-        """Return the domains that two closed sets have in common."""
+        """Return the domains that are in both closed sets."""
         common = (
             (max(left.first or 0, right.first or 0), min(left.last or 0, right.last or 0))
             for left in self.ranges
@@ -160,10 +163,10 @@ class DomainSet:
         return DomainSet.of(*(pair for pair in common if pair[0] <= pair[1]))
 
     def preferred(self) -> int:
-        """Return 0, the default of ROS, if it is in the set, else the first domain of the set."""
+        """Return domain 0, the default of ROS, if it is in the set, else the set's first domain."""
         return 0 if 0 in self else next(iter(self))
 
     def only(self) -> int | None:
-        """Return the domain if the set has only one, else None."""
+        """Return the domain of a set that has only one, else None."""
         domains = list(self)
         return domains[0] if len(domains) == 1 else None

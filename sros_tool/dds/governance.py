@@ -24,7 +24,7 @@ _SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_governanc
 
 
 class ProtectionKind(StrEnum):
-    """The protection of messages; the long forms also prove which writer a message came from."""
+    """The protection of messages; ``..._WITH_ORIGIN_AUTHENTICATION`` also proves the writer."""
 
     NONE = "NONE"
     SIGN = "SIGN"
@@ -43,11 +43,11 @@ class Attribute(NamedTuple):
     All code that reads, writes, describes or compares rules iterates over `attributes`, in the
     order of the schema and of the fields.  So a new attribute needs only a new field.
 
-    ``name`` is the name of the element and of the field; ``term`` is the field of
-    `sros_tool.policy.model` that it is translated from.  ``values`` are the allowed values.
-    ``open`` is the value that protects nothing; ``portable`` is a value that protects and that all
-    vendors enforce alike.  ``default`` is the value if a document lacks the element; None if the
-    schema requires the element.
+    ``name`` is the name of the XML element and of the rule's field; ``term`` is the field of
+    `sros_tool.policy.model` that is translated into the attribute.  ``values`` are the allowed
+    values.  ``open`` is the value that protects nothing; ``portable`` is a value that protects and
+    that all vendors enforce alike.  ``default`` is the value if a document lacks the element; None
+    if the schema requires the element.
     """
 
     name: str
@@ -63,12 +63,15 @@ class Attribute(NamedTuple):
         return isinstance(self.open, bool)
 
     def is_open(self, rule: DomainRule | TopicRule) -> bool:
-        """Return whether the rule has the value that protects nothing."""
+        """Return whether ``rule`` has the attribute's open value, the one that protects nothing."""
         return bool(getattr(rule, self.name) == self.open)
 
 
 def _flag(term: str, *, protects: bool = True) -> dict[str, Any]:
-    """Declare an attribute that is true or false; ``protects`` is the value that protects."""
+    """Return the field metadata of an attribute with the values true and false.
+
+    ``protects`` is the value that protects.
+    """
     values = (False, True)
     return {"term": term, "values": values, "open": not protects, "portable": protects}
 
@@ -76,7 +79,7 @@ def _flag(term: str, *, protects: bool = True) -> dict[str, Any]:
 def _protection_kind(
     term: str, values: tuple[ProtectionKind, ...] = tuple(ProtectionKind)
 ) -> dict[str, Any]:
-    """Declare an attribute that is a protection kind."""
+    """Return the field metadata of an attribute whose value is a protection kind."""
     kinds = {"open": ProtectionKind.NONE, "portable": ProtectionKind.ENCRYPT}
     return {"term": term, "values": values, **kinds}
 
@@ -110,13 +113,13 @@ class TopicRule:
 )
 @dataclass(frozen=True, slots=True)
 class DomainRule:
-    """The protection of some domains; the first topic rule that matches a topic decides."""
+    """The protection of some domains; the first topic rule that matches a topic applies to it."""
 
     domains: DomainSet
     allow_unauthenticated_participants: bool = field(
         metadata=_flag("allow_unauthenticated_participants", protects=False)
     )
-    """Whether participants without a certificate are let in."""
+    """Whether participants without a certificate may join."""
     enable_join_access_control: bool = field(metadata=_flag("join_access_control"))
     """Whether permissions decide who may join."""
     discovery_protection_kind: ProtectionKind = field(metadata=_protection_kind("discovery"))
@@ -151,7 +154,7 @@ def attributes(rule: type[DomainRule | TopicRule]) -> tuple[Attribute, ...]:
 
 
 def settings(rule: type[DomainRule | TopicRule], *, protect: bool) -> dict[str, Any]:
-    """Map the attributes of a rule to values that protect; if not ``protect``, to open values."""
+    """Map attribute names to values that protect, which are portable, or else to open values."""
     return {
         attribute.name: attribute.portable if protect else attribute.open
         for attribute in attributes(rule)
@@ -159,7 +162,7 @@ def settings(rule: type[DomainRule | TopicRule], *, protect: bool) -> dict[str, 
 
 
 class Governance(NamedTuple):
-    """A governance document; the first domain rule that names a domain decides."""
+    """A governance document; the first domain rule that lists a domain applies to it."""
 
     domain_access_rules: tuple[DomainRule, ...]
 
@@ -197,7 +200,8 @@ def render_governance(governance: Governance) -> bytes:
 def _attribute_lines(rule: DomainRule | TopicRule) -> Iterator[str]:
     for attribute in attributes(type(rule)):
         value = getattr(rule, attribute.name)
-        # Vendors refuse elements that they do not know, so an optional default is left out.
+        # Vendors refuse elements that they do not know, so an attribute with its default is left
+        # out.
         if attribute.default is None or value != attribute.default:
             text = json.dumps(value) if attribute.is_flag else str(value)
             yield f"<{attribute.name}>{text}</{attribute.name}>"

@@ -22,24 +22,27 @@ from sros_tool.xml import escape, parse, quoted, require_child, tag_of
 _SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_permissions.xsd"
 XSI = "http://www.w3.org/2001/XMLSchema-instance"
 MAX_SIGNED_BYTES = 60 * 1024
-"""Size limit, in bytes, of signed permissions: with more, Fast DDS 2.6 and 2.9 may not finish.
+"""Largest signed permissions, in bytes, with which handshakes of Fast DDS 2.6 and 2.9 finish.
 
 A message of the handshake must fit into one UDP datagram of 64 KB, with the certificate, the
-signature and the participant's data.  Tested with Fast DDS 2.9.1 on one network interface:
-63,129 bytes work and 63,189 do not for an EC certificate of 0.6 KB; for an RSA certificate of
-0.9 KB, 62,579 and 62,854.  The rest is room for longer certificates and more interfaces.
+signature and the participant's data.  Tested with Fast DDS 2.9.1 on one network interface: with an
+EC certificate of 0.6 KB, 63,129 bytes work and 63,189 do not; with an RSA certificate of 0.9 KB,
+62,579 work and 62,854 do not.  The rest is room for longer certificates and more interfaces.
 """
 LARGE_BYTES = MAX_SIGNED_BYTES - 6 * 1024
-"""Size in bytes from which a document, before it is signed, is written as short as possible.
+"""Size in bytes from which an unsigned document is written as short as possible.
 
-The difference is room for the signature and its certificate.
+The difference to `MAX_SIGNED_BYTES` is room for the signature and its certificate.
 """
 TOPIC_LINE_BYTES = len("            <topic></topic>\r\n")
-"""Size in bytes that a topic adds to a signed document, without its name, if it is indented."""
+"""Number of bytes that a topic adds to an indented signed document, without the topic's name."""
 
 
 class Criteria(NamedTuple):
-    """The topics of a rule; no partitions means the default partition."""
+    """The topics and partitions of a ``<publish>`` or ``<subscribe>`` in a rule.
+
+    No partitions means the default partition.
+    """
 
     topics: tuple[str, ...]
     partitions: tuple[str, ...] = ()
@@ -55,10 +58,10 @@ class Rule(NamedTuple):
     subscribe: tuple[Criteria, ...] = ()
     relay: tuple[Criteria, ...] = ()
     order: tuple[str, ...] = ()
-    """The direction of each criteria in the order of the document; () if publish comes first."""
+    """The direction of each criteria in document order; () means that publish comes first."""
 
     def criteria_of(self, directions: Sequence[str]) -> Iterator[tuple[str, Criteria]]:
-        """Yield the criteria of these directions, each with its direction, in their order."""
+        """Yield the criteria of ``directions`` in document order, each with its direction."""
         criteria = {each: iter(getattr(self, each)) for each in directions}
         order = self.order or [each for each in directions for _ in getattr(self, each)]
         for direction in order:
@@ -76,9 +79,9 @@ class Grant(NamedTuple):
     rules: tuple[Rule, ...]
     default_allow: bool = False
     default_empty: bool = False
-    """Whether ``<default>`` is empty; Cyclone DDS crashes on that."""
+    """Whether ``<default>`` is empty, which crashes Cyclone DDS."""
     default_first: bool = False
-    """Whether ``<default>`` stands before a rule; Fast DDS ignores what follows it."""
+    """Whether ``<default>`` stands before a rule; Fast DDS ignores rules after it."""
 
     @property
     def validity(self) -> Window:
@@ -116,7 +119,7 @@ class Permissions(NamedTuple):
 
 
 def grant(name: str, subject: str, validity: Window, rules: tuple[Rule, ...]) -> Grant:
-    """Return a grant as all vendors read it alike: dates in UTC, default DENY."""
+    """Return a grant that all vendors read alike: dates in UTC, default DENY."""
     return Grant(name, subject, iso(validity.not_before), iso(validity.not_after), rules)
 
 
@@ -148,7 +151,7 @@ def render_permissions(permissions: Permissions) -> bytes:
         lines += [f"      <default>{default}</default>", "    </grant>"]
     lines += ["  </permissions>", "</dds>", ""]
     document = "\n".join(lines).encode()
-    # A line feed becomes CR LF when the document is signed.
+    # Signing replaces each line feed by CR LF.
     if len(document) + document.count(b"\n") < LARGE_BYTES:
         return document
     return "\n".join([line.lstrip(" ") for line in lines]).encode()
@@ -290,7 +293,7 @@ def _read_criteria(element: etree._Element) -> Criteria:
 
 
 def domain_lines(domains: DomainSet) -> list[str]:
-    """Return the lines of a ``<domains>`` element: single ids, and ranges with both ends."""
+    """Return the lines of a ``<domains>`` element, with single ids and ranges."""
     lines = ["<domains>"]
     for part in domains.ranges:
         if part.first == part.last:
@@ -333,19 +336,23 @@ def _number(element: etree._Element) -> int:
 
 
 def size_of_topic(topic: str) -> int:
-    """Return the size of a topic in bytes; those that are no UTF-8 were read as surrogates."""
+    """Return the size of a topic in bytes; surrogates stand for bytes that were not UTF-8."""
     return len(topic.encode(errors="surrogateescape"))
 
 
 # ── the portable profile ───────────────────────────────────────────────────────────────────
 
 _SHOWN = 3
-_LONGEST_TOPIC = 251  # bytes, of DDS names
-_LONGEST_NAME = 8  # parts; a longer enclave name has too many subsets to compare
+_LONGEST_TOPIC = 251  # longest DDS topic name, in bytes
+# Parts of an enclave name; a longer name has too many subsets of parts to compare.
+_LONGEST_NAME = 8
 
 
 def document_notes(label: str, permissions: Permissions, signed_bytes: int) -> Iterator[Note]:
-    """Yield notes on a permissions document named ``label``; ``signed_bytes`` is its size."""
+    """Yield notes on permissions that are too large or not portable; ``label`` names the document.
+
+    ``signed_bytes`` is the size of the signed document.
+    """
     for identity, fact in portability_problems(permissions, signed_bytes):
         yield Note(identity, f"{label}: {fact}{_CONSEQUENCES[identity]}")
 
@@ -363,12 +370,15 @@ _CONSEQUENCES = {
 }
 
 
-Meets = Callable[[str], bool]
-"""Function that tells whether an expression shares a name with some other expressions."""
+OverlapTest = Callable[[str], bool]
+"""A function that tells whether an expression and some other expressions share a name."""
 
 
-def _meets_text(names: Sequence[str]) -> Meets:
-    """Return a predicate: the text of an expression matches one of ``names``, or the reverse."""
+def _overlap_by_text(names: Sequence[str]) -> OverlapTest:
+    """Return a function that tells whether an expression and one of ``names`` match each other.
+
+    Both are taken as text: one of them matches the other as a pattern.
+    """
     return lambda name: any(
         fnmatchcase(other_name, name) or fnmatchcase(name, other_name) for other_name in names
     )
@@ -377,12 +387,12 @@ def _meets_text(names: Sequence[str]) -> Meets:
 def portability_problems(
     permissions: Permissions,
     signed_bytes: int,
-    meets_some_of: Callable[[Sequence[str]], Meets] = _meets_text,
+    overlap_test_of: Callable[[Sequence[str]], OverlapTest] = _overlap_by_text,
 ) -> Iterator[tuple[str, str]]:
-    """Yield (id, clause) for each part of a document that vendors do not all read alike.
+    """Yield (id, clause) for each part of a document that vendors read differently.
 
-    ``meets_some_of(expressions)`` returns a predicate: whether an expression matches a name that
-    one of ``expressions`` matches.
+    ``overlap_test_of(expressions)`` returns a test whether an expression and one of ``expressions``
+    match a common name.
     """
     if signed_bytes >= MAX_SIGNED_BYTES:
         yield "portable.document-size", f"the signed permissions have {signed_bytes} bytes"
@@ -404,7 +414,7 @@ def portability_problems(
             blocked = _blocked_by_denials(
                 [t for r in denied for t in _topics(getattr(r, direction))],
                 {t for r in denied for t in _topics(getattr(r, other))},
-                meets_some_of([t for r in allowed for t in _topics(getattr(r, other))]),
+                overlap_test_of([t for r in allowed for t in _topics(getattr(r, other))]),
             )
             if blocked:
                 kept_from = "subscribing" if other == "subscribe" else "publishing"
@@ -423,8 +433,10 @@ def _topics(criteria: Iterable[Criteria]) -> tuple[str, ...]:
     return tuple(topic for criterion in criteria for topic in criterion.topics)
 
 
-def _blocked_by_denials(denied: list[str], denied_too: set[str], is_allowed: Meets) -> list[str]:
-    """Return the denied expressions that share a name with one allowed in the other direction."""
+def _blocked_by_denials(
+    denied: list[str], denied_too: set[str], is_allowed: OverlapTest
+) -> list[str]:
+    """Return the denied expressions that share a name with an expression allowed the other way."""
     return [
         expression
         for expression in denied
@@ -433,18 +445,19 @@ def _blocked_by_denials(denied: list[str], denied_too: set[str], is_allowed: Mee
 
 
 _FEW_PARTS = 20
-"""Number of parts of new names up to which each part is searched in all names; with more parts,
-comparing all names is faster.
+"""Number of distinct name parts up to which searching all names for the parts is faster.
+
+With more parts, comparing all names with each other is faster.
 """
 
 
 def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
     """Yield a note on enclaves with plain subjects that Cyclone DDS mistakes for each other.
 
-    ``names`` are all enclaves; a pair is reported if one of the two is in ``new``.
+    ``names`` are all enclaves; only pairs with an enclave in ``new`` are reported.
     """
     new_names = set(new)
-    # Of two names that are mistaken, one has all parts of the other.
+    # If Cyclone DDS mistakes one name for another, one has all parts of the other.
     parts = {part for name in new_names for part in name.strip("/").split("/")}
     if len(parts) <= _FEW_PARTS:
         names = new_names.union(name for name in names if any(part in name for part in parts))
@@ -459,10 +472,10 @@ def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
 
 
 def mistaken_names(names: Iterable[str]) -> list[tuple[str, str]]:
-    """Return sorted pairs of enclaves (a, b) in which Cyclone DDS takes a for b.
+    """Return the sorted pairs (a, b) of enclaves for which Cyclone DDS takes a for b.
 
-    Cyclone DDS checks only that the second subject has every part of the first: so the permissions
-    of ``/robot/admin`` fit the identity ``/robot``.
+    Cyclone DDS only checks that the subject of the permissions has every part of the certificate's
+    subject.  So the permissions of ``/robot/admin`` fit the certificate of ``/robot``.
     """
     parts_of = {name: frozenset(name.strip("/").split("/")) for name in names}
     by_parts: dict[frozenset[str], list[str]] = {}

@@ -22,7 +22,7 @@ from sros_tool.dds.decision.access import (
     OutcomeWord,
     ReasonWord,
 )
-from sros_tool.dds.decision.grants import read_moment
+from sros_tool.dds.decision.grants import read_date
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import DomainRule, ProtectionKind, TopicRule
 from sros_tool.dds.permissions import Grant
@@ -745,7 +745,7 @@ class Evaluator:
         if permissions and access:
             index = access.join().grant
             text = "" if index is None else permissions.grants[index].not_after
-            moment = read_moment(self.vendor.traits.moments, text, self.context.zone)
+            moment = read_date(self.vendor.traits.date_rule, text, self.context.zone)
             if self.enclave.signed and moment is not None and 0 < moment < 2**40:
                 expiries.append(("permissions.p7s", datetime.fromtimestamp(moment, UTC)))
         return min(expiries, key=lambda pair: pair[1], default=("", None))

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from sros_tool.dds.decision.access import AccessVerb, Outcome, OutcomeWord, ReasonWord
 from sros_tool.dds.decision.grants import other_fitting_enclaves
-from sros_tool.dds.decision.vendors import PRINCIPAL, Vendor
+from sros_tool.dds.decision.vendors import DEFAULT_RELEASES, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.distributions import SUPPORTED, Shipped
 from sros_tool.errors import Note, SrosError
@@ -232,7 +232,7 @@ def explain_on_dds(
         return Comparison(asked, None, by_distribution, beside, answer.allowed, notes)
     tested = [
         answer if v is vendor else Evaluator(v, enclave, context).answer(question)
-        for v in PRINCIPAL
+        for v in DEFAULT_RELEASES
     ]
     if len({tested_answer.outcome for tested_answer in tested}) > 1:
         notes = (*notes, Note("explain.vendors-differ", f"{_vendor_differences(tested)}."))

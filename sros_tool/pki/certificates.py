@@ -672,7 +672,7 @@ _EXTENSIONS = 0xA3
 _LONGEST_SERIAL = 20
 _TIME = re.compile(r"\d{14}Z", re.ASCII)
 _NETSCAPE_TYPE = "2.16.840.1.113730.1.1"
-_JUDGED = {
+_EVALUATED = {
     der.encode_oid(oid)
     for oid in (
         ExtensionOID.AUTHORITY_KEY_IDENTIFIER.dotted_string,
@@ -773,7 +773,7 @@ def _form_of_extensions(part: der.Value) -> tuple[object, ...]:
         return (part.whole,)
     (extensions,) = der.children(part.content)
     return tuple(
-        child.whole if kind.content in _JUDGED else (kind.content, len(rest) > 1)
+        child.whole if kind.content in _EVALUATED else (kind.content, len(rest) > 1)
         for child in der.children(extensions.content)
         for kind, *rest in (der.children(child.content),)
     )

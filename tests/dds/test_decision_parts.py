@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sros_tool.dds.decision.access import Outcome, Refusal, holds_for
+from sros_tool.dds.decision.access import Outcome, Refusal, includes_domain
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
-from sros_tool.dds.decision.grants import read_moment, same_subject
-from sros_tool.dds.decision.vendors import Moments, OpenRange, Subjects, Vendor
+from sros_tool.dds.decision.grants import read_date, same_subject
+from sros_tool.dds.decision.vendors import DateRule, OpenRange, Subjects, Vendor
 from sros_tool.dds.domains import DomainRange, DomainSet
 from tests.dds.decision_documents import allow, governance, grant, permissions, publish
 
@@ -71,8 +71,8 @@ BAD = None
 def test_dates_in_hours_from_noon(
     text: str, standard: float | None, local: float | None, cyclone: float | None
 ) -> None:
-    for rule, hours in zip(Moments, (standard, local, cyclone), strict=True):
-        found = read_moment(rule, text, UTC)
+    for rule, hours in zip(DateRule, (standard, local, cyclone), strict=True):
+        found = read_date(rule, text, UTC)
         assert found == (None if hours is None else NOON + hours * HOUR), rule
 
 
@@ -83,22 +83,22 @@ def test_dates_in_hours_from_noon(
 )
 def test_local_dates_are_in_the_standard_time_of_the_host(zone: str, hours: float) -> None:
     for text in ("2026-06-15T12:00:00Z", "2026-06-15T12:00:00+09:00"):
-        found = read_moment(Moments.LOCAL, text, ZoneInfo(zone))
+        found = read_date(DateRule.LOCAL, text, ZoneInfo(zone))
         assert found == NOON + hours * HOUR
-    assert read_moment(Moments.CYCLONE, "2026-06-15T12:00:00Z", ZoneInfo(zone)) == NOON
+    assert read_date(DateRule.CYCLONE, "2026-06-15T12:00:00Z", ZoneInfo(zone)) == NOON
 
 
 def test_what_no_calendar_holds_is_far_away_for_fast_dds() -> None:
-    assert read_moment(Moments.LOCAL, "9999-12-31T23:59:60Z", UTC) == inf
-    assert read_moment(Moments.LOCAL, "0000-01-01T00:00:00Z", UTC) == -inf
-    assert read_moment(Moments.LOCAL, "2026-02-31T00:00:00Z", UTC) == (
+    assert read_date(DateRule.LOCAL, "9999-12-31T23:59:60Z", UTC) == inf
+    assert read_date(DateRule.LOCAL, "0000-01-01T00:00:00Z", UTC) == -inf
+    assert read_date(DateRule.LOCAL, "2026-02-31T00:00:00Z", UTC) == (
         datetime(2026, 3, 3, tzinfo=UTC).timestamp()
     )
 
 
-@given(st.text(alphabet="0123456789-:TZ+. ", max_size=30), st.sampled_from(Moments))
-def test_no_text_is_an_error(text: str, rule: Moments) -> None:
-    found = read_moment(rule, text, ZoneInfo("America/Los_Angeles"))
+@given(st.text(alphabet="0123456789-:TZ+. ", max_size=30), st.sampled_from(DateRule))
+def test_no_text_is_an_error(text: str, rule: DateRule) -> None:
+    found = read_date(rule, text, ZoneInfo("America/Los_Angeles"))
     assert found is None or isinstance(found, float)
 
 
@@ -120,13 +120,13 @@ def test_no_text_is_an_error(text: str, rule: Moments) -> None:
 )
 def test_open_ranges(first: int | None, last: int | None, answers: tuple[bool | None, ...]) -> None:
     domains = DomainSet((DomainRange(first, last),))
-    assert tuple(holds_for(rule, domains, 42) for rule in OpenRange) == answers
+    assert tuple(includes_domain(rule, domains, 42) for rule in OpenRange) == answers
 
 
 def test_a_range_over_which_cyclone_crashes_is_not_reached_behind_one_that_holds() -> None:
     domains = DomainSet((DomainRange(42, 42), DomainRange(None, 7)))
-    assert holds_for(OpenRange.CRASHES, domains, 42)
-    assert holds_for(OpenRange.CRASHES, domains, 41) is None
+    assert includes_domain(OpenRange.CRASHES, domains, 42)
+    assert includes_domain(OpenRange.CRASHES, domains, 41) is None
 
 
 # ── documents ──────────────────────────────────────────────────────────────────────────────

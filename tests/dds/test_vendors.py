@@ -2,12 +2,12 @@
 
 import pytest
 
-from sros_tool.dds.decision.vendors import CYCLONE_DDS, FAST_DDS, PRINCIPAL, TESTED, Vendor
+from sros_tool.dds.decision.vendors import CYCLONE_DDS, DEFAULT_RELEASES, FAST_DDS, TESTED, Vendor
 
 
 def test_the_measured_vendors() -> None:
     assert TESTED == FAST_DDS + CYCLONE_DDS
-    assert PRINCIPAL == (Vendor.FAST, Vendor.CYCLONE)
+    assert DEFAULT_RELEASES == (Vendor.FAST, Vendor.CYCLONE)
     assert {each.release for each in FAST_DDS} == {"2.6", "2.9.1", "2.14", "3.2", "3.6"}
     assert CYCLONE_DDS == (Vendor.CYCLONE, Vendor.CYCLONE_11)
 

@@ -19,11 +19,11 @@ from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.keystores.topic_names import check_topic_names
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, names_text
 from sros_tool.dds.decision.access import is_open_to_unauthenticated
-from sros_tool.dds.decision.grants import read_moment
+from sros_tool.dds.decision.grants import read_date
 from sros_tool.dds.decision.vendors import (
     FAST_DDS,
     TESTED,
-    Moments,
+    DateRule,
     Vendor,
     joined_titles,
 )
@@ -326,7 +326,7 @@ def _validity_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iter
         return
     text = f"they are valid from {grant.not_before} to {grant.not_after}"
     begin, end = (
-        read_moment(Moments.LOCAL, moment, enclave.keystore.at.zone)
+        read_date(DateRule.LOCAL, moment, enclave.keystore.at.zone)
         for moment in (grant.not_before, grant.not_after)
     )
     if begin is None or end is None:

@@ -17,10 +17,10 @@ from string import ascii_letters, digits
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from sros_tool.dds.decision.expressions import ExpressionIndex, matches
-from sros_tool.dds.decision.grants import ComparisonCrash, certified_text, read_moment, same_subject
+from sros_tool.dds.decision.grants import ComparisonCrash, certified_text, read_date, same_subject
 from sros_tool.dds.decision.vendors import (
+    DateRule,
     DenyPartitions,
-    Moments,
     OpenRange,
     Style,
     TopicNames,
@@ -49,13 +49,13 @@ class Outcome(StrEnum):
 
     ALLOWED = "allowed"
     DENIED = "denied"
-    """Creating the endpoint fails."""
+    """The participant cannot create the endpoint."""
     PEER_DENIES = "peer denies"
-    """The process creates the participant or endpoint, but no permitted peer matches."""
+    """The participant or endpoint is created, but peers refuse to communicate with it."""
     REFUSED = "refused"
-    """The participant does not start at all."""
+    """The participant does not start."""
     CRASHES = "crashes"
-    """The process crashes, or its peers do (`Decision.hits_peers`)."""
+    """The participant's process crashes, or the processes of peers do (`Decision.hits_peers`)."""
 
     @property
     def ok(self) -> bool:
@@ -77,9 +77,9 @@ class Decision(NamedTuple):
     """The outcome of a question to access control, and what decided it.
 
     ``reason`` is a fixed word for programs (one of `_REASONS`), ``text`` a sentence for people.
-    ``grant`` is an index in the permissions, ``rule`` an index in the grant, ``expression`` the
-    ``<topic>`` that matched, ``topic_rule`` the rule of the governance for the topic. With
-    ``hits_peers``, the processes of peers crash, but not the participant's own.
+    ``grant`` is an index in the permissions, and ``rule`` an index in the grant.  ``expression`` is
+    the ``<topic>`` that matched, and ``topic_rule`` the governance rule for the topic.  With
+    ``hits_peers``, the processes of peers crash, but not the participant's own process.
     """
 
     outcome: OutcomeWord
@@ -133,14 +133,14 @@ class Refusal(NamedTuple):
     outcome: Outcome = Outcome.REFUSED
 
     def decision(self) -> Decision:
-        """Return the decision on any access: this refusal."""
+        """Return this refusal as the decision on any access."""
         return Decision(self.outcome, self.reason, self.text)
 
 
 def choose_grant(
     traits: VendorTraits, permissions: Permissions, subject: str, *, moment: datetime, zone: tzinfo
 ) -> int | Refusal:
-    """Return the index of the grant that decides for ``subject``, or why no grant does."""
+    """Return the index of the grant that decides for ``subject``, or the reason why none does."""
     if not subject and traits.crashes_on_empty_subject:
         text = f"{traits.title} fails with an error on a certificate with an empty subject."
         return Refusal("empty-subject", text, Outcome.CRASHES)
@@ -151,7 +151,8 @@ def choose_grant(
         _state(traits, index, grant, now, zone) for index, grant in enumerate(permissions.grants)
     ]
     for state in states:
-        if state and state.reason == "malformed":  # even if the grant is for another subject
+        # A malformed date counts even in a grant for another subject.
+        if state and state.reason == "malformed":
             return state
     for index, (grant, state) in enumerate(zip(permissions.grants, states, strict=True)):
         granted = grant.subject.strip() if traits.trims_texts else grant.subject
@@ -159,7 +160,7 @@ def choose_grant(
             if not same_subject(traits.subjects, granted, certified):
                 continue
         except ComparisonCrash:
-            if state:  # not compared
+            if state:  # the subject of this grant is not compared
                 continue
             text = (
                 f"{traits.title} ends with an error when it compares the grant for {granted!r} "
@@ -180,27 +181,30 @@ def _state(
     traits: VendorTraits, index: int, grant: Grant, now: float, zone: tzinfo
 ) -> Refusal | None:
     """Return why a grant is not valid at the moment ``now``, or None if it is valid."""
-    begin = read_moment(traits.moments, grant.not_before, zone)
-    end = read_moment(traits.moments, grant.not_after, zone)
+    begin = read_date(traits.date_rule, grant.not_before, zone)
+    end = read_date(traits.date_rule, grant.not_after, zone)
     name = f"grant {grant.name!r}" if grant.name else f"grant {index + 1}"
     if begin is None or end is None:
         wrong = grant.not_before if begin is None else grant.not_after
         return Refusal("malformed", f"{traits.title} cannot read the date {wrong!r} of {name}.")
-    how = " (read in the host's local time)" if traits.moments is Moments.LOCAL else ""
-    # Fast DDS counts whole seconds and includes both ends; Cyclone DDS excludes them.
-    strict = traits.moments is Moments.CYCLONE
+    how = " (read in the host's local time)" if traits.date_rule is DateRule.LOCAL else ""
+    # Fast DDS counts whole seconds, and a grant is valid at both ends; in Cyclone DDS, at neither.
+    strict = traits.date_rule is DateRule.CYCLONE
     if now < begin or (strict and now == begin):
         return Refusal(
             "not-yet-valid", f"{traits.title}: {name} is valid only from {grant.not_before}{how}."
         )
-    seconds = int(now) if traits.moments is Moments.LOCAL else now
+    seconds = int(now) if traits.date_rule is DateRule.LOCAL else now
     if seconds > end or (strict and now == end):
         return Refusal("expired", f"{traits.title}: {name} expired at {grant.not_after}{how}.")
     return None
 
 
-def holds_for(rule: OpenRange, domains: DomainSet, domain: int) -> bool | None:
-    """Return whether ``domain`` is in ``domains``; None if the vendor's process crashes."""
+def includes_domain(rule: OpenRange, domains: DomainSet, domain: int) -> bool | None:
+    """Return whether ``domain`` is in ``domains``; None if the check crashes the vendor's process.
+
+    ``rule`` says what a range with only a minimum or only a maximum means.
+    """
     for part in domains.ranges:
         first, last = part.first, part.last
         if first is None:
@@ -210,7 +214,7 @@ def holds_for(rule: OpenRange, domains: DomainSet, domain: int) -> bool | None:
         if last is None:
             last = first if rule is not OpenRange.OPEN else domain
         elif last == 0 and rule is OpenRange.SINGLE:
-            last = first  # Fast DDS keeps 0 for "no upper end"
+            last = first  # Fast DDS stores 0 for a missing maximum
         if first <= domain <= last:
             return True
     return False
@@ -222,7 +226,7 @@ NumberedRule = tuple[int, Rule]
 
 
 class RuleVerdict(NamedTuple):
-    """What the rules of a grant decide, why, and by which rule and expression.
+    """The verdict of a grant's rules, with the reason, the rule and the expression that decided.
 
     The outcome is ALLOWED, DENIED or CRASHES.
     """
@@ -260,12 +264,13 @@ class _Entry(NamedTuple):
 def _rules_for(
     traits: VendorTraits, grant: Grant, domain: int
 ) -> tuple[list[NumberedRule], RuleVerdict]:
-    """Return the rules of the grant for ``domain``, and the verdict if no rule matches."""
+    """Return the grant's rules for ``domain``, and the verdict if none of them matches a topic."""
     rules: list[NumberedRule] = []
     for index, rule in enumerate(grant.rules):
-        holds = holds_for(traits.open_range, rule.domains, domain)
+        holds = includes_domain(traits.open_range, rule.domains, domain)
         if holds is None:
-            # Cyclone DDS looks for the next rule before using a rule, so never uses the last rule.
+            # Before Cyclone DDS uses a rule, it looks for the next one, so the crash hides the last
+            # rule.
             return rules[:-1], RuleVerdict(Outcome.CRASHES, "open-range", index)
         if holds:
             rules.append((index, rule))
@@ -274,7 +279,7 @@ def _rules_for(
 
 def _default_verdict(traits: VendorTraits, grant: Grant) -> RuleVerdict:
     """Return the verdict that the grant's ``<default>`` gives where no rule matches."""
-    if not traits.honours_default:
+    if not traits.honors_default:
         return RuleVerdict(Outcome.DENIED, "no-rule")
     if traits.crashes_on_empty_texts and grant.default_empty:
         return RuleVerdict(Outcome.CRASHES, "empty-default")
@@ -291,7 +296,7 @@ class _GrantRules:
         otherwise: RuleVerdict,
         *verbs: str,
     ) -> None:
-        """Keep the rules for some verbs; ``otherwise`` is the verdict if no rule matches."""
+        """Keep the criteria for ``verbs``; ``otherwise`` is the verdict if no rule matches."""
         self._traits = traits
         self._rules = rules
         self._otherwise = otherwise
@@ -299,7 +304,7 @@ class _GrantRules:
 
     @cached_property
     def _entries(self) -> Sequence[_Entry]:
-        """The topics of the rules, in order."""
+        """The ``<topic>`` elements of the rules, in order."""
         traits = self._traits
         entries: list[_Entry] = []
         count = 0
@@ -318,18 +323,18 @@ class _GrantRules:
 
     @cached_property
     def _index(self) -> ExpressionIndex:
-        """The index that finds the entries which match a topic."""
+        """An index that finds the entries matching a topic."""
         texts = (_usable_expression(self._traits, entry.expression) for entry in self._entries)
         return ExpressionIndex(self._traits.style, texts)
 
     def ask(self, topic: str, partitions: tuple[str, ...]) -> RuleVerdict:
-        """Return the verdict on an endpoint of ``topic``; () stands for the default partition."""
+        """Return the verdict on an endpoint of ``topic``; () means the default partition."""
         wanted = partitions or _DEFAULT_PARTITION
         passed = 0
         for position in self._index.matching(topic):
             entry = self._entries[position]
             if entry.criteria == passed:
-                continue  # only the first matching topic of a criteria counts
+                continue  # of each criteria, only the first matching topic counts
             passed = entry.criteria
             fits = self._matches_partitions(entry, wanted)
             if fits or self._traits.topic_decides or not entry.expression:
@@ -344,7 +349,10 @@ class _GrantRules:
         return self._entries[position].verdict(fits=True)
 
     def crash_verdict(self, topic: str) -> RuleVerdict | None:
-        """Return the verdict if a topic crashes a process that reads all its criteria, or None."""
+        """Return the crash of a process that reads all criteria of the rules for a topic.
+
+        The result is None if no process crashes.
+        """
         passed = 0
         for position in self._index.matching(topic):
             entry = self._entries[position]
@@ -358,7 +366,7 @@ class _GrantRules:
         return all(entry.allow and entry.expression for entry in self._entries)
 
     def safe_names(self) -> NameSet:
-        """Return the topics for which `crash_verdict` finds no crash."""
+        """Return the topics for which `crash_verdict` returns None."""
         from sros_tool.automata import NameSet
 
         groups = groupby(self._entries, key=lambda entry: entry.criteria)
@@ -366,7 +374,7 @@ class _GrantRules:
         return _every_topic() - NameSet.union(filter(None, crashing))
 
     def _crashing_topics(self, group: Sequence[_Entry]) -> NameSet | None:
-        """Return the topics on which a criteria crashes the process; None for no topic.
+        """Return the topics for which reading a criteria crashes the process, or None.
 
         An empty ``<topic>`` crashes the process, unless an earlier ``<topic>`` of the criteria
         matches.
@@ -398,9 +406,9 @@ class _GrantRules:
         return NameSet.first(self._decisions_by_topic(self._entries), self._otherwise.allowed)
 
     def _decisions_by_topic(self, entries: Iterable[_Entry]) -> Iterator[tuple[NameSet, bool]]:
-        """Yield pairs of topics and whether they are allowed, in the order of the rules.
+        """Yield topics in the order of the rules, each time with whether these topics are allowed.
 
-        Entries in a row with the same verdict are joined.
+        Consecutive entries with the same verdict are joined.
         """
         for allowed, group in groupby(
             entries, key=lambda entry: entry.allow and bool(entry.expression)
@@ -422,7 +430,7 @@ class _GrantRules:
         return any(_any_matches(style, named, partition) for partition in wanted)
 
 
-@lru_cache(maxsize=8192)  # several vendors, and several enclaves, have the same names
+@lru_cache(maxsize=8192)  # several vendors and enclaves have the same expressions
 def _cached_names(style: Style, texts: tuple[str, ...]) -> NameSet:
     from sros_tool.dds.decision.expressions import names_of
 
@@ -434,9 +442,9 @@ def _any_matches(style: Style, expressions: tuple[str, ...], partition: str) -> 
 
 
 def _usable_expression(traits: VendorTraits, text: str) -> str:
-    """Return the expression as the vendor reads it.
+    """Return an expression as the vendor reads it.
 
-    An empty expression that crashes the vendor becomes ``*``: such an expression crashes for every
+    An empty expression becomes ``*`` for vendors that crash on it, because they crash for every
     name.
     """
     text = _trimmed(traits, text)
@@ -444,7 +452,7 @@ def _usable_expression(traits: VendorTraits, text: str) -> str:
 
 
 def _trimmed(traits: VendorTraits, text: str) -> str:
-    """Return the text of an element, trimmed if the vendor ignores spaces around the text."""
+    """Return the text of an element, without surrounding spaces if the vendor ignores them."""
     return text.strip(" \t\v\r\n") if traits.trims_texts else text
 
 
@@ -461,7 +469,7 @@ def _partitions(
 
 
 def is_open_to_unauthenticated(domain: DomainRule, topic: TopicRule, vendor: Vendor) -> bool:
-    """Return whether participants without an identity may use the topics of a rule of a domain."""
+    """Return whether participants without an identity may use the topics of a topic rule."""
     traits = vendor.traits
     if not domain.allow_unauthenticated_participants or traits.ignores_unauthenticated:
         return False
@@ -497,7 +505,7 @@ class GovernedDomain:
         self._traits = traits = vendor.traits
         self.rule: DomainRule | None = None
         for rule in governance.domain_access_rules:
-            if holds_for(traits.open_range, rule.domains, domain):
+            if includes_domain(traits.open_range, rule.domains, domain):
                 self.rule = rule
                 break
         self._topic_rules = self.rule.topic_access_rules if self.rule else ()
@@ -513,13 +521,16 @@ class GovernedDomain:
         return None if position is None else self._topic_rules[position]
 
     def names_by_rule(self) -> Iterator[tuple[NameSet, TopicRule]]:
-        """Yield each topic rule in order, with all topics that its expression matches."""
+        """Yield each topic rule in order, with the topics that its expression matches."""
         for rule in self._topic_rules:
             text = _usable_expression(self._traits, rule.topic_expression)
             yield _cached_names(self._traits.style, (text,)), rule
 
     def topics_of_unauthenticated(self) -> NameSet | None:
-        """Return the topics that participants without an identity may write and read, or None."""
+        """Return the topics that participants without an identity may write and read, or None.
+
+        None means that there are no such topics.
+        """
         domain = self.rule
         if domain is None or not domain.allow_unauthenticated_participants:
             return None
@@ -544,7 +555,7 @@ def _verdict_text(
 ) -> str:
     """Return ``verdict`` on ``asked_access``, such as ``publish rt/a``, as a clause.
 
-    ``by_peers``: the participant itself allows the access, and its peers deny the access.
+    ``by_peers``: the participant itself allows the access, but its peers deny it.
     """
     rule = "" if verdict.rule is None else f"rule {verdict.rule + 1}"
     peers = f" for domain {domain}, and peers deny the access" if by_peers else ""
@@ -570,7 +581,7 @@ def _verdict_text(
 
 
 class _Joining(NamedTuple):
-    """Whether a participant may join, the reason as a word for programs, and as a clause."""
+    """The outcome of joining a domain, with a word for programs and a clause for people."""
 
     outcome: Outcome
     reason: str
@@ -585,7 +596,7 @@ def _decide_join(
     rules: list[NumberedRule],
     otherwise: RuleVerdict,
 ) -> _Joining:
-    """Return whether a participant may join a domain, by the rules of its grant.
+    """Return the outcome of joining a domain, by the governance and the rules of a grant.
 
     If none of the ``rules`` matches, ``otherwise`` decides.
     """
@@ -612,7 +623,8 @@ def _decide_join(
     missing = f"no allow rule of the grant covers {where}"
     opened = not governed.all_controlled() and otherwise.outcome is not Outcome.ALLOWED
     if opened and otherwise.outcome is Outcome.CRASHES:
-        # With a topic that is free, the participant starts without its rules; its peers read them.
+        # If some topic is not access-controlled, the participant starts without reading its rules;
+        # its peers do read them.
         text = _verdict_text(otherwise, f"joining {where}", governed.domain)
         text = text.replace("crashes the process", "crashes the processes of its peers")
         return _Joining(Outcome.CRASHES, otherwise.reason, text, hits_peers=True)
@@ -626,7 +638,7 @@ def _decide_join(
     return _Joining(otherwise.outcome, otherwise.reason, text)
 
 
-class _Kind(Enum):
+class _Basis(Enum):
     """What decides on access to the topics of a governance topic rule."""
 
     NOTHING = auto()
@@ -650,7 +662,7 @@ _TOPIC_NAMES = {
     TopicNames.WORDS: (f"{ascii_letters}_/", f"{ascii_letters}{digits}_/"),
     TopicNames.PRINTABLE: ("".join(sorted({*map(chr, range(33, 127))} - {*"*?[]\"'#$"})),) * 2,
 }
-"""The characters that a topic's name may begin with, and those that may follow."""
+"""Maps a rule to the allowed first characters of a topic name and the allowed later ones."""
 
 
 def _is_topic_name(rule: TopicNames, text: str) -> bool:
@@ -662,7 +674,7 @@ def _is_topic_name(rule: TopicNames, text: str) -> bool:
 
 @cache
 def _usable_topics(rule: TopicNames) -> NameSet:
-    """Return the topics without wildcards that `_is_topic_name` accepts."""
+    """Return the topics that `_is_topic_name` accepts, without names that have wildcards."""
     from sros_tool.automata import Automaton, Letters, NameSet
 
     if rule is TopicNames.ANY:
@@ -675,10 +687,9 @@ _ENDPOINTS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 
 
 class GrantedAccess:
-    """What the rules of a grant alone decide in a domain.
+    """What the rules of a grant allow in a domain, regardless of governance, validity and joining.
 
-    Governance, validity and joining are not considered.  The participant itself and its peers each
-    apply the rules, and both have to allow the access.
+    The participant itself and its peers each apply the rules, and both have to allow the access.
     """
 
     def __init__(self, traits: VendorTraits, grant: Grant, domain: int) -> None:
@@ -695,7 +706,10 @@ class GrantedAccess:
         return allowed if self.peers is self.own else allowed & self.peers[verb].names()
 
     def reason(self, verb: AccessVerb, topic: str) -> str:
-        """Return which rule allows or denies ``verb`` on a topic, in the default partition."""
+        """Return which rule allows or denies ``verb`` on a topic, as a clause.
+
+        The topic is in the default partition.
+        """
         verdict, by_peers = self.own[verb].ask(topic, ()), False
         if verdict.allowed and self.peers is not self.own:
             verdict, by_peers = self.peers[verb].ask(topic, ()), True
@@ -708,7 +722,7 @@ class GrantedAccess:
 
     @cached_property
     def peers(self) -> dict[AccessVerb, _GrantRules]:
-        """The rules as peers apply them; the same object as `own` if they do not differ."""
+        """The rules as peers apply them; the same object as `own` if these are equal."""
         relays = ("relay",) if self._traits.relays_count_for_readers else ()
         if self._own_rules is self.rules and not relays:
             return self.own
@@ -725,7 +739,7 @@ class GrantedAccess:
 class Access:
     """The access control of one vendor for one subject.
 
-    Peers are assumed to have the same governance, clock and time zone, and every right.
+    Peers are assumed to have the same governance, clock and time zone, and all rights.
     """
 
     def __init__(
@@ -737,9 +751,10 @@ class Access:
         moment: datetime,
         zone: tzinfo = UTC,
     ) -> None:
-        """Prepare the decisions on ``subject`` (RFC 4514) in a domain at ``moment`` (aware).
+        """Prepare the decisions on ``subject`` (RFC 4514) in a domain at the time ``moment``.
 
-        ``zone`` is the host's time zone.  Nothing is raised: the decisions report every fault.
+        ``moment`` is timezone-aware, and ``zone`` is the host's time zone.  No error is raised:
+        faults of the documents become decisions.
         """
         self._traits = governed.vendor.traits
         self._governed = governed
@@ -758,15 +773,15 @@ class Access:
         return self.join() if verb is AccessVerb.JOIN else self._endpoint(verb, topic, partitions)
 
     def join(self) -> Decision:
-        """Return the decision on the participant: whether it starts, and peers accept it."""
+        """Return the decision on the participant: whether it starts and peers accept it."""
         return self._join
 
     def publish(self, topic: str, partitions: tuple[str, ...] = ()) -> Decision:
-        """Return the decision on a DataWriter: whether it is created, and peers match it."""
+        """Return the decision on a DataWriter: whether it is created and peers match it."""
         return self._endpoint(AccessVerb.PUBLISH, topic, partitions)
 
     def subscribe(self, topic: str, partitions: tuple[str, ...] = ()) -> Decision:
-        """Return the decision on a DataReader: whether it is created, and peers match it."""
+        """Return the decision on a DataReader: whether it is created and peers match it."""
         return self._endpoint(AccessVerb.SUBSCRIBE, topic, partitions)
 
     def governance_refusal(self, topic: str) -> Decision | None:
@@ -780,66 +795,73 @@ class Access:
         return None
 
     def topics(self, verb: AccessVerb) -> NameSet:
-        """Return the topics without wildcard characters for which `decide` allows ``verb``.
+        """Return the topics for which `decide` allows ``verb``, without names that have wildcards.
 
-        The topics are in the default partition, and their names may have any length.
+        The topics are in the default partition.  The length of names is not limited.
         """
         return self.ruled_topics(verb) & _usable_topics(self._traits.topic_names)
 
     def ruled_topics(self, verb: AccessVerb) -> NameSet:
-        """Return `topics`, and also names that DDS does not accept, which ROS 2 never uses.
+        """Return the topics that the rules allow, including names that are not valid in DDS.
 
-        If two vendors read documents alike, these sets are mostly equal.
+        `topics` leaves those names out, and ROS 2 never uses them.  Here they are kept, because the
+        sets of two vendors that read documents alike are then mostly equal.
         """
         from sros_tool.automata import NameSet
 
         if self._join.outcome in (Outcome.REFUSED, Outcome.CRASHES) or self._grant is None:
             return NameSet()
         rules = list(self._governed.names_by_rule())
-        kinds = [self._kind_of(verb, rule) for _, rule in rules]
+        bases = [self._basis_of(verb, rule) for _, rule in rules]
         topics = (
             NameSet.first(
-                (names, each is kind) for (names, _), each in zip(rules, kinds, strict=True)
+                (names, each is basis) for (names, _), each in zip(rules, bases, strict=True)
             )
-            & self._allowed_in(verb, kind)
-            for kind in dict.fromkeys(kinds)
-            if kind is not _Kind.NOTHING
+            & self._allowed_in(verb, basis)
+            for basis in dict.fromkeys(bases)
+            if basis is not _Basis.NOTHING
         )
         return NameSet.union(topics)
 
     def protection(self) -> tuple[tuple[NameSet, DomainRule, TopicRule], ...]:
-        """Return the topic rules of the domain, each with the topics for which it decides."""
+        """Return the topic rules of the domain, each with the topics to which it applies."""
         domain = self._governed.rule
         if domain is None:
             return ()
         return tuple((names, domain, rule) for names, rule in self._governed.names_by_rule())
 
     def topics_of_unauthenticated(self) -> NameSet | None:
-        """Return the topics that participants without an identity may write and read, or None."""
+        """Return the topics that participants without an identity may write and read, or None.
+
+        None means that there are no such topics.
+        """
         return self._governed.topics_of_unauthenticated()
 
-    def _kind_of(self, verb: AccessVerb, rule: TopicRule) -> _Kind:
-        """Return what decides on access to a topic rule's topics, as `_decision_by_rules` does."""
+    def _basis_of(self, verb: AccessVerb, rule: TopicRule) -> _Basis:
+        """Return what decides on the topics of a topic rule, in the way of `_decision_by_rules`."""
         if self._traits.crashes_on_empty_texts and not rule.topic_expression.strip():
-            return _Kind.NOTHING
+            return _Basis.NOTHING
         writes, reads = rule.enable_write_access_control, rule.enable_read_access_control
         refused = self._join.outcome is Outcome.PEER_DENIES
         if not (writes if verb is AccessVerb.PUBLISH else reads):
             return (
-                _Kind.NOTHING
+                _Basis.NOTHING
                 if refused and not self._can_exchange_unprotected(rule)
-                else _Kind.EVERYTHING
+                else _Basis.EVERYTHING
             )
         if refused:
-            return _Kind.NOTHING
-        return _Kind.BOTH_WAYS if self._traits.creates_topics and writes and reads else _Kind.RULES
+            return _Basis.NOTHING
+        return (
+            _Basis.BOTH_WAYS if self._traits.creates_topics and writes and reads else _Basis.RULES
+        )
 
-    def _allowed_in(self, verb: AccessVerb, kind: _Kind) -> NameSet:
-        if kind is _Kind.EVERYTHING:
+    def _allowed_in(self, verb: AccessVerb, basis: _Basis) -> NameSet:
+        if basis is _Basis.EVERYTHING:
             return _every_topic()
         allowed = self._granted.topics(verb)
-        # Where nothing is denied, the rule that allows an endpoint also allows its topic.
-        if kind is not _Kind.BOTH_WAYS or self._either.only_allows():
+        # If the rules deny nothing, the rule that allows an endpoint also allows creating its
+        # topic.
+        if basis is not _Basis.BOTH_WAYS or self._either.only_allows():
             return allowed
         return allowed & self._creatable_names()
 
@@ -859,16 +881,16 @@ class Access:
 
     @cached_property
     def _peers(self) -> dict[AccessVerb, _GrantRules]:
-        """The grant's rules as peers apply them; the same object as `_own` if they are equal."""
+        """The grant's rules as peers apply them; the same object as `_own` if these are equal."""
         return self._granted.peers
 
     @cached_property
     def _either(self) -> _GrantRules:
-        """The grant's rules for both directions in one list, to decide on creating a topic."""
+        """The grant's rules for both directions in one list, to decide on creating topics."""
         return self._granted.deciding_rules(self._granted.rules, *_ENDPOINTS)
 
     def _creation(self, verb: AccessVerb, topic: str) -> RuleVerdict:
-        """Return the verdict on creating a topic, which has to precede an endpoint for ``verb``."""
+        """Return the verdict on creating a topic, which comes before an endpoint for ``verb``."""
         if not self._traits.asks_both_directions:
             return self._either.ask_topic(topic)
         directions = sorted(_ENDPOINTS, key=lambda endpoint: endpoint is not verb)
@@ -910,7 +932,7 @@ class Access:
     def _decision_by_rules(
         self, verb: AccessVerb, topic: str, partitions: tuple[str, ...]
     ) -> Decision:
-        """Return the decision by governance and grant for a participant that starts."""
+        """Return the decision of governance and grant, for a participant that starts."""
         join, traits = self._join, self._traits
         rule = self._governed.topic_rule(topic)
         if stopped := self.governance_refusal(topic):
@@ -947,11 +969,11 @@ class Access:
         return self._verdict(verdict, asked, rule)
 
     def _can_exchange_unprotected(self, rule: TopicRule) -> bool:
-        """Return whether a participant that peers refuse can still exchange an unprotected topic.
+        """Return whether a refused participant can still exchange data on an unprotected topic.
 
         Peers check only the direction of the refused participant: read access for its readers,
-        write access for its writers.  With access control in the other direction, the refused
-        participant itself checks the rights of its peer, which it knows only after the handshake.
+        write access for its writers.  If the other direction is access-controlled, the refused
+        participant itself checks the rights of its peers, which it knows only after the handshake.
         So it matches endpoints that either side opens later (Cyclone DDS 0.10.2,
         `q_omg_security_check_remote_writer_permissions` and `.._reader_permissions`).
         """

@@ -1,11 +1,11 @@
 """Governance and permissions as Cyclone DDS 0.10 reads them, with its own XML parser.
 
-In its XML (ddsrt/src/xmlparser.c) names consist of ASCII letters, digits, ``_ - :``; comments,
-processing instructions and ``<!...>`` are skipped between any two tokens; an element holds either
-elements or one text.
+In this parser (ddsrt/src/xmlparser.c), names consist of ASCII letters, digits, ``_ - :``.
+Comments, processing instructions and ``<!...>`` are skipped between any two tokens.  An element
+contains either elements or a single text.
 
-Capitals in tags, the order of elements, and blanks around texts do not matter; of several equal
-elements the last one counts.  An unknown element or attribute makes the document malformed.
+The case of tags, the order of elements, and blanks around texts do not matter.  If an element is
+repeated, the last one counts.  An unknown element or attribute makes the document malformed.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
 
 _BLANKS = " \t\v\r\n"
 _CDATA = "<![CDATA["
-_ROOM = len(_CDATA) - 2  # Cyclone DDS looks for more text only if this many bytes are left
+_ROOM = len(_CDATA) - 2  # if fewer bytes are left, Cyclone DDS does not look for more text
 _DEEPEST = (
-    200  # nesting of elements; a deeper document has unknown elements, so it is refused anyway
+    # Levels of nested elements; a deeper document has unknown elements, and is refused for them.
+    200
 )
 _NAME = re.compile("[A-Za-z][A-Za-z0-9_:-]*")
 _SKIPPED = re.compile(
@@ -54,7 +55,7 @@ def read(xml: bytes) -> XmlElement:
 
 class _Reader:
     def __init__(self, xml: bytes) -> None:
-        self._text = xml.decode("latin-1").partition("\0")[0]  # each character stands for a byte
+        self._text = xml.decode("latin-1").partition("\0")[0]  # each character stands for one byte
         self._index = 0
 
     def root(self) -> XmlElement:
@@ -145,7 +146,7 @@ class _Reader:
             if not _NAME.match(text, index + 1 + closes):
                 raise self._error("a name is malformed")
             return not closes
-        if text.startswith(tuple(_QUOTES), index):  # Cyclone DDS reads on to the closing quote
+        if text.startswith(tuple(_QUOTES), index):  # Cyclone DDS skips a quoted text here
             self._string()
             self._index = index
         return False
@@ -195,7 +196,7 @@ class _Reader:
 _SCHEMA_ATTRIBUTES = ("xmlns:xsi", "xsi:nonamespaceschemalocation")
 _IGNORED = ("relay", "value", "name", "tag", "data_tags")
 _NOTHING = "["
-"""An expression that matches no name: a set of characters without its closing bracket."""
+"""An expression that matches no name: a set of characters without a closing bracket."""
 _LONGEST_NUMBER = 4000
 """Maximum number of digits that are converted; a 64-bit number has at most 20."""
 _INTEGER = re.compile(r"[+-]?(?:0[xX][0-9a-fA-F]*|0[0-7]*|[1-9]\d*)\Z", re.ASCII)
@@ -205,7 +206,7 @@ def _names(rule: type[DomainRule | TopicRule]) -> tuple[str, ...]:
     return tuple(attribute.name for attribute in attributes(rule))
 
 
-# The allowed children of each element; an element without an entry holds only text.
+# The allowed child elements by element; other elements contain only text.
 _DOMAINS = {"domains": ("id", "id_range"), "id_range": ("min", "max")}
 _GOVERNANCE = _DOMAINS | {
     "dds": ("domain_access_rules",),
@@ -242,9 +243,9 @@ def read_governance(xml: bytes) -> Governance:
 def read_permissions(xml: bytes) -> Permissions:
     """Return the permissions in ``xml``; raise `UnreadableError` if Cyclone DDS refuses them.
 
-    Three kinds of content are accepted, although a decision that uses them crashes Cyclone DDS: a
-    ``<topic>`` without text is read as "", a rule without domains as a range that is open at both
-    ends, and a ``<default>`` may be empty.
+    Three kinds of content are accepted here, although Cyclone DDS crashes in decisions that use
+    them.  A ``<topic>`` without text is read as "".  A rule without domains is read with a range
+    that is open at both ends.  A ``<default>`` may be empty.
     """
     dds = _Node.root(xml, _PERMISSIONS, _IGNORED)
     parent = dds.last("permissions")
@@ -327,7 +328,8 @@ def _read_number(node: _Node) -> int:
     number = int(sign + digits, 8 if octal else 0)
     if not -(2**63) <= number < 2**63:
         raise UnreadableError(f"<{node.tag}> holds {number}, which is far too large")
-    number = (number + 2**31) % 2**32 - 2**31  # truncated to 32 bits before the check
+    # Cyclone DDS truncates the number to 32 bits before it checks the range.
+    number = (number + 2**31) % 2**32 - 2**31
     if not 0 <= number <= MAX_DOMAIN:
         raise UnreadableError(f"<{node.tag}> holds {number}, which is above {MAX_DOMAIN}")
     return number
@@ -347,7 +349,7 @@ def _read_value(node: _Node, attribute: Attribute) -> Value:
         raise UnreadableError(
             f"<{node.tag}> holds {node.text!r}, which is not a protection kind there"
         )
-    # Cyclone DDS keeps 0 for a kind without text, which is the strongest one there.
+    # For a kind without text, Cyclone DDS uses 0, which stands for the strongest kind.
     return ProtectionKind(node.text or str(attribute.values[-1]))
 
 
@@ -452,7 +454,7 @@ def _read_criteria(node: _Node) -> Criteria:
     topics, partitions = node.last("topics"), node.last("partitions")
     return Criteria(
         tuple(topic.text for topic in topics.all("topic")) if topics else (),
-        # An empty list of partitions does not mean the default partition: it contains none.
+        # An empty list of partitions matches no partition, not even the default partition.
         tuple(partition.text for partition in partitions.all("partition")) or (_NOTHING,)
         if partitions
         else (),

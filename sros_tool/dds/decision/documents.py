@@ -43,12 +43,12 @@ def _readers(
 
 
 def read_governance_as(vendor: Vendor, xml: bytes) -> Governance | Refusal:
-    """Return the governance as ``vendor`` reads it from ``xml``, or its refusal."""
+    """Return the governance as ``vendor`` reads ``xml``, or the vendor's refusal."""
     return _read(vendor, "governance", _readers(vendor.traits.reader)[0], xml)
 
 
 def read_permissions_as(vendor: Vendor, xml: bytes) -> Permissions | Refusal:
-    """Return the permissions as ``vendor`` reads them from ``xml``, or its refusal."""
+    """Return the permissions as ``vendor`` reads ``xml``, or the vendor's refusal."""
     return _read(vendor, "permissions", _readers(vendor.traits.reader)[1], xml)
 
 
@@ -70,7 +70,7 @@ def _read(
 
 @lru_cache(maxsize=8)  # all enclaves of a keystore have the same governance
 def canonical_governance(document: bytes) -> Governance | None:
-    """Return the governance in a document if it is exactly as sros writes it, else None.
+    """Return the governance in a document that is byte for byte as sros writes it; otherwise None.
 
     All vendors read such a document alike.
     """
@@ -82,7 +82,7 @@ def canonical_governance(document: bytes) -> Governance | None:
 
 
 def canonical_permissions(permissions: Permissions, document: bytes) -> bool:
-    """Return whether a document is exactly what sros writes for these permissions.
+    """Return whether ``document`` is byte for byte what sros writes for ``permissions``.
 
     All vendors read such a document alike.
     """

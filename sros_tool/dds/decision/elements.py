@@ -1,4 +1,4 @@
-"""XML elements as vendors' parsers read them, and documents read by the standard's schemas.
+"""XML elements as vendors' parsers return them, and parsers by the schemas of the standard.
 
 Source: DDS-Security 1.1, the schemas omg_shared_ca_permissions and omg_shared_ca_governance of
 20170901.
@@ -26,14 +26,17 @@ from sros_tool.xml import tag_of
 
 
 def decoded(text: str) -> str:
-    """Return the text whose bytes in UTF-8, perhaps malformed, are the characters of ``text``."""
+    """Return ``text``, whose characters stand for bytes, decoded as UTF-8.
+
+    Invalid bytes become surrogates.
+    """
     return text if text.isascii() else text.encode("latin-1").decode("utf-8", "surrogateescape")
 
 
 class UnreadableError(Exception):
     """The reason why a vendor does not accept a document.
 
-    ``missing`` says that the document lacks content, on which some releases crash
+    ``missing`` says that content is missing from the document, which makes some releases crash
     (`VendorTraits.crashes_on_missing_content`).
     """
 
@@ -62,7 +65,7 @@ class NodeMark(Enum):
 class XmlElement:
     """An XML element; ``children`` has its nodes in order, with text and CDATA as strings.
 
-    ``name`` and the names of ``attributes`` are kept as written, with their prefixes.
+    ``name`` and the names of ``attributes`` keep their namespace prefixes, as written.
     """
 
     name: str
@@ -82,13 +85,14 @@ def _attributes(rule: type[DomainRule | TopicRule]) -> str:
     )
 
 
-# Allowed children by element, as expressions over "name,"; other elements hold text.
+# Maps an element to its allowed children, as a regular expression over names with a comma after
+# each; other elements contain text.
 _DOMAINS = {
     "domains": "(id,|id_range,)+",
     "id_range": "min,(max,)?|max,",
 }
 _RULE = "domains,(publish,)*(subscribe,)*(relay,)*"
-# The schema allows these in any order, each once.
+# The schema allows these elements in any order, each at most once.
 _CRITERIA = "(?!.*(?:^|,)(\\w+,).*\\1)(?=.*topics,)(topics,|partitions,|data_tags,)*"
 _PERMISSIONS = _DOMAINS | {
     "dds": "permissions,",

@@ -1,7 +1,6 @@
-"""The topic expressions of vendors: the sets of names that they match, and matching single names.
+"""The topic expressions of vendors: which names they match, as sets and one by one.
 
-How a vendor reads ``[...]`` in an expression follows fnmatch of glibc, or the matching of Cyclone
-DDS.
+Vendors read ``[...]`` in an expression either like fnmatch of glibc, or like Cyclone DDS.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ _CLASSES = {
 
 
 def _pieces_of(style: Style, expression: str) -> list[Letters | None]:
-    """Return the characters allowed at each place of an expression, with None for ``*``."""
+    """Return the characters allowed at each position of an expression; None stands for ``*``."""
     take_set = _FnmatchSets(expression).take if style is Style.FNMATCH else _cyclone_set
     pieces: list[Letters | None] = []
     index = 0
@@ -57,14 +56,17 @@ def _pieces_of(style: Style, expression: str) -> list[Letters | None]:
 
 @lru_cache(maxsize=65536)
 def _automaton(style: Style, expression: str) -> Automaton | None:
-    """Return an automaton for the names of an expression; None if it matches only itself."""
+    """Return an automaton for the names that match an expression.
+
+    The result is None for an expression that matches only its own text.
+    """
     if not is_expression(expression):
         return None
     return Automaton.sequence(_pieces_of(style, expression))
 
 
 def names_of(style: Style, expressions: Iterable[str]) -> NameSet:
-    """Return the names that any of the expressions matches."""
+    """Return the names that match at least one of the expressions."""
     made = {expression: _automaton(style, expression) for expression in expressions}
     return NameSet(
         (expression for expression, wild in made.items() if wild is None),
@@ -73,7 +75,7 @@ def names_of(style: Style, expressions: Iterable[str]) -> NameSet:
 
 
 def _pattern_of(letters: Letters) -> str:
-    """Return a regular expression that matches one character out of ``letters``."""
+    """Return a regular expression that matches one of ``letters``."""
     if letters == ANY_LETTER:
         return "."
     if single := letters.single():
@@ -83,7 +85,7 @@ def _pattern_of(letters: Letters) -> str:
 
 
 class _FnmatchSets:
-    """A parser of ``[...]`` in expressions, as glibc reads it, in linear time."""
+    """A parser of ``[...]`` in expressions that follows glibc, but in linear time."""
 
     def __init__(self, text: str) -> None:
         self._text = text
@@ -92,9 +94,9 @@ class _FnmatchSets:
     def take(self, text: str, start: int) -> tuple[Letters, int]:
         """Return the characters of the set after ``[``, and the index after the set.
 
-        After an unknown class or symbol, and after a range without its end, no further character
-        matches.  A set that is not closed is a plain ``[`` in all other cases, and also if it has a
-        ``[``.
+        After an unknown class or symbol, or a range without an end, the set matches no further
+        character.  An unclosed set is a plain ``[``, but matches nothing if it has such an error
+        before any further ``[``.
         """
         index = start
         negated = text[index : index + 1] in ("!", "^")
@@ -115,9 +117,9 @@ class _FnmatchSets:
         return _set_of(members, negated), index + 1
 
     def _end_of(self, index: int, *, is_first: bool) -> tuple[bool, bool]:
-        """Return whether a set is closed after ``index``; if not, whether its ``[`` is literal.
+        """Return whether a set is closed after ``index``; if not, whether its ``[`` is a plain one.
 
-        Results are cached, because many sets that are not closed would take quadratic time.
+        Results are cached, because many unclosed sets would otherwise take quadratic time.
         """
         text = self._text
         path: list[tuple[int, bool | None]] = []
@@ -139,7 +141,7 @@ class _FnmatchSets:
             index, is_first = after, False
         for place, decided in reversed(path):
             plain = plain if decided is None else decided
-            if text[place] != "]":  # the first member of a set may be one; later it closes the set
+            if text[place] != "]":  # at the first position "]" is a member, later it closes the set
                 self._known[place] = closed, plain
         return closed, plain
 
@@ -152,8 +154,8 @@ def _set_of(members: list[Letters], negated: bool) -> Letters:
 def _token(text: str, index: int) -> tuple[Letters | None, bool, int]:
     """Return the characters that a token of a set stands for.
 
-    Also returns whether the token is a range, and the index after it.  The characters are None for
-    something that glibc does not know.
+    Also returns whether the token is a range, and the index after the token.  The characters are
+    None if glibc does not know the token.
     """
     if match := _CLASS.match(text, index):
         return _CLASSES.get(match[1]), False, match.end()
@@ -169,9 +171,9 @@ def _token(text: str, index: int) -> tuple[Letters | None, bool, int]:
 
 
 def _member(text: str, index: int) -> tuple[str | None, int]:
-    """Return one character of a set, even if written ``[.a.]``, and the index after it.
+    """Return one character of a set, also one written as ``[.a.]``, and the index after it.
 
-    The character is None if there is none.
+    The character is None if the text has ended or ``[.`` does not enclose one character.
     """
     if text[index : index + 2] != "[.":
         return (text[index] if index < len(text) else None), index + 1
@@ -184,9 +186,9 @@ def _member(text: str, index: int) -> tuple[str | None, int]:
 def _cyclone_set(text: str, start: int) -> tuple[Letters, int]:
     """Return the characters of the set after ``[``, and the index after it (Cyclone DDS 0.10).
 
-    The loop of Cyclone DDS takes the closing bracket for a member before it ends, and looks for a
-    range there, too: ``[ab]`` also matches ``]``, and ``[ab]-x`` is one set with the range ``]`` to
-    ``x``.
+    The loop of Cyclone DDS ends only after it has read the closing bracket as a member, which can
+    also begin a range: ``[ab]`` also matches ``]``, and ``[ab]-x`` is one set with the range from
+    ``]`` to ``x``.
     """
     index = start
     negated = text[index : index + 1] == "!"
@@ -211,17 +213,20 @@ def _cyclone_set(text: str, start: int) -> tuple[Letters, int]:
 
 
 _Matcher = Callable[[str], object]
-"""A function of a name; its result is truthy if the name matches."""
+"""A function of a name, with a truthy result if the name matches."""
 
 _BEFORE_SPECIAL = re.compile(r"[^*?\[]*")
 
 
 @lru_cache(maxsize=65536)
 def _matcher(style: Style, expression: str) -> _Matcher | None:
-    """Return a function that tells whether names match; None if only ``expression`` itself does."""
+    """Return a function that tells whether a name matches ``expression``.
+
+    The result is None for an expression without wildcards, which matches only its own text.
+    """
     if not is_expression(expression):
         return None
-    segments = [""]  # the text between stars
+    segments = [""]  # the parts between the stars
     for pattern in _patterns(style, expression):
         if pattern:
             segments[-1] += pattern
@@ -245,7 +250,7 @@ def _joined_regex(segments: list[str]) -> str:
     """Return one regular expression for parts of an expression that ``*`` separates.
 
     Each part matches a fixed number of characters, so its first match is as good as a later one.
-    The atomic group tries only that one; otherwise many stars would take exponential time.
+    The atomic groups try only the first match; otherwise many stars would take exponential time.
     """
     first, *rest = segments
     if not rest:
@@ -261,10 +266,11 @@ def matches(style: Style, expression: str, name: str) -> bool:
 
 
 class ExpressionIndex:
-    """An index of a list of expressions, to find those that match a name.
+    """An index of a list of expressions that finds the expressions matching a name.
 
-    An expression without wildcards is looked up by the name, any other by the text before its first
-    wildcard.  So a search in thousands of expressions takes little longer than one comparison.
+    An expression without wildcards is found by the whole name, any other by the text before its
+    first wildcard.  So a search in thousands of expressions takes little longer than one
+    comparison.
     """
 
     def __init__(self, style: Style, texts: Iterable[str], *, both_ways: bool = False) -> None:

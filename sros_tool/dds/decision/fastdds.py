@@ -1,11 +1,11 @@
 """Governance and permissions as Fast DDS reads them, with its parser TinyXML-2 9.
 
 The parser accepts much that XML forbids: ``--`` in a comment, a lone ``&``, control characters,
-``]]>`` in a text, a second root.  It reads bytes, without encodings, namespaces or entities of the
-document.
+``]]>`` in a text, a second root.  The parser works on bytes, and ignores declared encodings,
+namespaces and entities.
 
-Elements must be in order, texts keep their blanks, and keywords have only one spelling.  Content
-after the last expected element is not read.
+Fast DDS demands the elements in order, keeps blanks in texts, and accepts one spelling of a
+keyword.  It ignores content after the last expected element.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def read(xml: bytes) -> XmlElement:
 
 class _Reader:
     def __init__(self, xml: bytes) -> None:
-        # Signed documents have these line ends; each character stands for a byte.
+        # Signed documents have CR LF line ends; each character stands for one byte.
         canonical = xml.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n").decode("latin-1")
         self._read_text = canonical.partition("\0")[0].lstrip(_BLANKS).removeprefix(_MARK)
         self._index = 0
@@ -88,7 +88,7 @@ class _Reader:
             closing, name, closed = tag[1], tag[2], tag[6]
             if closing and not closed:
                 if len(stack) == 1:
-                    return  # what follows the root is not read
+                    return  # TinyXML-2 reads nothing after the root
                 if stack.pop().name != decoded(name):
                     raise self._error(f"</{name}> closes another element")
                 continue
@@ -108,7 +108,7 @@ class _Reader:
             raise self._error("it ends with <")
 
     def _take_special(self, stack: list[XmlElement]) -> None:
-        """Read a declaration, comment, CDATA or anything else that begins with ``<?`` or ``<!``."""
+        """Read a declaration, a comment, CDATA, or anything else after ``<?`` or ``<!``."""
         text, children = self._read_text, stack[-1].children
         begin, end = next(marks for marks in _SPECIAL if text.startswith(marks[0], self._index))
         start = self._index + len(begin)
@@ -135,11 +135,11 @@ class _Reader:
 
 
 def _plain(text: str) -> str:
-    """Return the text up to a NUL, with normalized line ends and resolved references."""
+    """Return the text before the first NUL, with normalized line ends and resolved references."""
     if "&" not in text:
         return decoded(_LINE_END.sub("\n", text) if "\r" in text or "\n" in text else text)
-    # TinyXML-2 writes into the text that it reads: for a lone "&" it writes nothing, so the old
-    # character stays at that position.
+    # TinyXML-2 overwrites the text in place: for a lone "&" it writes nothing, so the character
+    # that was at that position stays.
     written = list(text)
     place = index = 0
     while index < len(text):
@@ -162,7 +162,7 @@ def _plain(text: str) -> str:
 
 
 def _referenced_character(match: re.Match[str]) -> str | None:
-    """Return the bytes of a character reference such as ``&amp;``, or None if it is malformed."""
+    """Return the bytes of a reference such as ``&amp;``, or None if the reference is malformed."""
     if match[2]:
         return _ENTITIES[match[2]]
     # TinyXML-2 reads the digits backwards, from the last one to the mark before them.
@@ -170,7 +170,8 @@ def _referenced_character(match: re.Match[str]) -> str | None:
     digits = match[1].rpartition(mark)[2]
     if not re.fullmatch("[0-9a-fA-F]*" if base == 16 else "[0-9]*", digits):
         return None
-    return _utf8(int(digits.lstrip("0")[:30] or "0", base))  # the longer ones are as far too large
+    # 30 digits are as far too large as more digits.
+    return _utf8(int(digits.lstrip("0")[:30] or "0", base))
 
 
 def _utf8(number: int) -> str:
@@ -192,7 +193,7 @@ def read_governance(xml: bytes) -> Governance:
     root = read(xml)
     parent = _first_child(root, "domain_access_rules")
     if root.children[-1] is not parent:
-        # A comment there is refused too.
+        # Even a comment there is refused.
         raise UnreadableError("something follows <domain_access_rules>")
     return Governance(
         tuple(_read_domain_rule(element) for element in _children_named(parent, "domain_rule"))
@@ -221,10 +222,10 @@ def _first_child(root: XmlElement, name: str) -> XmlElement:
 
 
 def _children_named(parent: XmlElement, name: str) -> list[XmlElement]:
-    """Return the children of ``parent``, which all have to be named ``name``.
+    """Return the children of ``parent``, all of which must be named ``name``.
 
     Raises:
-        UnreadableError: there are no children, or one has another name.
+        UnreadableError: there are no children, or a child has another name.
     """
     children = parent.elements
     if not children or any(child.name != name for child in children):
@@ -233,7 +234,7 @@ def _children_named(parent: XmlElement, name: str) -> list[XmlElement]:
 
 
 class _Sequence:
-    """The child elements of an element, which are read one after another."""
+    """The child elements of an element, for reading them one after another."""
 
     def __init__(self, element: XmlElement) -> None:
         self._name = element.name
@@ -245,7 +246,7 @@ class _Sequence:
         return self._index < len(self._children) and self._children[self._index].name == name
 
     def next(self, name: str) -> XmlElement:
-        """Return the next child and go on; raise `UnreadableError` if it has another name."""
+        """Return the next child and advance; raise `UnreadableError` if it has another name."""
         if not self.is_next(name):
             actual = f", where it has <{self.rest()[0].name}>" if self.rest() else ""
             raise UnreadableError(f"<{self._name}> lacks <{name}> at its position{actual}")
@@ -253,11 +254,11 @@ class _Sequence:
         return self._children[self._index - 1]
 
     def rest(self) -> list[XmlElement]:
-        """Return the children that were not read yet."""
+        """Return the children that were not read yet, without advancing."""
         return self._children[self._index :]
 
     def while_named(self, *names: str) -> list[XmlElement]:
-        """Return the children up to the first one with another name, and go on after them."""
+        """Return the next children while their names are in ``names``, and advance past them."""
         elements = []
         while self._index < len(self._children):
             if self._children[self._index].name not in names:
@@ -276,7 +277,7 @@ class _Sequence:
 
 
 def _read_text(element: XmlElement) -> str | None:
-    """Return the text of an element if its first node is text (comments aside), else None."""
+    """Return the text of an element whose first node, apart from comments, is text; else None."""
     for child in element.children:
         if child is not NodeMark.COMMENT:
             return child if isinstance(child, str) else None
@@ -291,10 +292,10 @@ def _read_required_text(element: XmlElement) -> str:
 
 
 def _read_first_text(element: XmlElement) -> str:
-    """Return the text of a number or flag, which has to be the first node of its element.
+    """Return the text of a number or flag, which must be the first node of the element.
 
     Raises:
-        UnreadableError: the first node is something else, even a comment.
+        UnreadableError: the first node is not text; even a comment is refused.
     """
     first = element.children[0] if element.children else None
     if not isinstance(first, str):
@@ -310,7 +311,7 @@ def _read_number(element: XmlElement) -> int:
 
 
 def _integer(match: re.Match[str]) -> int:
-    """Return a number as sscanf reads it: above 64 bits, it is the largest 64-bit number."""
+    """Return a number as sscanf reads it: larger ones become the largest 64-bit number."""
     if match[1]:
         return min(int(match[1], 16), 2**64 - 1)
     digits = match[2].lstrip("+-").lstrip("0")

@@ -1,6 +1,6 @@
-"""Whether a grant is for the subject of a certificate, and at which moments, by vendor.
+"""Whether a grant applies to the subject of a certificate, and when it is valid, by vendor.
 
-A certificate's subject is the RFC 2253 text that OpenSSL and
+The subject of a certificate is given as the RFC 2253 text that OpenSSL and
 `sros_tool.pki.certificates.subject_text` print, with the most specific attribute first.
 """
 
@@ -13,19 +13,19 @@ from datetime import datetime, timedelta, tzinfo
 from functools import lru_cache, partial
 from math import inf
 
-from sros_tool.dds.decision.vendors import Moments, Subjects, VendorTraits
+from sros_tool.dds.decision.vendors import DateRule, Subjects, VendorTraits
 from sros_tool.validity import parse_iso
 
 _BLANK = ord(" ")
-_MOST_PARTS = 20  # Cyclone DDS refuses a grant's subject of more
+_MOST_PARTS = 20  # Cyclone DDS refuses a grant whose subject has more parts
 
 
 class ComparisonCrash(Exception):  # noqa: N818
-    """The comparison of these two subjects crashes the vendor's process."""
+    """The vendor's process crashes when it compares these two subjects."""
 
 
 def same_subject(rule: Subjects, granted_subject: str, certified_subject: str) -> bool:
-    """Return whether a grant for ``granted_subject`` applies to a certificate with another subject.
+    """Return whether a grant for ``granted_subject`` applies to ``certified_subject``.
 
     Raises:
         ComparisonCrash: the comparison crashes the vendor's process.
@@ -36,12 +36,13 @@ def same_subject(rule: Subjects, granted_subject: str, certified_subject: str) -
 def other_fitting_enclaves(
     traits: VendorTraits, certified: Mapping[str, str], granted: Mapping[str, Collection[str]]
 ) -> dict[str, tuple[str, ...]]:
-    """Map each enclave to the other enclaves whose permissions also fit its certificate.
+    """Map an enclave to the other enclaves whose permissions also fit the enclave's certificate.
 
-    ``certified`` are the subjects of certificates, ``granted`` those of grants, by enclave.
+    ``certified`` maps enclaves to the subjects of their certificates, ``granted`` to the subjects
+    of their grants.  Enclaves without such others are left out.
     """
     plain = _PLAIN_PARTS.get(traits.subjects)
-    if plain is None:  # all others compare the whole subject
+    if plain is None:  # the other rules compare the whole subject
         return {}
     having: dict[str, set[str]] = {}
     for name, subjects in granted.items():
@@ -70,7 +71,7 @@ def other_fitting_enclaves(
 
 
 def certified_text(traits: VendorTraits, subject: str) -> str:
-    """Return the subject of a certificate as the vendor compares it."""
+    """Return the subject of a certificate in the form that the vendor compares."""
     if traits.escapes_subjects:
         return "".join(
             letter if letter.isascii() else "".join(f"\\{octet:02X}" for octet in letter.encode())
@@ -86,10 +87,10 @@ def _same_attributes(granted_subject: str, certified_subject: str) -> bool:
 
 
 def _same_parts(granted_subject: str, certified_subject: str) -> bool:
-    """Return whether subjects are equal, split at commas and without blanks around parts.
+    """Return whether two subjects have the same parts between commas, without blanks around parts.
 
-    Escaped commas split as well.  A part of less than three bytes keeps some of its blanks, and
-    what stands behind an empty part is ignored.  Source: Fast DDS 2.9.1, Permissions.cpp
+    Escaped commas split as well.  A part of less than three bytes keeps some of its blanks.  Text
+    after an empty part is ignored.  Source: Fast DDS 2.9.1, Permissions.cpp
     (rfc2253_string_compare).
     """
     ours, theirs = granted_subject.encode(), certified_subject.encode(errors="surrogateescape")
@@ -106,8 +107,8 @@ def _same_parts(granted_subject: str, certified_subject: str) -> bool:
 def _trimmed(text: bytes, start: int, end: int) -> bytes:
     """Return ``text[start:end]`` without blanks, as far as Fast DDS 2.9.1 removes them.
 
-    On each side it stops when one byte would be left, but it does not stop at the end of a shorter
-    part.
+    Removal on one side stops before only one byte is left.  In a shorter part, it runs over the end
+    of the part.
     """
     last = end - 1
     try:
@@ -127,12 +128,15 @@ def _part_end(text: bytes, start: int) -> int:
     return len(text) if comma < 0 else comma
 
 
-_MOST_ATTRIBUTES = 20  # the ones that Fast DDS 2.14 uses
+_MOST_ATTRIBUTES = 20  # Fast DDS 2.14 ignores attributes beyond these
 _BEFORE = {
     wanted: re.compile(rf'(?:\\.|"(?:\\.|[^"\\])*(?:"|\\?\Z)|[^"\\{wanted}])*', re.DOTALL)
     for wanted in "=,"
 }
-"""Maps a character to a pattern for the text before it, outside of escapes and quotes."""
+"""Maps a character to a pattern for the text before its first occurrence.
+
+Occurrences in escapes and quotes do not count.
+"""
 
 
 def _same_in_any_order(granted_subject: str, certified_subject: str) -> bool:
@@ -140,15 +144,16 @@ def _same_in_any_order(granted_subject: str, certified_subject: str) -> bool:
     first_values: dict[str, str] = {}
     for kind, value in theirs:
         first_values.setdefault(kind, value)
-    # Only the first value of a kind is found, so a repeated kind never matches; a kind that the
-    # certificate lacks has an empty value.
+    # Fast DDS finds only the first value of a type, so a repeated type matches only if its values
+    # are equal; a type that the certificate lacks counts as having an empty value.
     return len(ours) == len(theirs) and all(first_values.get(k, "") == v for k, v in ours)
 
 
 def _types_and_values(name: str) -> list[tuple[str, str]]:
-    """Return types and values of a subject's attributes, up to the first malformed one.
+    """Return types and values of a subject's attributes.
 
-    Source: Fast DDS 2.14, DistinguishedName.cpp.
+    The list ends before the first malformed attribute.  Source: Fast DDS 2.14,
+    DistinguishedName.cpp.
     """
     pairs: list[tuple[str, str]] = []
     rest = name.lstrip(" ")
@@ -156,7 +161,7 @@ def _types_and_values(name: str) -> list[tuple[str, str]]:
         equals = _outside_quotes(rest, "=")
         if equals < 0:
             break
-        # An empty cut means: up to the end of the text.
+        # In Fast DDS, a substring of length zero means all text up to the end.
         kind, rest = rest[: equals or None], rest[equals + 1 :]
         comma = _outside_quotes(rest, ",")
         value = rest if comma < 0 else rest[: comma or None]
@@ -177,7 +182,10 @@ _EQUALS = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*"|[^="\\])*', re.DOTALL)
 
 
 def _attributes(name: str) -> list[tuple[str, str]]:
-    """Return types and unescaped values of a subject's attributes up to the first malformed one."""
+    """Return types and unescaped values of a subject's attributes.
+
+    The list ends before the first malformed attribute.
+    """
     attributes = []
     index = 0
     while index < len(name):
@@ -209,7 +217,7 @@ def _has_granted_parts(
         kind, _, value = part.partition("=")
         values.setdefault(kind, value)
     wanted = _SEPARATORS.split(certified_subject)
-    if wanted and not wanted[-1]:  # no empty part after a last separator
+    if wanted and not wanted[-1]:  # Cyclone DDS sees no empty part after a final separator
         wanted.pop()
     for part in wanted:
         kind, _, value = normalize(part).partition("=")
@@ -227,7 +235,7 @@ _PLAIN_PARTS: dict[Subjects, Callable[[str], str]] = {
     Subjects.SUBSET: str,
     Subjects.TRIMMED_SUBSET: _without_blanks,
 }
-"""Functions that normalize the parts of a subject, for the rules that split subjects."""
+"""Maps a rule that splits subjects to the function that normalizes a part."""
 
 _COMPARE: dict[Subjects, Callable[[str, str], bool]] = {
     Subjects.EXACT: _same_attributes,
@@ -244,28 +252,28 @@ _CYCLONE = re.compile(
     r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d):(\d\d)(\.\d{1,12})?(?:Z|([+Z-])(\d\d):(\d\d))?\Z",
     re.ASCII,
 )
-# std::get_time of libstdc++ with %Y-%m-%dT%H:%M:%S: the text may end after the year, the month or
-# the day; one blank may precede the day; anything may follow the seconds.
+# The form that std::get_time of libstdc++ reads with %Y-%m-%dT%H:%M:%S: the text may end after the
+# year, the month or the day; one blank may precede the day; anything may follow the seconds.
 _LOCAL = re.compile(
     r"\s*(\d{1,4})(?:-(\d\d?)(?:-\s?(\d\d?)(?:[Tt](\d\d?):(\d\d?):(\d\d?))?)?)?", re.ASCII
 )
-_LAST_YEAR = 2262  # of 64 bits of nanoseconds
+_LAST_YEAR = 2262  # the last year that 64 bits of nanoseconds can hold
 _FARTHEST = timedelta(hours=12)
 
 
 @lru_cache(maxsize=64)  # the enclaves of a keystore share most of their dates
-def read_moment(rule: Moments, text: str, zone: tzinfo) -> float | None:
+def read_date(rule: DateRule, text: str, zone: tzinfo) -> float | None:
     """Return the time that a date means, in seconds since 1970; None if it is malformed.
 
-    ``zone`` is the host's time zone.  A date that Cyclone DDS cannot read is minus infinity: as a
-    beginning or as an end, it has always passed.
+    ``zone`` is the host's time zone.  A date that Cyclone DDS cannot read becomes minus infinity,
+    as a time that has always passed.
     """
     match rule:
-        case Moments.LOCAL:
+        case DateRule.LOCAL:
             return _local_time(text, zone)
-        case Moments.CYCLONE:
+        case DateRule.CYCLONE:
             return _cyclone_time(text)
-        case Moments.STANDARD:
+        case DateRule.STANDARD:
             try:
                 return parse_iso(text).timestamp()
             except ValueError:
@@ -279,13 +287,13 @@ def _local_time(text: str, zone: tzinfo) -> float | None:
     year, month, day, hour, minute, second = (int(group or -1) for group in match.groups())
     if 0 in (month, day) or month > 12 or day > 31 or hour > 23 or minute > 59 or second > 60:
         return None
-    # A missing month or day stays zero: January, or the last day of the month before.
+    # A missing month counts as January, a missing day as the last day of the month before.
     days = timedelta(days=max(day, 0) - 1)
     time = timedelta(hours=max(hour, 0), minutes=max(minute, 0), seconds=max(second, 0))
     try:
         wall = datetime(year, max(month, 1), 1) + days + time
         aware = wall.replace(tzinfo=zone)
-        # tm_isdst stays 0, so that mktime takes standard time, in summer too.
+        # tm_isdst is 0, so mktime uses standard time, even in summer.
         offset = (aware.utcoffset() or timedelta(0)) - (aware.dst() or timedelta(0))
     except (ValueError, OverflowError):
         return inf if year > 1 else -inf

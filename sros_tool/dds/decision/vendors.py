@@ -23,7 +23,7 @@ class Style(Enum):
 
 
 class Subjects(Enum):
-    """When a grant's subject matches the subject of a certificate."""
+    """The rule by which a grant's subject matches the subject of a certificate."""
 
     EXACT = auto()
     """The same attributes in the same order; spaces around them do not count."""
@@ -32,20 +32,20 @@ class Subjects(Enum):
     ANY_ORDER = auto()
     """The same attributes in any order (Fast DDS 2.14)."""
     SUBSET = auto()
-    """The grant has every part of the certificate's subject, split at ``, / |`` (Cyclone DDS)."""
+    """Each part of the certificate's subject, split at ``, / |``, is in the grant's subject."""
     TRIMMED_SUBSET = auto()
-    """The grant has every part of the certificate's subject, with any spaces around it (11)."""
+    """As SUBSET, but spaces around parts are ignored (Cyclone DDS 11)."""
 
 
-class Moments(Enum):
-    """How the dates in a grant are read."""
+class DateRule(Enum):
+    """How a vendor reads the dates in a grant."""
 
     STANDARD = auto()
-    """A date has the offset that it names, or else is in UTC."""
+    """A date has the offset that it states, or is in UTC."""
     LOCAL = auto()
     """A date is in the host's standard time; its offset is ignored (Fast DDS)."""
     CYCLONE = auto()
-    """As in the standard, but before 1970, after 2262 or incomplete means "in the past"."""
+    """As in the standard, but dates before 1970, after 2262 or incomplete have passed."""
 
 
 class OpenRange(Enum):
@@ -70,14 +70,14 @@ class TopicNames(Enum):
 
 
 class DenyPartitions(Enum):
-    """Which partitions of an endpoint a deny rule must name to apply to the endpoint."""
+    """Which partitions a deny rule must name to apply to an endpoint."""
 
     ANY_OR_ALL = auto()
-    """One of the endpoint's partitions; a rule without partitions applies to all."""
+    """One of the endpoint's partitions; a rule without partitions applies to all endpoints."""
     ANY_OR_DEFAULT = auto()
-    """One of them; a rule without partitions applies to the default partition (Cyclone DDS)."""
+    """As ANY_OR_ALL, but without partitions, a rule applies to the default one (Cyclone DDS)."""
     IGNORED = auto()
-    """None: a deny rule applies to all partitions, even if it names some (Fast DDS)."""
+    """None: a deny rule applies in all partitions, whichever it names (Fast DDS)."""
 
 
 class Signers(Enum):
@@ -86,9 +86,9 @@ class Signers(Enum):
     AUTHORITY = auto()
     """The permissions CA itself, whose certificate is in the message."""
     LISTED = auto()
-    """Anyone with a certificate in the permissions CA's file; no chain is verified (2.14)."""
+    """Anyone whose certificate is in the permissions CA's file; no chain is needed (2.14)."""
     CHAIN = auto()
-    """Anyone whose certificate in the message is for S/MIME and has a chain to that CA."""
+    """Anyone with a certificate for S/MIME in the message and a chain to the permissions CA."""
 
 
 class Hashes(Enum):
@@ -104,13 +104,13 @@ class Keys(Enum):
 
     ANY = auto()
     EC_AND_RSA = auto()
-    """EC and RSA of any size, but not Ed25519 (Fast DDS)."""
+    """EC keys and RSA keys of any size, but not Ed25519 (Fast DDS)."""
     SMALL = auto()
-    """EC of 256 bits, and RSA of 2048 (Cyclone DDS)."""
+    """EC keys of 256 bits and RSA keys of 2048 bits (Cyclone DDS)."""
 
 
 class DocumentReader(Enum):
-    """The parser that reads the documents (`sros_tool.dds.decision.documents`)."""
+    """The parser for governance and permissions (`sros_tool.dds.decision.documents`)."""
 
     STANDARD = auto()
     """The schema of the standard."""
@@ -122,7 +122,7 @@ class DocumentReader(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VendorTraits:
-    """The names of one vendor, and how it decides where vendors differ.
+    """The names of one vendor, and its decisions where vendors differ.
 
     The default of a field is what the standard demands.
     """
@@ -130,64 +130,64 @@ class VendorTraits:
     title: str
     """The name and version, for messages."""
     product: str = ""
-    """The name without a version, which all releases of the product share."""
+    """The product name without a version, common to all releases."""
     tested: bool = False
-    """Whether this data was compared with the decisions of the real library."""
+    """Whether these traits were compared with the decisions of the real library."""
     reader: DocumentReader = DocumentReader.STANDARD
     style: Style = Style.FNMATCH
     governance_both_ways: bool = False
-    """A topic rule also applies if its expression matches the topic's name used as a pattern."""
+    """A topic rule also applies if the topic's name is a pattern that matches its expression."""
     trims_texts: bool = False
     """Spaces around the text of an XML element are ignored."""
     subjects: Subjects = Subjects.EXACT
     escapes_subjects: bool = False
     r"""Characters of a subject beyond ASCII are compared as escapes (``\C3\B6``)."""
     longest_subject: int | None = None
-    """Number of bytes of a certificate's subject that are compared; the rest is ignored."""
+    """Number of bytes of a certificate's subject that are compared; None means all."""
     drops_expired: bool = False
     """Running participants lose each other when the certificate of one expires.
 
-    Since Fast DDS 2.6.12 and 3.2.5 (CVE-2025-67108); in 2.14.6 and 3.6.2 they stay connected (all
-    tested).
+    Since Fast DDS 2.6.12 and 3.2.5 (CVE-2025-67108); with 2.14.6 and 3.6.2, they stay connected
+    (all tested).
     """
     expiry_overflows: bool = False
     """A certificate that expires more than 292 years from now counts as expired.
 
-    Its time in nanoseconds overflows 64 bits.  From 584 years on it is accepted again, and so
-    forth.
+    The expiry time in nanoseconds overflows 64 bits.  It wraps around: from 584 years on, the
+    certificate is valid again, and so on.
     """
     crashes_on_empty_subject: bool = False
-    """A certificate with an empty subject crashes its process and the processes of its peers."""
-    moments: Moments = Moments.STANDARD
+    """A certificate with an empty subject crashes its own process and the processes of peers."""
+    date_rule: DateRule = DateRule.STANDARD
     passes_over_outdated_grants: bool = False
-    """A later grant is used if the subject's first grant is not valid now."""
+    """If the first grant for a subject is not valid now, a later grant is used."""
     open_range: OpenRange = OpenRange.OPEN
     filters_own_domain: bool = True
-    """The participant itself ignores its rules for other domains, as peers always do."""
+    """The participant itself ignores its rules for other domains, as all peers do."""
     relays_count_for_readers: bool = False
-    """For peers, ``<relay>`` of a rule also counts for a reader, after its ``<subscribe>``."""
+    """For peers, the ``<relay>`` of a rule also applies to a reader, after the ``<subscribe>``."""
     topic_decides: bool = False
-    """The first rule with the topic decides, even if its partitions do not match."""
+    """The first rule that names the topic decides, even if its partitions do not match."""
     deny_partitions: DenyPartitions = DenyPartitions.ANY_OR_ALL
-    honours_default: bool = True
+    honors_default: bool = True
     """The ``<default>`` of the grant decides if no rule matches."""
     crashes_on_missing_content: bool = False
-    """An empty document or element crashes the process; other vendors only refuse it.
+    """An empty document or element crashes the process; most vendors only refuse the document.
 
     The elements are ``<topic_expression>`` and ``<not_after>`` (Fast DDS before 3).
     """
     crashes_on_empty_texts: bool = False
-    """A decision crashes the process if it reads an expression or default without text."""
+    """A decision that reads an expression or a default without text crashes the process."""
     topic_names: TopicNames = TopicNames.ANY
     longest_topic_name: int | None = None
-    """Longest topic name that is matched, in bytes; topics with longer names are still created."""
+    """Longest topic name that rules match, in bytes; longer topics can still be created."""
     creates_topics: bool = False
-    """A topic is created before its endpoint; a right in either direction is enough.
+    """A topic is created before its endpoint, which takes a right in either direction.
 
-    The first rule with the topic decides, whether it is to publish or to subscribe.
+    The first rule that names the topic decides, for publishing or for subscribing.
     """
     asks_both_directions: bool = False
-    """Creating a topic needs a right to publish or to subscribe, each decided by its first rule."""
+    """Creating a topic takes a right to publish or subscribe; the first rule of each decides."""
     always_needs_allow_rule: bool = False
     """A participant without allow rules never starts, even without join control."""
     needs_domain_rule: bool = True
@@ -195,40 +195,40 @@ class VendorTraits:
     shares_open_topics: bool = False
     """A participant still exchanges data on unprotected topics with peers that refuse it.
 
-    Access control in the other direction of the topic prevents this (tested).
+    Access control in the topic's other direction prevents this (tested).
     """
     ignores_unauthenticated: bool = False
     """Participants without an identity are refused even if governance allows them (2.9)."""
     controls_unauthenticated: bool = True
     """Access control applies to participants without an identity.
 
-    If it does not, all topics with enable_discovery_protection are hidden from them, whatever
-    discovery_protection_kind is (Cyclone DDS 0.10.2).
+    If False, access control does not apply to them, but topics with enable_discovery_protection are
+    hidden from them, even if discovery_protection_kind is NONE (Cyclone DDS 0.10.2).
     """
     refuses_open_rtps: bool = False
-    """RTPS protection is refused if unauthenticated participants are allowed."""
+    """RTPS protection is refused in a governance that allows unauthenticated participants."""
     signers: Signers = Signers.AUTHORITY
     reads_first_authority: bool = False
     """Only the first CA in a file is trusted."""
     reads_lists_of_authorities: bool = False
-    """Revocation lists in the file of the identity CA count, as well as ``crl.pem``."""
+    """Revocation lists in the file of the identity CA count in addition to ``crl.pem``."""
     verifies_authorities: bool = False
-    """The first certificate of a CA file is strictly verified when it is loaded.
+    """The first certificate of a CA file is strictly verified when the file is loaded.
 
-    If the vendor does not accept its hash, the process crashes, because it uses freed memory.
+    If the vendor does not accept the certificate's hash, the process crashes (use after free).
     """
     verifies_policies: bool = False
     """Certificate policies and the root CA's own signature are verified (Fast DDS)."""
     reads_trusted_certificates: bool = True
     """A certificate may be in a PEM block ``TRUSTED CERTIFICATE``."""
     reads_files_as_text: bool = False
-    """A zero byte in a file of certificates or lists ends the line, or even the file."""
+    """A zero byte in a file of certificates or lists ends the line, or the whole file."""
     hashes: Hashes = Hashes.ANY
     keys: Keys = Keys.ANY
     reads_tokens: bool = True
-    """The key of an enclave can be on a PKCS#11 token, as ``key.p11`` names it."""
+    """The key of an enclave can be on a PKCS#11 token that ``key.p11`` names."""
     largest_document: int | None = None
-    """Size of signed permissions, in bytes, above which a handshake may never finish."""
+    """Largest signed permissions, in bytes, with which handshakes always finish; None: no limit."""
 
 
 _STANDARD = VendorTraits("DDS-Security 1.1")
@@ -241,7 +241,7 @@ _FAST_2_14 = VendorTraits(
     subjects=Subjects.ANY_ORDER,
     longest_subject=1024,
     crashes_on_empty_subject=True,
-    moments=Moments.LOCAL,
+    date_rule=DateRule.LOCAL,
     longest_topic_name=251,
     passes_over_outdated_grants=True,
     open_range=OpenRange.SINGLE,
@@ -249,7 +249,7 @@ _FAST_2_14 = VendorTraits(
     relays_count_for_readers=True,
     topic_decides=True,
     deny_partitions=DenyPartitions.IGNORED,
-    honours_default=False,
+    honors_default=False,
     crashes_on_missing_content=True,
     always_needs_allow_rule=True,
     needs_domain_rule=False,
@@ -272,7 +272,7 @@ _CYCLONE_0_10 = VendorTraits(
     trims_texts=True,
     subjects=Subjects.SUBSET,
     escapes_subjects=True,
-    moments=Moments.CYCLONE,
+    date_rule=DateRule.CYCLONE,
     open_range=OpenRange.CRASHES,
     deny_partitions=DenyPartitions.ANY_OR_DEFAULT,
     crashes_on_empty_texts=True,
@@ -291,8 +291,8 @@ class Vendor(StrEnum):
     """A DDS implementation, or the specification itself.
 
     To add a vendor that decides by the standard, add an entry here: options, texts and comparisons
-    use all entries.  `sros_tool.runtime.rmw` maps RMWs to vendors.  Of a product with several
-    releases, the first entry is meant if an option names no version.
+    use all entries.  `sros_tool.runtime.rmw` maps RMWs to vendors.  An option that names a product
+    without a version means the first entry of this product.
     """
 
     traits: VendorTraits
@@ -375,7 +375,7 @@ class Vendor(StrEnum):
 
     @property
     def documented_only(self) -> bool:
-        """Whether the vendor was never tested, and is taken to follow the standard."""
+        """Whether the vendor was never tested, and is assumed to follow the standard."""
         return not self.traits.tested and self is not Vendor.STANDARD
 
 
@@ -383,10 +383,12 @@ TESTED = tuple(vendor for vendor in Vendor if vendor.traits.tested)
 """The vendors whose decisions were compared with the real library."""
 
 ZENOH = "zenoh"
-"""The word for Zenoh where options and checks take the names of vendors."""
+"""The word for Zenoh in options and checks that take the names of vendors."""
 
-PRINCIPAL = tuple({vendor.traits.product: vendor for vendor in reversed(TESTED)}.values())[::-1]
-"""For each tested product, the release that is meant if an option names no version."""
+DEFAULT_RELEASES = tuple({vendor.traits.product: vendor for vendor in reversed(TESTED)}.values())[
+    ::-1
+]
+"""The release of each tested product that an option without a version means."""
 
 
 def _releases(product: str) -> tuple[Vendor, ...]:
@@ -404,13 +406,13 @@ WHOLE_PRODUCTS = {
     f"all-{vendor.value}": tuple(
         release for release in TESTED if release.traits.product == vendor.traits.product
     )
-    for vendor in PRINCIPAL
+    for vendor in DEFAULT_RELEASES
 }
-"""Words for all tested releases of a product, such as ``all-fastdds``."""
+"""Maps a word for all tested releases of a product, such as ``all-fastdds``, to these releases."""
 
 
 def words_of(vendors: Iterable[Vendor]) -> list[str]:
-    """Return the shortest list of option values that names these vendors."""
+    """Return the fewest option values that together name exactly these vendors."""
     left = list(vendors)
     words = []
     for word, releases in WHOLE_PRODUCTS.items():
@@ -421,10 +423,10 @@ def words_of(vendors: Iterable[Vendor]) -> list[str]:
 
 
 def joined_titles(titles: Iterable[str]) -> list[str]:
-    """Return titles of vendors, with the releases of one product joined into one title.
+    """Return titles of vendors, with the releases of a product joined into one title.
 
-    All tested releases become the name of the product, and some of them a title such as ``Fast
-    DDS 2.14/3.6``.  Other texts, such as ``Zenoh``, stay as they are.
+    If all tested releases are there, the title is the name of the product; otherwise it names them,
+    such as ``Fast DDS 2.14/3.6``.  Other texts, such as ``Zenoh``, stay as they are.
     """
     of_title = {vendor.title: vendor for vendor in TESTED}
     releases: dict[str, list[Vendor]] = {}
@@ -443,6 +445,6 @@ def _measured(product: str) -> set[Vendor]:
 
 
 def _releases_text(vendors: Iterable[Vendor]) -> str:
-    """Return the releases, the earliest first, such as ``2.9.1/2.14``."""
+    """Return the releases of vendors, earliest first, such as ``2.9.1/2.14``."""
     releases = (vendor.release for vendor in vendors)
     return "/".join(sorted(releases, key=lambda release: [*map(int, release.split("."))]))
