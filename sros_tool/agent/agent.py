@@ -108,8 +108,7 @@ _TRUST_FILES = tuple(
 """Files of an enclave that decide whom it trusts: CAs and revocation list."""
 _REPLACED_LIST = "replaced.crl.pem"
 _REPLACED_FOR = timedelta(days=30)
-"""How long the agent sends a revocation list that a release replaced by a list that revokes
-less.
+"""How long the agent sends a revocation list after a release replaced it by a shorter one.
 """
 _REPAIRED_FOR = timedelta(days=1)
 """How long the agent reports that it replaced files which differed from the release."""
@@ -120,7 +119,7 @@ _BRING_KEY = (
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _Answer = TypeVar("_Answer")
 _MOST_CERTIFICATES = 8
-"""How many enclaves the agent tries with a web server that refuses their certificates."""
+"""Maximum number of client certificates that the agent tries if a web server refuses them."""
 
 
 class RefusedError(UnavailableError):
@@ -201,23 +200,24 @@ class _Round:
         now, before = self._machine.now, self._state
         self._attempt(lambda: recover_keystore(self._folder))
         boot = self._machine.boot()
-        # A start counts if both ids are known: a restart that was not seen stays due.
+        # Only two known ids prove a start of the machine; otherwise, restarts stay due.
         has_started = bool(before.boot and boot and before.boot != boot)
         self._state = replace(before, boot=boot)
         if self._machine.restarted or has_started:
-            # After a start of the machine no process has files of before; what is seen counts.
+            # After a start of the machine, no process has earlier files, so earlier restarts are
+            # not due.
             self._forget_restarts()
-        # Before files are replaced: processes may have started with those that are here now.
+        # Note this before files are replaced: processes may have started with the present files.
         self._note_due((), self._enclaves())
         if self._machine.restarted:
             self._forget_restarts()
         proven = self._proven_moment()
         clock = self._clock(proven)
-        # Documents that were verified prove that this moment has passed, whatever the clock shows.
+        # Verified documents prove that ``before.latest`` has passed, whatever the clock shows.
         certain = max(now, before.latest) if before.latest else now
         readable_keys = exposed_keys(self._folder, now)
         recent = {key: at for key, at in before.exposed.items() if abs(now - at) < _REPAIRED_FOR}
-        # Remembered before the change, which closes the keys of changed enclaves to others.
+        # Remembered now, because installing closes the keys of changed enclaves to others.
         exposed = recent | dict.fromkeys(readable_keys, now)
         self._state = replace(self._state, exposed=exposed)
         installation, fetched = self._fetch_and_install(certain)
@@ -228,13 +228,14 @@ class _Round:
         self._note_removed(now)
         names = self._enclaves()
         opened = open_installed(self._folder, names, now=now)
-        if clock is not RobotClock.BEHIND:  # what is wrong is seen on a clock that is right
+        if clock is not RobotClock.BEHIND:  # with a wrong clock, valid files look unusable
             self._problems += unusable_sentences(opened)
         self._problems += exposed_sentences(self._folder, now)
         self._note_closed_keys(exposed, now)
         self._note_due(installation.changed, names)
         restarted: Sequence[str] = ()
-        if clock is not RobotClock.BEHIND:  # nodes would not accept their certificates
+        # With a wrong clock, nodes would not accept their certificates.
+        if clock is not RobotClock.BEHIND:
             restarted = self._restart(names, opened)
         processes = self._look_after(restarted, names)
         self._problems += [f"{problem}." for problem in processes.problems]
@@ -315,7 +316,7 @@ class _Round:
         return self._machine.clock()
 
     def _proven_moment(self) -> datetime | None:
-        """Return a time that is certainly past, or None.
+        """Return a time that has certainly passed, or None.
 
         It is the latest time that was verified, else the earliest start of a certificate.
         """
@@ -408,7 +409,7 @@ class _Round:
     def _newer_enclaves(self) -> frozenset[str]:
         """Return the enclaves whose certificate is newer than everything in accepted releases.
 
-        One whose certificate cannot be read is not among them: no process can run in it.
+        An enclave with an unreadable certificate is left out, because no process can run in it.
         """
         newer, latest = set(), self._state.latest
         for name in self._enclaves():
@@ -471,7 +472,7 @@ class _Round:
         closed = {
             key: exposed[key]
             for key in exposed.keys() - exposed_keys(self._folder, now)
-            if (self._folder / key).exists()  # an enclave that was removed has no key
+            if (self._folder / key).exists()  # a removed enclave has no key
         }
         self._state = replace(self._state, exposed=closed)
         if closed:
@@ -584,7 +585,7 @@ class _Round:
         self._save()
 
     def _note_due(self, changed: Iterable[str], names: Iterable[str]) -> None:
-        """Note the restarts that are due: also for files that somebody else changed."""
+        """Note the restarts that are due, also after others changed files."""
         before, files = self._state.files, self._digests(names)
         changed = {*changed}
         new_files, moment = {*changed}, _since_boot()
@@ -617,8 +618,8 @@ class _Round:
     def _digests(self, names: Iterable[str]) -> dict[str, str]:
         """Map each enclave to two digests: of its files without the key, and of its trust files.
 
-        The trust files decide which other enclaves it accepts.  Of a revocation list, only what it
-        revokes counts: processes with the list from before it was signed again do not lack it.
+        The trust files decide which other enclaves the enclave accepts. Of a revocation list, only
+        the revoked certificates count: a list that was only signed again makes no restart due.
         """
         with Folder(self._folder) as opened:
             return {
@@ -656,7 +657,8 @@ class _Round:
         settings, machine = self._settings, self._machine
         if not settings.restart or not self._state.due:
             return ()
-        # Only processes that were seen with earlier files, or may have them.
+        # Restart only units whose processes were seen with earlier files, or may have earlier
+        # files.
         processes = self._look(names)
         routers = [
             name for name in names if (enclave_path(self._folder, name) / ROUTER_FILE).exists()
@@ -700,7 +702,7 @@ class _Round:
             return {
                 name: now - timedelta(seconds=since_boot - moment)
                 for name, moment in moments.items()
-                if moment <= since_boot  # otherwise of another start
+                if moment <= since_boot  # a later time is of an earlier start of the machine
             }
 
         return look_at_processes(
@@ -1016,7 +1018,7 @@ def send(
             headers = {"Content-Type": "application/pkcs7-mime", "User-Agent": "sros"}
             connection.request("PUT", where, message, headers)
             reply = connection.getresponse()
-            if connection.is_cut_off:  # what came may be a part of the answer
+            if connection.is_cut_off:  # the answer may be incomplete
                 raise TimeoutError(errno.ETIMEDOUT, "it takes too long")
     except (OSError, http.client.HTTPException, ValueError) as error:
         kind = RefusedError if ended_tls(error) else UnavailableError
@@ -1049,8 +1051,8 @@ _NEW_KEYS = "new-keys"
 def _is_due(file: Path, now: datetime) -> bool:
     """Return whether at most a third of the life of the certificate in ``file`` is left.
 
-    A file is written only when it changes, so its modification time shows since when the robot has
-    the certificate.
+    A file is written only when it changes, so its modification time is when the robot got the
+    certificate.
 
     Raises:
         SrosError: the certificate cannot be read.

@@ -1,4 +1,4 @@
-"""A connection to a web server that is closed after a time, however the server answers."""
+"""A connection to a web server with a time limit that holds however slowly the server answers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def ended_tls(error: BaseException | None) -> bool:
 
     With TLS 1.3 this may be an alert, or only the end of the connection.
     """
-    certificate_error = ssl.SSLCertVerificationError  # of the certificate of the server
+    certificate_error = ssl.SSLCertVerificationError  # the server's own certificate is wrong
     return isinstance(error, ssl.SSLError) and not isinstance(error, certificate_error)
 
 
@@ -56,7 +56,7 @@ class GuardedConnection(http.client.HTTPConnection):
         plain = socket.create_connection((self.host, self.port), _SILENCE)
         self._guard = plain.dup()
         self.sock = plain
-        if self.is_cut_off:  # before there was a guard
+        if self.is_cut_off:  # the time was over during the handshake
             raise TimeoutError(errno.ETIMEDOUT, "it takes too long")
         if self._context:
             self.sock = self._context.wrap_socket(plain, server_hostname=self.host)

@@ -148,7 +148,7 @@ def fetch_release(
     Another release with the number of the installed one is returned, too.  The release is not
     verified against the CAs of the robot: callers have to verify its seal, with
     `sros_tool.keystore.delivery.release.seal_problem`.  A release that was fetched before is not
-    transferred again.  Not for two processes at once in the same ``state``.
+    transferred again.  Only one process at a time may use the same ``state``.
 
     Args:
         state: the agent's folder, ``FOLDER/.agent``, with the pinned root.

@@ -83,7 +83,8 @@ class Installation(NamedTuple):
     removed: tuple[str, ...] = ()
     """Enclaves that were removed, because the release does not have them."""
     kept: Mapping[str, str] = {}
-    """Enclaves that kept their files, except perhaps the revocation list, and why, as a clause."""
+    """Enclave that kept its files (except perhaps the revocation list) → the reason, as a clause.
+    """
     latest: datetime | None = None
     """The newest date of the certificates and revocation lists of the enclaves that did not keep
     their files.
@@ -169,7 +170,7 @@ def install_release(
         tuple(name for name in changes if name in enclaves),
         tuple(name for name in removed if name in changes),
         kept,
-        # What is not valid yet proves nothing: the clock of the keystore may have been ahead.
+        # A file that is not valid yet proves no time: the keystore's clock may have been ahead.
         _newest_validity_start(files for name, files in enclaves.items() if name not in kept),
     )
 
@@ -265,9 +266,9 @@ def _pinned(release: Release, pinned: frozenset[str]) -> Iterator[x509.Certifica
 def _check_lists(name: str, files: Mapping[str, bytes], present: Mapping[str, bytes]) -> None:
     """Raise `KeystoreError` if a revocation list in the release is older than the list here.
 
-    ``files`` are the files of an enclave in the release, ``present`` those here that have lists.
-    The owner of the folder can write anything into it, so only lists count that are signed by a CA
-    which the release trusts.
+    ``files`` are the files of an enclave in the release, ``present`` its files here that may
+    contain lists. The owner of the folder can write anything into it, so only lists count that are
+    signed by a CA which the release trusts.
     """
     if older := older_list(present, files):
         here, new = older
@@ -285,10 +286,10 @@ def _check_lists(name: str, files: Mapping[str, bytes], present: Mapping[str, by
 
 
 def present_lists(folder: Folder, name: str) -> dict[str, bytes]:
-    """Return the files of an enclave that may have revocation lists, as far as it has them."""
+    """Return the existing files of an enclave that may contain revocation lists."""
     present: dict[str, bytes] = {}
     for file in LIST_FILES:
-        with suppress(SrosError, OSError):  # else nothing that a process could load
+        with suppress(SrosError, OSError):  # an unreadable file is none that a process could load
             present[file] = folder.read_inside(f"{enclave_folder(name)}/{file}")
     return present
 
@@ -422,7 +423,8 @@ def _present_key(folder: Folder, name: str, files: Mapping[str, bytes]) -> Publi
         if (data := _content(folder, f"{place}/{REQUEST}")) is not None:
             return load_request(data, f"of enclave {name}").public_key
         pem = _content(folder, f"{place}/{CERTIFICATE_FILE}") or files.get(CERTIFICATE_FILE, b"")
-        return load_certificates(pem, CERTIFICATE_FILE)[0].public_key()  # type: ignore[return-value]
+        # Type: ignore[return-value].
+        return load_certificates(pem, CERTIFICATE_FILE)[0].public_key()
     raise KeystoreError(
         f"the key of enclave {name} {KEY_NOT_HERE}",
         "",

@@ -55,13 +55,15 @@ class EnclaveProcesses(NamedTuple):
     """The processes in the enclaves of a security folder."""
 
     states: Mapping[str, RunningFiles]
-    """By enclave, whether its processes that run from the folder have loaded the current files.
+    """Maps each enclave to whether its processes that run from the folder have the current files.
 
     A process of a user who cannot read the key may only claim to run in the enclave: it is never
     ``current``.
     """
     restartable: Mapping[str, RunningFiles]
-    """Like `states`, without such processes: nobody who can only claim it restarts a unit."""
+    """Like `states`, but without processes that may only claim to run in the enclave: they must not
+    cause a restart of a unit.
+    """
     list_states: Mapping[str, RunningFiles]
     """Like `states`, but only for the revocation list and the CAs: ``current`` also if only the
     enclave's own certificate, permissions or governance are newer than a process."""
@@ -94,9 +96,9 @@ def look_at_processes(
 ) -> EnclaveProcesses:
     """Return what runs in the enclaves ``names`` of ``folder``; ``look`` reads the processes.
 
-    ``replaced`` maps enclaves to when their files, and ``list_replaced`` to when the files that
-    decide whom they trust, were replaced, by the clock of ``now``: the times of the files are by
-    the clock of then, which may have been set since.
+    ``replaced`` maps enclaves to when their files were replaced, ``list_replaced`` to when their
+    trust files (CAs and revocation list) were.  Both are by the clock of ``now``, because the clock
+    may have been set since files got their times.
     """
     running = (look or ProcessTable().look)(now)
     own_processes = [process for process in running.processes if _is_of(process, folder)]
@@ -200,7 +202,7 @@ def _states(
     is_outdated: Callable[[Process, ProcessEnclave], bool],
     readers: Collection[Process],
 ) -> dict[str, RunningFiles]:
-    """Map enclaves to what their processes have loaded; only ``readers`` of the key are current."""
+    """Map enclaves to the files that processes loaded; only ``readers`` of the key are current."""
     states = dict.fromkeys(names, RunningFiles.NOT_SEEN)
     for process in processes:
         name, enclave = _enclave_of(process), process.enclave
@@ -251,14 +253,15 @@ def _robot_dds(running: RunningProcesses) -> RobotDds:
 # ── the clock ──────────────────────────────────────────────────────────────────────────────
 
 _UNSYNCHRONIZED = 5  # TIME_ERROR
-_SIZE_OF_TIMEX = 512  # more than any
+_SIZE_OF_TIMEX = 512  # larger than the struct timex of any system
 
 
 def kernel_clock() -> RobotClock:
     """Return whether a time service has set the clock, as adjtimex(2) says."""
     try:
         library = ctypes.CDLL(None, use_errno=True)
-        state = library.adjtimex(ctypes.create_string_buffer(_SIZE_OF_TIMEX))  # changes nothing
+        # With a zeroed struct, adjtimex changes nothing.
+        state = library.adjtimex(ctypes.create_string_buffer(_SIZE_OF_TIMEX))
     except (OSError, AttributeError):
         return RobotClock.UNKNOWN
     if state < 0:

@@ -1,7 +1,7 @@
 """What a robot's agent remembers between its runs, and its status: one small file, replaced whole.
 
-Losing the file loses nothing that matters: the release that is installed names its number, and the
-sequence of messages goes by the clock.
+The agent can do without the file: the installed release contains its number, and the sequence
+numbers of messages follow the clock.
 """
 
 from __future__ import annotations
@@ -50,18 +50,18 @@ class AgentState:
     the number of the last message.  ``latest`` is the latest moment that has certainly passed:
     verified documents begin to be valid then.  ``due`` are the enclaves whose processes were not
     yet seen with the installed files, since the start ``boot`` of the machine (see `boot_id`); of
-    those in ``unseen``, no process was seen.  ``restarted`` are those whose units were restarted
-    since.  ``list_due`` are the enclaves whose processes may lack the revocation list.  ``files``
-    maps enclaves to two digests at the end of the last round, as text: of all files, and of the
-    files that decide whom the enclave trusts.  A change of a digest, whoever wrote the files, makes
-    a restart due; ``list_since`` maps enclaves to the time since when the second digest is the
-    same.  ``fetched`` and ``sent`` are when the source and the inbox were last reached.
-    ``replaced`` and ``list_replaced`` map enclaves of `due` and `list_due` to when the agent last
-    replaced their files, in seconds since the start of the machine: no setting of its clock changes
-    that.  ``repaired`` is a sentence on files that were not those of the release and were replaced,
-    at ``repaired_at``.  ``exposed`` maps paths of private keys that others could read, until the
-    agent closed them, to the time of that round; ``removed`` maps enclaves that the installed
-    release did not have to the time of the round that removed them.
+    those in ``unseen``, no process was seen.  ``restarted`` are the enclaves in ``due`` whose units
+    were restarted since.  ``list_due`` are the enclaves whose processes may lack the revocation
+    list.  ``files`` maps enclaves to two digests at the end of the last round, as text: of all
+    files, and of the files that decide whom the enclave trusts.  A change of a digest, whoever
+    wrote the files, makes a restart due; ``list_since`` maps enclaves to the time since when the
+    second digest is the same.  ``fetched`` and ``sent`` are when the source and the inbox were last
+    reached. ``replaced`` and ``list_replaced`` map enclaves of `due` and `list_due` to when the
+    agent last replaced their files, in seconds since the start of the machine: no setting of its
+    clock changes that.  ``repaired`` is a sentence on files that were not those of the release and
+    were replaced, at ``repaired_at``.  ``exposed`` maps paths of private keys that others could
+    read, until the agent closed them, to the time of that round; ``removed`` maps enclaves that the
+    installed release did not have to the time of the round that removed them.
     """
 
     release: int = 0
@@ -95,7 +95,7 @@ class AgentState:
 
 
 def read_state(folder: Path) -> AgentState:
-    """Return what the agent of ``folder`` remembers; if the file is damaged, what can be known."""
+    """Return what the agent of ``folder`` remembers; from a damaged file, as much as possible."""
     state = AgentState()
     with suppress(SrosError, OSError, ValueError, TypeError, KeyError):
         path = agent_folder(folder) / _STATE
@@ -169,7 +169,7 @@ def write_state(folder: Path, state: AgentState) -> None:
 
 
 def mark_outdated(folder: Path) -> None:
-    """Mark the state as outdated, by the modification time 0 of its file.
+    """Mark the state as outdated, by setting the modification time of its file to 0.
 
     The next `write_state` removes the mark.  On a file system that became read-only, only the age
     of the state shows that it is outdated.
@@ -279,7 +279,7 @@ class AgentStatus(NamedTuple):
 def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStatus:
     """Return what the agent of ``folder`` last did, and what is wrong with the files now.
 
-    Source and inbox have to be reached within the time ``oldest``.
+    ``oldest`` is how long ago source and inbox may at most have been reached.
 
     Raises:
         SrosError: the folder has no agent, or its settings are malformed.
@@ -307,7 +307,7 @@ def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStat
 
 
 def _seen_now(folder: Path, state: AgentState, now: datetime) -> Iterator[str]:
-    """Yield sentences on what is wrong with the files now, but not what the last round said."""
+    """Yield sentences on what is wrong with the files now, except what the last round reported."""
     names = [n for n in enclave_names(folder) if not waits_for_answer(enclave_path(folder, n))]
     for name in sorted(state.files.keys() - {*names}):
         yield f"{name} had a certificate in the last round of the agent, and has none now."

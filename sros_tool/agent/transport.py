@@ -1,7 +1,8 @@
 """How files of a publishing folder get to the robot: by https, http, or from a folder.
 
-`tuf` fetches through either class, while its ``connection`` is entered.  They allow neither endless
-nor slow answers, follow no redirect and no link, and leave the verification of files to `tuf`.
+`tuf` fetches through one of the two classes, while its ``connection`` is entered. Both limit the
+size and the time of answers, follow no redirect and no link, and leave the verification of files to
+`tuf`.
 """
 
 from __future__ import annotations
@@ -128,7 +129,7 @@ class HttpTransport(FetcherInterface):
         finally:
             if response is None or not response.isclosed():
                 self.connection.end()
-        if self.connection.is_cut_off:  # the end may be that of the connection alone
+        if self.connection.is_cut_off:  # the answer may be incomplete
             raise SlowRetrievalError(f"{path} takes too long")
 
     def _answer(self, path: str) -> http.client.HTTPResponse:

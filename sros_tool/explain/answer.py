@@ -214,7 +214,7 @@ def acting_parts(question: Question) -> dict[str, Question]:
 
 
 def text_of_parts(question: Question, parts: Iterable[str]) -> str:
-    """Return why it matters that an enclave may do these parts of an action, as a sentence."""
+    """Return a sentence on what an enclave can do by these parts of an action."""
     does = "command the server" if question.right == "call" else "inform the clients"
     return f"it may do a part of the action, which is enough to {does}: {', '.join(parts)}."
 
@@ -620,7 +620,7 @@ def deciding_lines(policy: Enclave, answer: Answer) -> tuple[PolicyLine, ...]:
         return ()
     rule = answer.grant.rules[answer.decision.rule or 0]
     qualifier = ALLOW if rule.allow else DENY
-    # Cyclone DDS denies a whole topic, also because of a rule for the other direction.
+    # Cyclone DDS also denies a topic because of a deny rule for the other direction.
     other = AccessVerb.SUBSCRIBE if part.verb is AccessVerb.PUBLISH else AccessVerb.PUBLISH
     for verb in (part.verb, other):
         lines = tuple(

@@ -118,7 +118,7 @@ class AskedEnclave(NamedTuple):
 
 
 def rights_naming(keystore: OpenedKeystore, name: str) -> Iterator[Right]:
-    """Yield the rights in those permissions of a keystore that contain a ROS name.
+    """Yield the rights in all permissions of a keystore whose text contains a ROS name.
 
     Unreadable permissions are left out; permissions without the name are not parsed.
     """
@@ -187,16 +187,16 @@ def open_to_ask(
 
 
 def is_policy(path: Path) -> bool:
-    """Return whether a path is a file, or a folder of policies."""
+    """Return whether a path is a file or a folder of policies, so that it may be a policy."""
     if not path.is_dir() or is_keystore(path) or is_enclave(path):
         return path.is_file()
-    from sros_tool.policy.document import files_of_policies  # a question to a keystore needs none
+    from sros_tool.policy.document import files_of_policies  # not needed for a keystore
 
     return any(files_of_policies(path))
 
 
 def policy_to_ask(file: Path, fleet: Fleet | None) -> tuple[Policy, Policy]:
-    """Return a policy as it is stated, and with the robots of a fleet for its placeholders."""
+    """Return a policy as its file states it, and with its placeholders filled in for a fleet."""
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.policy.document import read_policy
 
@@ -300,14 +300,14 @@ def planned_enclave(
 def _action_meant(
     evaluator: Evaluator, question: Question, read_other_rights: Callable[[], Iterable[Right]]
 ) -> Question | None:
-    """Return the same question about an action if rights show that the name is one; else None.
+    """Return the same question about an action if rights show an action of this name; else None.
 
     The rights of the enclave are read first.  If they deny the service, ``read_other_rights``
     returns more rights, such as those in its policy and keystore.
     """
     if question.word not in ("call", "serve"):
         return None
-    from sros_tool.translate import grant_rights  # most questions need no translation back
+    from sros_tool.translate import grant_rights  # needed only for names that may be actions
 
     answer = evaluator.answer(question)
     rights = set(grant_rights(evaluator.enclave.name, answer.grant)) if answer.grant else set()
@@ -319,7 +319,7 @@ def _action_meant(
 def taken_for_action(question: Question, action: Question) -> tuple[Note, ...]:
     """Return a note that a question about a service is answered for an action.
 
-    None is needed for ``call``, which is the policy's word for actions.
+    Empty for ``call``, because a policy uses this word for actions.
     """
     if action.word == question.word:
         return ()
@@ -335,8 +335,8 @@ def note_on_action(
 ) -> Iterator[Note]:
     """Yield a note if the denied name is a part of an action, or names an action that is allowed.
 
-    ``kind`` is the kind of the name if the user gave it; ``decide`` returns whether the enclave may
-    do it, or else the parts that it may do.
+    ``kind`` is the kind of the name if the user gave it; ``decide`` returns whether the enclave has
+    the right, or else the parts that it may use.
     """
     if name := action_part(question.name)[0]:
         word = "execute" if question.right in ("publish", "reply") else "call"
@@ -354,7 +354,7 @@ def note_on_action(
 def question_meant(
     evaluator: Evaluator, asked_enclave: AskedEnclave, question: Question, kind: str | None
 ) -> tuple[Question, tuple[Note, ...]]:
-    """Return the question to answer, and a note if it is not the question that was asked."""
+    """Return the question to answer, and a note if it differs from the question that was asked."""
     if not kind:
         action = _action_meant(
             evaluator, question, lambda: asked_enclave.other_rights(question.name)

@@ -105,7 +105,7 @@ class EnclaveNodes:
 
 @dataclass(frozen=True, slots=True, order=True)
 class EnclaveNode:
-    """A node of an enclave; ``node`` is "" if the nodes of the enclave are not known."""
+    """A node that an enclave should have; ``node`` is "" if the enclave's nodes are not known."""
 
     enclave: str
     """The enclave of the node."""
@@ -461,7 +461,7 @@ _STRAYS = "not judged, because the writers or readers of these topics belong to 
 def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
     """Return notes on observed things that were not judged, each with their number and names.
 
-    These are "" for tools that only observe.
+    The text of number and names is "" for tools that only observe.
     """
     tools = {node.fqn for node in observation.nodes if is_tool(node)}
     active = {node.fqn for node in observation.nodes if is_tool(node) and not _only_observes(node)}
@@ -516,7 +516,7 @@ def _only_observes(node: ObservedNode) -> bool:
 def _enclaves_of(
     process: Sequence[ObservedNode], known: EnclaveNodes
 ) -> tuple[frozenset[str], bool]:
-    """Return the enclaves that a process may run in, and whether they match all its nodes.
+    """Return the enclaves in which a process may run, and whether they match all of its nodes.
 
     The enclave that the graph shows counts even if it is meant for other nodes.
     """
@@ -615,7 +615,7 @@ def _group_by_right(denied: Iterable[DeniedRight]) -> tuple[DeniedRight, ...]:
 
 
 def _nodes_using_denied(denied: Iterable[DeniedRight], observation: Observation) -> Observation:
-    """Return the nodes with the endpoints of denied rights, unless a deny rule denies a right."""
+    """Return the nodes with the endpoints of denied rights, without rights that a rule denies."""
     wanted: dict[tuple[str, str], set[Endpoint]] = {}
     for right in denied:
         if right.by_rule:

@@ -62,11 +62,11 @@ _NEAR_LINES = 3
 class Denial:
     """A denied DDS topic, and ``direction``: "publish", "subscribe", or "" if unknown.
 
-    With ``by_rule`` a deny rule denies it, so that an allow rule would not help (None: unknown);
-    with ``remote`` the permissions of a peer deny it.  ``enclave`` is "" if the log does not name
-    it.  ``process`` is the label of the process that printed the denial, or "", and ``lines`` the
-    numbers of its lines, from 1.  ``folder`` is the folder from which the process loaded its
-    enclave, or "".
+    ``by_rule``: a deny rule denies the topic, so that an allow rule would not help (None: unknown).
+        ``remote``: the permissions of a peer deny the topic.  ``enclave`` is "" if the log does not
+        name it.  ``process`` is the label of the process that printed the denial, or "", and
+        ``lines`` the numbers of its lines, from 1.  ``folder`` is the folder from which the process
+        loaded its enclave, or "".
     """
 
     topic: str
@@ -140,7 +140,7 @@ def _denials_of(process: str, numbered: list[tuple[int, str]]) -> Iterator[Denia
 
 
 def _direction(lines: list[str], topic: str) -> tuple[bool, str]:
-    """Return whether a peer is denied, and the direction, by a denial and the lines after it."""
+    """Return, from a denial and the lines after it, whether a peer is denied, and the direction."""
     for line in lines:
         other = denied_topic(line)
         if other and other[1]["topic"] != topic:
@@ -195,7 +195,7 @@ def serving_node(denial: Denial) -> str:
 
 def _is_ros(topic: str) -> bool:
     if is_expression(topic) or expression_problem(topic[2:]):
-        return False  # a topic name that looks like a wildcard must not become one
+        return False  # a topic named like a wildcard must not become a wildcard
     return topic.startswith("rt/") or bool(service_of(topic)[0])
 
 
@@ -251,7 +251,7 @@ def learned_from_logs(
     node: tuple[str, str] | None,
     present: Policy | None,
 ) -> tuple[Learned, list[AskingLine], bool]:
-    """Return the rights that are missing by logs, explanations, and whether there is a denial.
+    """Return the rights missing by logs, the lines that ask for them, and whether any was denied.
 
     Args:
         logs: the texts of the logs by their paths.
@@ -421,10 +421,10 @@ def _missing_common_part(
     node_rights: frozenset[NodeRight],
     common: CommonParts,
 ) -> tuple[str, ...]:
-    """Return the common part that a profile does not include and needs, as a tuple; or ().
+    """Return, as a tuple, the common part that a profile needs and does not include; or ().
 
-    A denied right (None: any) shows that it needs the part, and no right of the part that it is
-    missing.
+    The profile needs a part if one of its rights was denied (None: any), and lacks the part if it
+    has none of its rights.
     """
     if is_expression(profile[1]):
         return ()

@@ -30,10 +30,11 @@ def note_on_earlier_permissions(
 ) -> Iterator[Note]:
     """Yield a note on enclaves that are ``denied`` now, if earlier permissions may allow it.
 
-    Permissions cannot be revoked: earlier ones work with a certificate that they fit, until one of
-    the two expires or the certificate is revoked.  The ledger does not have the rights of earlier
-    permissions; those that were signed from the same policy as the present ones do not count.  If
-    the ledger or a revocation list cannot be read, or lines are missing, the note says so.
+    Permissions cannot be revoked: earlier permissions work with every certificate that they fit,
+    until either expires or the certificate is revoked.  The ledger does not have the rights of
+    earlier permissions; those that were signed from the same policy as the present ones do not
+    count.  If the ledger or a revocation list cannot be read, or lines are missing, the note says
+    so.
     """
     if not denied or not keystore.has(LEDGER):  # an export, or a keystore of ros2/sros2
         return
@@ -69,7 +70,7 @@ def note_on_revoked_enclaves(
     asking: AskingContext,
     named: Collection[str],
 ) -> Iterator[Note]:
-    """Yield notes on revoked certificates that are still accepted, and have the right.
+    """Yield notes on enclaves whose revoked certificates are still accepted and give the right.
 
     DDS accepts them in processes without the current revocation list; Zenoh (``vendor`` None) has
     no revocation list.  ``named`` are the enclaves that have the right now.
@@ -126,9 +127,9 @@ def note_on_revoked_enclaves(
 
 
 class _RevokedEnclave(NamedTuple):
-    """An enclave whose revoked certificate and permissions for it work ``until`` a moment.
+    """An enclave whose revoked certificate works with fitting permissions ``until`` a moment.
 
-    ``decided`` is False if the keystore lacks permissions, which may give the right.
+    ``decided`` is False if the keystore lacks some of these permissions, which may give the right.
     """
 
     name: str
@@ -153,7 +154,8 @@ def _revoked_with_right(
         works: list[tuple[bool, str]] = []
         for certificate, folder in zip(revoked, folders, strict=True):
             fitting = [of for of in permissions[name] if of.subject in ("", certificate.subject)]
-            if vendor is None:  # it has the rules of the last permissions, which do not expire
+            # Zenoh files have the rules of the last permissions, and do not expire.
+            if vendor is None:
                 fitting = [of._replace(not_after="") for of in permissions[name][-1:]]
                 if (folder / ROUTER_FILE).exists():  # sessions trust a router in everything
                     works.append((True, certificate.not_after))
@@ -179,7 +181,7 @@ def _documents(keystore: OpenedKeystore, folders: Iterable[Path]) -> Mapping[str
     """Map the SHA-256 of each ``permissions.p7s`` in the folders to its content."""
     documents = {}
     for folder in folders:
-        with suppress(SrosError):  # it counts as permissions that are not here
+        with suppress(SrosError):  # an unreadable file counts as missing permissions
             data = keystore.read(folder / PERMISSIONS_FILE, "permissions document")
             documents[hashlib.sha256(data).hexdigest()] = data
     return documents

@@ -121,7 +121,7 @@ def _with_policy_change(evaluator: Evaluator, answer: Answer) -> Answer | None:
         return None
     if change.add or change.lift:
         return answer._replace(change=change)
-    # The current policy allows it.
+    # The policy allows the access already; it only has to be signed.
     other = answer.provenance in (Provenance.CHANGED, Provenance.UNKNOWN)
     return answer._replace(sign=True) if other else None
 
@@ -158,7 +158,7 @@ _BY_REASON: dict[str, str | Fault] = {
     "invalid-name": "Use a name of letters, digits, '_' and '/'.",
     "partition": "Leave partitions out of permissions; sros never writes them.",
 }
-"""Faults, or remedies, by the reason of a denial that no change of the policy can resolve."""
+"""Reason of a denial that no change of the policy can resolve → the fault, or a remedy."""
 
 _OF_VALIDITY = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_VALID)
 _OF_GOVERNANCE = (Fault.GOVERNANCE_MALFORMED, Fault.GOVERNANCE_DOMAIN)
@@ -203,7 +203,7 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
 
 def _filled_remedy(text: str, root: str, enclave: str, file: str) -> str:
     path = enclave_path(Path(root), enclave) / (file or "cert.pem")
-    # Quoted, so that text copied into a shell cannot become another command.
+    # Quoted, so that copied text cannot become another command in a shell.
     return text.format(root=quote(root), enclave=quote(enclave), path=quote(str(path)))
 
 
@@ -218,7 +218,7 @@ def _is_rotating(keystore: Path) -> bool:
 
 
 def _is_latest(keystore: Path, enclave: str) -> bool:
-    """Return whether an enclave has the permissions that, by the ledger, were signed last."""
+    """Return whether an enclave has the permissions that the ledger records as signed last."""
     from sros_tool.keystore.reader import OpenedKeystore
 
     try:
@@ -330,7 +330,7 @@ def _added_xml(right: Right, places: Iterable[tuple[str, str]]) -> str:
     ns, node = max(fitting or known, key=lambda pair: len(pair[0]), default=_ANY_NODE)
     group = Group(right.kind, ((right.right, right.qualifier),), (right.name,))
     enclave = Enclave(right.enclave, (Profiles((Profile(ns, node, (group,)),)),))
-    from sros_tool.policy.document import policy_xml  # an allowed question needs none
+    from sros_tool.policy.document import policy_xml  # only denied questions need it
 
     return policy_xml(Policy((enclave,))).decode().rstrip()
 
@@ -350,7 +350,7 @@ def _node_names(policy: Enclave | None, answer: Answer) -> Iterator[tuple[str, s
 
 def _granted_rights(name: str, answer: Answer) -> Iterator[Right]:
     """Yield the rights in the grant of an enclave."""
-    from sros_tool.translate import grant_rights  # an allowed question needs none
+    from sros_tool.translate import grant_rights  # only denied questions need it
 
     if answer.grant:
         yield from grant_rights(name, answer.grant)
@@ -396,7 +396,7 @@ def likely_meaning(right: Right, used: Collection[Right], named: Iterable[Right]
 
 
 def meaning_of_other_kind(right: Right, named: Iterable[Right]) -> str:
-    """Return, as a clause, that ``named`` have a service as an action, or vice versa; or ""."""
+    """Return a clause if ``named`` have the name as an action, not as a service, or the reverse."""
     for other in named:
         if other.name == right.name and {other.kind, right.kind} == {"services", "actions"}:
             kind = "an action" if other.kind == "actions" else "a service"
@@ -418,7 +418,7 @@ def _similar_names(name: str, names: AbstractSet[str], is_service: bool) -> tupl
         return tuple(same_last) if len(same_last) <= _SHOWN else ()
     if not names:
         return ()
-    from difflib import get_close_matches  # for this alone, which is asked last
+    from difflib import get_close_matches  # imported only for this last search
 
     return tuple(get_close_matches(name, sorted(names), n=_SHOWN, cutoff=_ALIKE))
 

@@ -178,8 +178,8 @@ class SearchedKeystore:
     def has_other_side(self, right: Right) -> bool | None:
         """Return whether an enclave has the right that the peers of a right need, by its name.
 
-        None if that is not known, as with unreadable permissions, or if an enclave has it only by a
-        wildcard.  In an export, other machines can have an enclave with it: `place`.
+        None if that is not known, as with unreadable permissions, or if an enclave has the right
+        only by a wildcard. In an export, the enclave with the right may be missing (see `place`).
         """
         exact, expressions = self._allowed_names[OTHER_SIDE[right.right]]
         if right.name in exact:
@@ -191,11 +191,11 @@ class SearchedKeystore:
 
     @cached_property
     def zenoh_routers(self) -> frozenset[str]:
-        """The enclaves of Zenoh routers: by the settings, by name without them, and by files."""
-        from sros_tool.zenoh.configuration import ZenohNetwork  # most logs are not of Zenoh
+        """The enclaves of Zenoh routers, by the settings (or their default) and by router files."""
+        from sros_tool.zenoh.configuration import ZenohNetwork  # most logs do not come from Zenoh
 
         network = None
-        with suppress(SrosError):  # which `sros check` reports
+        with suppress(SrosError):  # `sros check` reports the error
             network = settings.zenoh if (settings := self._keystore.settings) else None
         names = set((network or ZenohNetwork()).router_names())
         for name in self._keystore.names:
@@ -217,19 +217,19 @@ class SearchedKeystore:
 
     @cached_property
     def _rights(self) -> RightsSource | None:
-        with suppress(SrosError):  # its documents do not tell
+        with suppress(SrosError):  # without readable documents, the rights are unknown
             return load_rights(self._keystore)
         return None
 
     @property
     def place(self) -> str:
-        """What has these enclaves: the keystore, or an export, which may lack some of them."""
+        """The source of the enclaves: the keystore, or an export, which may lack enclaves."""
         is_whole = self._rights is not None and self._rights.scope is None
         return "keystore" if is_whole else "export"
 
     @cached_property
     def _allowed_names(self) -> Mapping[str, tuple[frozenset[str], Names]]:
-        """Map each right to the names that enclaves have, and to those with wildcards."""
+        """Map each right to the exact names, and to the wildcards, that enclaves have."""
         names: dict[str, set[str]] = {right: set() for right in OTHER_SIDE}
         for right in self._rights.rights if self._rights else ():
             if right.qualifier is ALLOW and right.right in names:
@@ -251,7 +251,7 @@ class SearchedKeystore:
 
 @dataclass(frozen=True, slots=True)
 class AskedPolicy:
-    """The policy of a question about a log, perhaps of a robot that has it in a namespace.
+    """The policy that explains a log, perhaps of a robot that uses the policy in a namespace.
 
     ``file`` is its path, and ``name`` the enclave that the user named, or "".
     """
@@ -278,7 +278,7 @@ class AskedPolicy:
         stated = self.policy.enclave(path) if path else None
         if stated is None:
             return None
-        alone = replace(self.policy, enclaves=(stated,))  # whoever writes the log names many
+        alone = replace(self.policy, enclaves=(stated,))  # the log may name many enclaves
         return policy_in_namespace(alone, ns).enclave(enclave)
 
 
@@ -297,8 +297,8 @@ def explain_log_of(
     """Explain the security messages of a log, and examine the enclaves that it names.
 
     ``name`` is the enclave, or its folder, whose processes wrote the log; "" if the log names the
-    enclave itself, or ``keystore`` is the folder of the enclave alone.  With ``policy_file`` there
-    is no keystore, and only denials are compared: with what the policy gives.
+    enclave itself, or ``keystore`` is the folder of the enclave alone.  With ``policy_file``, there
+    is no keystore, and only denials are examined: by the rights in the policy.
 
     Raises:
         UsageError: ``name`` is an enclave, and there is no keystore.
@@ -327,7 +327,7 @@ def explain_log_of(
                 "Write the keystore before the enclave.",
             )
 
-    # Once for each enclave: whoever writes the log chooses how many it names, and how often.
+    # Cached, because a log may name any number of enclaves, any number of times.
     @cache
     def find(enclave: str) -> LoadedEnclave | None:
         if named is not None and enclave in ("", named.name):
@@ -373,7 +373,7 @@ def explain_log(
 ) -> tuple[LogFinding, ...]:
     """Return the security messages of a log, each once, in the order of the log.
 
-    The lines that are not understood follow at the end, those of a process as one finding.
+    Lines that are not understood follow at the end, with one finding for each process.
 
     ``find`` loads an enclave; ``context`` returns domain and time for it.  ``root`` is the path of
     the keystore as suggested commands name it.  The enclaves of peers and nodes in the log are
@@ -476,7 +476,7 @@ def _rejoined_message(process: str, line: str, rest: str, following: str) -> str
 
     ``line`` counts as broken if it and ``following`` have no known meaning, but both together do.
     """
-    if not UNKNOWN.pattern.search(rest):  # first, because it is fast
+    if not UNKNOWN.pattern.search(rest):  # checked first, because this check is fast
         return ""
     other, end = labeled_line(following)
     if other not in ("", process) or matching_text(line) or matching_text(following):
@@ -492,7 +492,7 @@ def _meaning_of(line: str, rest: str) -> tuple[LogText, re.Match[str] | None]:
     """Return the meaning of a line, and its match, if any; ``rest`` is the line without label."""
     if meaning := matching_zenoh_text(line):
         return meaning
-    if ZENOH_LINE.search(rest):  # what is not in the table is no trouble of security
+    if ZENOH_LINE.search(rest):  # other lines of Zenoh are no security problem
         return UNKNOWN, None
     if meaning := matching_text(line):
         return meaning
@@ -527,7 +527,7 @@ def _lines_naming(
     """Map denials to the numbers and texts of lines that name their topic.
 
     If a process was denied a topic for several causes, a line that is no denial itself belongs to
-    the denial before it; a denial of which the direction is unknown may then be of any cause.
+    the denial before it; a denial with an unknown direction may belong to any of these causes.
     """
     of_topic = defaultdict[tuple[str, str], list[Denial]](list)
     for denial in denials:
@@ -580,15 +580,16 @@ def _dropped_message_findings(
 ) -> Iterator[LogFinding]:
     """Yield a finding for each right whose lack made Zenoh drop messages.
 
-    ``own_name`` is the enclave of the process that wrote the log, "" if unknown.  Its rules for its
-    router are its own rights: where these drop a message, the process itself lacks a right.
+    ``own_name`` is the enclave of the process that wrote the log, "" if unknown.  If the process
+    drops a message to or from its router, the process itself lacks the right: its rules for the
+    router are its own rights.
     """
     numbered = ((n, *labeled_line(line[:_LONGEST])) for n, line in enumerate(lines, 1))
     groups: dict[tuple[str, str, bool, str], list[DroppedMessage]] = {}
     dropped = [*dropped_messages(numbered)]
     routers = keystore.zenoh_routers if keystore and dropped else frozenset[str]()
     for message in dropped:
-        # Routers check each other, too: without its name, the process may be one of them.
+        # Routers check each other, too: a process without a known name may be a router.
         is_node = own_name not in routers if own_name else len(routers) == 1
         lacks_own = message.name in routers and is_node
         kind = message.message, message.ingress is not lacks_own
@@ -806,8 +807,8 @@ class _Examiner:
     def missing_namespaces(self, denials: Iterable[Denial]) -> dict[tuple[str, str], str]:
         """Map pairs of process and enclave to the namespace that all denied names lack.
 
-        Only if a service of a node is among the names: otherwise a remapping may be missing, and
-        not the namespace of the process.
+        Empty unless a service that every node offers is among the names: otherwise a remapping may
+        be missing, not the namespace of the process.
         """
         by_process = defaultdict[tuple[str, str], list[Denial]](list)
         for denial in denials:
@@ -911,7 +912,7 @@ class _Examiner:
     def _other_folder_cause(self, denial: Denial, enclave: LoadedEnclave) -> tuple[list[str], str]:
         """Return cause and remedy if the process runs from another folder than the enclave's."""
         folder, loaded = Path(denial.folder), None
-        with suppress(SrosError, OSError):  # the log chooses the path
+        with suppress(SrosError, OSError):  # the path comes from the log, so it may be anything
             if folder.is_absolute() and enclave.folder and not folder.samefile(enclave.folder):
                 loaded = signed_enclave(None, str(folder), self._context(enclave).at)
         if loaded is None:
@@ -963,7 +964,8 @@ class _Examiner:
         if other := meaning_of_other_kind(denied, named_rights(asked)):
             return [f"{other}, but {name} is {with_article(question.type)}"], ""
         is_used = self._keystore.has_other_side(denied) if self._keystore else None
-        names = () if is_used else likely_names(asked)  # a name that peers have is no mistake
+        # A name that peers have a right to is no mistake.
+        names = () if is_used else likely_names(asked)
         if not names and is_used is False and self._keystore:
             place = self._keystore.place
             return [f"no enclave of the {place} may {OTHER_SIDE[denied.right]} {name}"], (
@@ -1060,9 +1062,10 @@ class _Examiner:
 
 
 def _keystore_with(path: str) -> Path | None:
-    """Return the keystore here with the enclave's folder that a log names; None without it.
+    """Return the keystore that has the enclave folder named in a log; None if there is none.
 
-    The log chooses the path, and the remedy gives the keystore to another user.
+    The check is strict, because the log chooses the path, and the remedy gives the keystore to
+    another user.
     """
     place, _, name = path.rpartition("/enclaves/")
     with suppress(OSError, ValueError, SrosError):
@@ -1073,7 +1076,7 @@ def _keystore_with(path: str) -> Path | None:
 
 
 def _unknown_cause(hits: Iterable[_Hit]) -> str:
-    """Return the cause of lines that are not understood: which they are, each text once."""
+    """Return the cause for lines that are not understood: their texts, without repetitions."""
     lines: dict[str, int] = {}
     for hit in hits:
         lines.setdefault(_NUMBERS.sub("", plain_refusal(hit.text)), hit.line)
@@ -1091,7 +1094,7 @@ def _with_name(text: str, word: str, name: str) -> str:
     if not name:
         return text
     plain = quote(name).replace("{", "{{").replace("}", "}}")
-    # Not the KEYSTORE in ROS_SECURITY_KEYSTORE.
+    # Whole words only: the word KEYSTORE also ends the variable ROS_SECURITY_KEYSTORE.
     return plain.join(re.split(rf"\b{word}\b", text))
 
 
@@ -1138,7 +1141,7 @@ def _renaming_advice(nodes: Sequence[str], wrong: str, enclave: str) -> str:
     rules = f"`--ros-args -r __node:={quote(name)} -r __ns:={quote(ns or '/')}`"
     start = f"Start the node under that name ({rules})"
     if len(nodes) > 1:
-        # rcl looks for the rule of the namespace under the new name.
+        # rcl looks up the rule for the namespace by the node's new name.
         rules = f"`--ros-args -r {quote(wrong.rpartition('/')[2])}:__node:={quote(name)} "
         rules += f"-r {quote(name)}:__ns:={quote(ns or '/')}`"
         new_name = meant[0] if len(meant) == 1 else f"one of these names, such as {meant[0]}"
@@ -1222,7 +1225,7 @@ def _questions_to_ask(denial: Denial) -> tuple[Question, ...]:
     words = _WORDS_OF_TYPES[kind] if right == "use" else (right,)
     try:
         return tuple(ask(word, name, kind) for word in words)
-    except SrosError:  # a name that ROS does not have
+    except SrosError:  # not a valid ROS name
         return ()
 
 

@@ -288,7 +288,7 @@ def _export_notes(answer: Answer) -> Iterator[Note]:
 def _earlier_permissions_notes(answer: Answer, now: datetime) -> Iterator[Note]:
     """Yield a note if earlier permissions of the enclave may allow what is denied."""
     if (keystore := answer.enclave.keystore) and not answer.allowed:
-        from sros_tool.explain.earlier import note_on_earlier_permissions  # a yes needs none
+        from sros_tool.explain.earlier import note_on_earlier_permissions  # only a denial needs it
 
         yield from note_on_earlier_permissions(keystore, {answer.enclave.name}, now)
 
@@ -305,7 +305,7 @@ def _note_on_action(evaluator: Evaluator, answer: Answer, kind: str | None) -> I
 
 
 def _note_on_parts(evaluator: Evaluator, answer: Answer) -> Iterator[Note]:
-    """Yield a note if the enclave may do a part of an action that it is denied as a whole."""
+    """Yield a note if the enclave is denied an action as a whole, but may use a part of it."""
     if parts := _allowed_parts(evaluator, answer):
         yield Note("explain.in-part", text_of_parts(answer.question, parts))
 
@@ -331,9 +331,9 @@ def _not_a_topic_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[
 
 
 def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[Note]:
-    """Yield a note if another name may be meant: by a similar one, or because nobody offers it.
+    """Yield a note if another name may be meant: a similar name, or a name that somebody offers.
 
-    A name that a peer has is no mistake.
+    A name that a peer has a right to is no mistake.
     """
     question = answer.question
     if answer.allowed or answer.problems or not question.right:
@@ -352,7 +352,7 @@ def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[N
 
 
 def _note_on_fitting_permissions(evaluator: Evaluator, answer: Answer) -> Iterator[Note]:
-    """Yield a note if a denied enclave can do it with the permissions of another enclave."""
+    """Yield a note if a denied enclave could use another enclave's permissions, which allow it."""
     if answer.allowed or not answer.question.right:
         return
     holders = [
@@ -401,7 +401,7 @@ def _zenoh_decision(
         return None
     if not _runs_on_zenoh(keystore, enclave.name):
         return None
-    from sros_tool.explain.zenoh import ZenohEvaluator  # many keystores have no Zenoh
+    from sros_tool.explain.zenoh import ZenohEvaluator  # many keystores are not for Zenoh
 
     try:
         evaluator = ZenohEvaluator(keystore, moment=context.at, domain=context.domain)
@@ -436,7 +436,7 @@ class OpenedParts(NamedTuple):
 
     @staticmethod
     def joined(opened: Iterable[OpenedParts]) -> OpenedParts:
-        """Return the union of several: open in at least one enclave or domain."""
+        """Return what is open in at least one of several enclaves or domains."""
         known = tuple(opened)
         if any(opened_parts.whole for opened_parts in known):
             return OpenedParts(whole=True)
@@ -631,7 +631,8 @@ class VendorOfPolicy(NamedTuple):
 
 
 _MOST_NARROWED = 100
-"""If more enclaves are asked about, all are decided: permissions of others perhaps fit."""
+"""If more enclaves than this are asked about, sros decides on all: other permissions may fit, too.
+"""
 
 
 class VendorOfKeystore(NamedTuple):
@@ -666,7 +667,7 @@ class VendorOfKeystore(NamedTuple):
 
     def outcomes(self, question: Question) -> tuple[VendorOutcome, ...]:
         """Return the outcome for each enclave, sorted by name."""
-        # Imported here, because a question about one enclave needs neither.
+        # Imported here, because a question about one enclave does not need them.
         from sros_tool.explain.who import decide_each, first_allowing_domain
 
         def outcome(name: str) -> VendorOutcome:
@@ -701,7 +702,7 @@ class VendorOfKeystore(NamedTuple):
         return tuple(o for o in self._with_holders(outcomes) if o.enclave in asked)
 
     def _with_holders(self, outcomes: Sequence[VendorOutcome]) -> tuple[VendorOutcome, ...]:
-        """Return outcomes, in which a denial names allowed enclaves whose permissions also fit."""
+        """Return the outcomes; denied ones name the allowed enclaves whose permissions also fit."""
         certified = {o.enclave: o.subject for o in outcomes if o.subject and not o.allowed}
         granted = {o.enclave: [o.granted] for o in outcomes if o.granted}
         vendors = {self.vendor, *(self.stated(o.enclave) or self.vendor for o in outcomes)}

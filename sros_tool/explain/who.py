@@ -74,7 +74,7 @@ class EnclaveOutcome(Protocol):
 
     @property
     def in_part(self) -> Sequence[str]:
-        """The acting parts of an action that the enclave may do, but not the whole."""
+        """The acting parts of an action that the enclave may use without the whole right."""
 
     @property
     def by_permissions_of(self) -> Sequence[str]:
@@ -138,7 +138,8 @@ def answer_for_all(decider: Decider, question: Question, kind: str | None) -> An
     """
     outcomes = decider.outcomes(question)
     taken: tuple[Note, ...] = ()
-    # A name that an enclave has as a service is one; a wildcard shows nothing about it.
+    # If an enclave has an exact right to the service, the name is a service; a wildcard shows
+    # nothing.
     unclear = all(outcome.wildcard for outcome in outcomes if outcome.allowed)
     if not kind and unclear and question.type == "service":
         rights = decider.rights_naming(question.name)
@@ -174,7 +175,7 @@ def names_meant(decider: Decider, question: Question, enclaves: Container[str]) 
     exact = [name for name in names if not is_expression(name)]
     same_last = [name for name in exact if name.rpartition("/")[2] == last]
     meant = same_last or likely_names(question.name, exact)
-    if not meant or question.name in meant:  # an enclave with the right cannot start now
+    if not meant or question.name in meant:  # the name is right, but its enclave cannot start
         return None
     text = f"they may {question.word} {first_few(meant, 3)}: perhaps that is meant."
     return Note("explain.likely-name", text)
@@ -196,7 +197,7 @@ def first_allowing_domain(
 
 def decide_each(names: Sequence[str], decide: Callable[[str], _Outcome]) -> tuple[_Outcome, ...]:
     """Return the decision on each of the enclaves, sorted by name; uses all cores."""
-    from sros_tool.parallel import map_slices, tick  # a question about one enclave needs none
+    from sros_tool.parallel import map_slices, tick  # not needed for one enclave
 
     def work(part: Sequence[str]) -> list[_Outcome]:
         outcomes = []
@@ -322,7 +323,8 @@ def follow_reach(
             f"Perhaps you mean {' or '.join(meant)}." if meant else "",
         )
     reach = network.reach(enclave)
-    notes = [note for note in source.notes if note.id != "rights.domains"]  # they are followed
+    # Reach follows each domain, so this note does not apply.
+    notes = [note for note in source.notes if note.id != "rights.domains"]
     if of_keystore and _admits_strangers(OpenedKeystore(source.path).governance):
         refuse = remedy_in_keystore(source.path, f"Run {REFUSE_STRANGERS}.")
         text = (
@@ -363,7 +365,7 @@ def _fitting_holders(source: RightsSource, enclave: str) -> list[str]:
         return []
     try:
         certificate = load_certificate(read_bytes(file, "certificate"), f"'{file}'")
-    except SrosError:  # no process can run with it
+    except SrosError:  # no process can use an unreadable certificate
         return []
     certified = {enclave: subject_text(certificate.subject)}
     fitting = (other_fitting_enclaves(v.traits, certified, granted) for v in CYCLONE_DDS)
@@ -381,7 +383,7 @@ def _admits_strangers(governance: Governance) -> bool:
 
 
 def _access_in_domain(unguarded_access: Iterable[Unguarded], domain: int) -> Iterator[Unguarded]:
-    """Yield, as rights in one domain, the access that its governance leaves open."""
+    """Yield, as rights in one domain, the access that the domain's governance leaves open."""
     only = DomainSet.of((domain, domain))
     for topics in unguarded_access:
         if topics.domains is None or domain in topics.domains:
@@ -393,8 +395,8 @@ def _rights_of_router(
 ) -> Iterator[Right]:
     """Yield what a router may send and receive, as rights; nothing for any other enclave.
 
-    It may receive what its enclaves may send by ``rights``, and the reverse; and what other routers
-    allow it.
+    By ``rights``, it may receive what its enclaves may send, and send what they may receive. It
+    also has the rights that other routers give it.
     """
     if router not in source.routers:
         return

@@ -1,4 +1,4 @@
-"""Decide as Zenoh does, by the configurations in a keystore, for each link between processes.
+"""Decide on rights as Zenoh does: by the configurations in a keystore, for each link of processes.
 
 Zenoh reports no denial as an error: a process that denies a message drops it.  In client mode, the
 router and the session itself decide on a right; in peer mode, the sessions of all other enclaves
@@ -89,7 +89,7 @@ from sros_tool.zenoh.document import ZenohEndpoint, parse_configuration
 from sros_tool.zenoh.key_expressions import includes
 
 _OF_TLS = (CERTIFICATE_FILE, KEY_FILE, IDENTITY_CA_FILE)
-"""Names of the files of an enclave that a process on Zenoh needs."""
+"""Names of the enclave files that a process on Zenoh needs for TLS."""
 
 
 class _Outcome(StrEnum):
@@ -300,7 +300,8 @@ class ZenohEvaluator:
     ) -> None:
         """Read the routers.
 
-        In a copy of a keystore without any keys, keys count as present, except for ``joining``.
+        In a copy of a keystore without any keys, all keys count as present, except the key of
+        ``joining``.
         """
         keystore.check()
         self._counts_keys = not (joining or keystore.has_keys)
@@ -317,7 +318,7 @@ class ZenohEvaluator:
     def _routers(self) -> dict[str, ZenohFile]:
         """Map the enclaves of routers to their files.
 
-        There is one router, or several that are connected to each other.
+        There is one router, or there are several that are connected to each other.
 
         Raises:
             KeystoreError: there is no router, or its rules do not tell what passes.
@@ -430,7 +431,7 @@ class ZenohEvaluator:
         return f"{check}: {check.decision.why}, in {file} of {check.enforcer}"
 
     def outdated_enclaves(self, answer: ZenohAnswer) -> tuple[str, ...] | None:
-        """Return the names of files that decide an answer and do not match the permissions.
+        """Return the deciding files of an answer that do not match the permissions.
 
         Only the rules that concern the question are compared.  None if the files cannot be
         compared, as in an export.
@@ -453,7 +454,7 @@ class ZenohEvaluator:
                 authority,
                 self._at,
                 only_enclaves=deciding,
-                # What may pass between routers depends on all enclaves on both sides.
+                # With several routers, what may pass between them depends on all enclaves.
                 among=() if network.routers else deciding | self._enclaves_to_check(answer, ends),
                 reader=self._rendered,
             ).files
@@ -463,7 +464,7 @@ class ZenohEvaluator:
             sorted(
                 signed_path(drift.path) if drift.kind is Drift.UNSIGNED else drift.path
                 for drift in drifts
-                # Whether the files of the first two are signed is distinguished.
+                # Unsigned files of the enclave itself and of the routers are reported elsewhere.
                 if drift.enclave in deciding
                 and not (drift.kind is Drift.UNSIGNED and drift.enclave in ours)
             )
@@ -548,7 +549,7 @@ class ZenohEvaluator:
         """Return the mode of a process, what it enforces, and where it connects or listens."""
         data = self.keystore.read(path, "Zenoh configuration")
         rendered = self._rendered.read(data)
-        # Where each rule is written once, rules have the ids of the file.
+        # In this form of the file, each rule is written once, with the id from the file.
         if rendered and rendered.settings is SettingsEdition.RULES_ONCE:
             texts = rendered.listen if rendered.mode is Mode.ROUTER else rendered.connect
             return rendered.mode, rendered.access_control, tuple(map(ZenohEndpoint, texts))
@@ -592,7 +593,7 @@ class ZenohEvaluator:
         for name in self.names if wanted else ():
             if name == process.name:
                 continue
-            # The router's rules state the same rights, and are at hand.
+            # The router's rules, already read, state the same rights.
             deliveries = self._direct_deliveries(
                 process, _unrestricted_process(name, Mode.CLIENT), wanted
             )
@@ -649,7 +650,7 @@ class ZenohEvaluator:
         for name in self.names:
             if name == process.name or name in self.routers:
                 continue
-            # What the session itself lets through comes first: it needs no other file.
+            # The session's own decision comes first, because it needs no other file.
             alone = self._link_checks(
                 process, _unrestricted_process(name, Mode.PEER), wanted_rights
             )
@@ -715,7 +716,8 @@ class ZenohEvaluator:
             if name == zenoh_file.enclave or name in self.routers:
                 continue
             assert zenoh_file.process
-            # What the others decide comes first: it needs no file of that enclave.
+            # The decision of the other processes comes first, because it needs no file of that
+            # enclave.
             deliveries = self._deliveries_between(
                 zenoh_file.process,
                 _unrestricted_process(name, zenoh_file.process.mode),
@@ -832,9 +834,9 @@ _ROUTERS_KEY = Note(
 
 
 def _domains(keystore: OpenedKeystore, now: datetime) -> DomainSet:
-    """Return the ROS domains of a keystore; of an export, those of the governance of its enclaves.
+    """Return the ROS domains of a keystore; for an export, the domains in its enclaves' governance.
 
-    Without any governance it is domain 0.
+    Without any governance, return domain 0.
     """
     if keystore.has_all_enclaves:
         return keystore.domains
@@ -844,7 +846,7 @@ def _domains(keystore: OpenedKeystore, now: datetime) -> DomainSet:
 
 
 def _with_equal_rules(evaluator: ZenohEvaluator, domains: DomainSet) -> Iterator[DomainSet]:
-    """Yield parts of ``domains``: the routers have the same rules for all domains of a part."""
+    """Divide ``domains`` into parts with the same rules of the routers in all domains of a part."""
     keys: dict[str, set[object]] = defaultdict(set)
     for router, file in evaluator.routers.items():
         for rule, expressions in _rules(file.process.access) if file.process else ():
@@ -929,7 +931,7 @@ class ZenohOfKeystore:
         return rights_naming(self._keystore, name)
 
     def printed(self, question: Question, outcomes: Sequence[ZenohAnswer]) -> WhoOnZenoh:
-        """Return what ``--json`` prints for these answers."""
+        """Return these answers in the form that ``--json`` prints."""
         shown = [
             ZenohEnclaveOutcome(
                 outcome.enclave,
@@ -1020,7 +1022,7 @@ class ZenohExplanation(NamedTuple):
 
     @property
     def wants_rights(self) -> bool:
-        """Whether more rights would help; they never do for the router, whose enclave has none."""
+        """Whether more rights would help; never for a router, because its enclave has no rights."""
         return not self.allowed and not self.permitted and not self.answer.of_router
 
     @property

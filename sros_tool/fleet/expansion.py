@@ -33,7 +33,7 @@ from sros_tool.wording import first_few
 if TYPE_CHECKING:
     from sros_tool.policy.minimize import MinimizedPolicy
 
-_MOST_NAMES = 200_000  # of one enclave: a signed document cannot have more
+_MOST_NAMES = 200_000  # per enclave: a signed document cannot have more
 
 
 class FleetPolicy(Mapping[str, Enclave]):
@@ -151,7 +151,7 @@ class FleetPolicy(Mapping[str, Enclave]):
             nonlocal count
             ns, node = (self._filled_name(text, robot) for text in (profile.ns, profile.node))
             if has_placeholder(profile.ns):
-                ns = check_namespace(ns)  # in the root namespace it can be empty
+                ns = check_namespace(ns)  # a name in the root namespace can be empty
             groups = []
             for unfilled in profile.groups:
                 group = self._group(unfilled, robot, _MOST_NAMES - count)
@@ -203,7 +203,7 @@ class FleetPolicy(Mapping[str, Enclave]):
         if names is None:
             parts = parts_of(name)
             names = tuple(dict.fromkeys(self._robots_for_name(parts, source)))
-            if name == written:  # the same for all enclaves that say it
+            if name == written:  # without a placeholder, a name is the same for all robots
                 self._names[key] = names
         return names
 
@@ -254,7 +254,7 @@ def read_policy_for(path: Path, fleet: Fleet | None) -> Policy:
 
 
 def fleet_with_enclaves(fleet: Fleet, files: Iterable[Path]) -> Fleet:
-    """Return the fleet with the paths of enclaves that policies have, unreadable ones left out.
+    """Return the fleet with the enclave paths of policies; unreadable policies are left out.
 
     Use the result only to show which robot an enclave belongs to.
     """
@@ -397,7 +397,7 @@ def _as_stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Ite
     A right to an action is yielded as rights to its parts.
     """
     enclave, robot = policy.stated(path)
-    policy[path]  # which has a bounded number of names
+    policy[path]  # raises an error if there are too many names
     rights = policy_rights(with_absolute_names(Policy((enclave,))))
     stated = [right for right in rights if right.qualifier is ALLOW]
     exact: dict[tuple[str, str], list[Right]] = defaultdict(list)
@@ -417,7 +417,7 @@ def _as_stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Ite
                 if rules.cover(general_right := Right(enclave.path, ALLOW, right.right, name))
             ][:1]
         )
-        # A wildcard for each robot, such as /{robots}/*, stays.
+        # Keep a wildcard for each robot, such as /{robots}/*.
         same = same or [
             part
             for used, name, rights in wide
@@ -428,7 +428,7 @@ def _as_stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Ite
 
 
 def _names(policy: FleetPolicy, name: str, robot: Robot | None) -> Iterable[str]:
-    """Return the names that a name with placeholders stands for, for a robot.
+    """Return a robot's names for a name with placeholders.
 
     The name has the form of `with_absolute_names`.
     """

@@ -311,7 +311,7 @@ _SHOWN = {"robots": "hosts", **_VARIABLES}
 
 _OF_ALL = ("all", "ungrouped", "_meta")
 _MOST_DEPTH = 64
-_MOST_STEPS = 200_000  # a host counts in each group, a group in every other group
+_MOST_STEPS = 200_000  # a host is counted once for each of its groups
 _WRITE_OUT = (
     "Write it out with `ansible-inventory -i FILE --list > hosts.json`, and name hosts.json."
 )
@@ -395,7 +395,8 @@ def _load_yaml(data: bytes, label: str) -> Any:
         ) from error
     loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        # Before the values are made: depth could end the process, aliases fill the memory.
+        # Checked before values are made: deep nesting could end the process, aliases could fill the
+        # memory.
         depth = 0
         for event in yaml.parse(data, Loader=loader):
             depth += isinstance(event, yaml.CollectionStartEvent)
@@ -552,7 +553,7 @@ class _Inventory:
             robot = {key: values[word] for key, word in _VARIABLES.items() if word in values}
             domain = robot.get("domain")
             if isinstance(domain, str) and domain.isdecimal() and len(domain) < 4:
-                robot["domain"] = int(domain)  # as variables of INI inventories are
+                robot["domain"] = int(domain)  # variables of INI inventories are text
             yield name, {"address": host, **robot, "groups": sorted(of[host])}
 
     def _mapping(self, value: Any, at: object) -> dict[Any, Any]:

@@ -192,7 +192,7 @@ def address_problem(address: str) -> str:
         ip_address(address)
     except ValueError:
         return "It is neither a host name nor an IP address, such as r7.example.com or 10.0.7.1."
-    # An IPv6 address can have a zone of any characters.
+    # The zone of an IPv6 address can have any characters.
     return "" if "%" not in address else "It has a zone: write the address without it."
 
 
@@ -239,7 +239,7 @@ _VALUES = {"robot": _PART, "namespace": f"(?:/{_PART})*"}
 
 
 def pattern_problem(path: str) -> str:
-    """Return why ``path`` is not a pattern of one enclave per robot, as a sentence, or ""."""
+    """Return a sentence on why ``path`` is not a pattern for one enclave of each robot; else ""."""
     try:
         parts = parts_of(path)
         check_path(parts)
@@ -443,8 +443,8 @@ def _candidates(fleet: Fleet, pattern: _Pattern, enclave: str) -> Iterator[Robot
 # ── names of many robots as one ───────────────────────────────────────────────────────────────
 
 
-_SHOWN = 20  # robots that a line names; --json has all
-_MOST_TARGETS = 5  # lines about pairs of robots with one text; more become one line
+_SHOWN = 20  # maximum number of robots that a line names; --json has all
+_MOST_TARGETS = 5  # if more pairs of robots share a text, they become one line
 
 
 def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[str]:
@@ -479,8 +479,8 @@ def grouped_by_robot(
     """Group items that differ only in one robot: kind -> robot -> items.
 
     Each item has its possible kinds, with the robot in which it differs from others of the kind;
-    the kind with the most robots counts.  It also has kinds of items that differ in further
-    robots: such a kind, marked by True, counts if it joins more than ``most`` groups.
+    it is put into the kind with the most robots.  An item also has kinds, marked by True, for items
+    that differ in other robots as well: such a kind is used if it joins more than ``most`` groups.
     """
     robots: dict[_Kind, set[str]] = defaultdict(set)
     read = list(items)
@@ -507,7 +507,7 @@ def grouped_by_robot(
 
 
 class _Folding(NamedTuple):
-    """A text that stands for several robots: any robot, any robot but ``own``, or any pair."""
+    """A text with a placeholder for any robot, any robot but ``own``, or any pair of robots."""
 
     text: str
     own: str = ""
@@ -522,7 +522,7 @@ def _foldings(fleet: Fleet, enclave: str, text: str) -> list[tuple[_Folding, str
     if own is None and other:
         own, other = other, None
     if own is None:
-        # Another text that has such words of its own is not mixed up with a folded one.
+        # Marked, so that a text which contains "{robot}" itself is not mixed up with a folded text.
         return [(_Folding(f"\0{text}"), "")]
     any_own = _with_placeholders(text, enclave, own)
     if other is None:
@@ -545,7 +545,7 @@ def named_robots(fleet: Fleet, enclave: str, text: str) -> tuple[Robot, ...]:
 def with_robot_placeholder(text: str, robot: Robot, word: str = "robot") -> str:
     """Return a text with ``{robot}``, or another word, in place of a robot's namespace and name.
 
-    The name can also be a part of a name, as in ``r1_lift``.
+    The robot's name can also be a part of another name, as in ``r1_lift``.
     """
     any_robot = f"{{{word}}}"
     if robot.namespace != "/":

@@ -325,7 +325,7 @@ def groups_of(rights: Iterable[NodeRight], ns: str, node: str) -> tuple[Group, .
 
 
 _CHANGING = (
-    # tf2_ros puts a memory address into the name of a listener's node; the others a process id.
+    # Names of tf2_ros listeners contain a memory address; the other names contain a process id.
     (re.compile(r"(transform_listener_impl_)[0-9a-f]+\Z"), r"\1*"),
     (re.compile(r"(launch_ros_)[0-9]+\Z"), r"\1*"),
     (re.compile(r"(rqt_gui_(?:py|cpp)_node_)[0-9]+\Z"), r"\1*"),
@@ -481,7 +481,7 @@ def _part_rights(root: Path, part: str) -> frozenset[NodeRight] | None:
     return frozenset(rights)
 
 
-@lru_cache(maxsize=4)  # verbs such as close ask several times
+@lru_cache(maxsize=4)  # cached, because verbs such as close call this several times
 def _shipped_parts(
     shipped: Path,
 ) -> Mapping[str, tuple[Mapping[str, bytes], frozenset[NodeRight] | None]]:
@@ -816,7 +816,7 @@ def draft(path: Path, learned: Learned, common: CommonParts | None) -> Draft:
 def _rights_and_profiles(
     path: Path, before: bytes, merged: bytes, learned: Learned, common: CommonParts
 ) -> tuple[Learned, list[LearnedProfile]]:
-    """Return the rights to write name by name, and the profiles to write with includes.
+    """Return the rights to write as single names, and the profiles to write with includes.
 
     An existing profile gets an include only if it neither has nor denies any right of the include.
     """
@@ -956,9 +956,9 @@ def merge_policies(
 ) -> Merged:
     """Merge policies into the policy file at ``path``; write nothing.
 
-    Of ``others``, only the ``nodes`` (() for all) are taken, moved to the ``namespace``, remapped
-    by the texts ``remaps``, and all put into the ``enclave``.  With ``may_include``, new profiles
-    include common parts in the folder of ``path``.
+    Only the ``nodes`` of ``others`` (() for all) are merged.  They are moved to the ``namespace``,
+    remapped by the texts ``remaps``, and put into the ``enclave``.  With ``may_include``, new
+    profiles include common parts in the folder of ``path``.
 
     Raises:
         SrosError: as `merge_all` and `remapped_policies`; or a name is not valid, or no policy has
@@ -998,8 +998,8 @@ def _with_common_parts(path: Path, merged: bytes, others: Sequence[Policy]) -> b
     """Return the policy file ``merged``, whose new profiles include the common parts in its folder.
 
     A profile is new if the file at ``path`` lacks it.  Without includes in ``others``, which were
-    merged into the file, ``merged`` is returned.  Rights never change, and neither does a profile
-    that states a protection, or of an enclave that denies a right of the parts.
+    merged into the file, ``merged`` is returned.  Rights never change.  A profile does not change
+    if it states a protection, or if its enclave denies a right in the parts.
     """
     if not any(
         group.source.file != merged_policy.file
@@ -1025,7 +1025,7 @@ def _with_common_parts(path: Path, merged: bytes, others: Sequence[Policy]) -> b
             if (enclave.path, ns, node) in known or any(g.protect for g in profile.groups):
                 continue
             own = _allowed_rights(profile_rights(enclave.path, profile))
-            # A merge leaves out what another profile of the enclave allows.
+            # A merge leaves out rights that another profile of the enclave allows.
             chosen, _ = common.choose(allowed, ns, node)
             includes = tuple(
                 part for part in chosen if common.included_rights((part,), ns, node) & own
@@ -1043,7 +1043,7 @@ def _allowed_rights(rights: Iterable[Right]) -> frozenset[NodeRight]:
 
 
 def _groups_not_given(given_rights: frozenset[NodeRight], profile: Profile) -> tuple[Group, ...]:
-    """Return the groups of a profile without names whose rights are all in ``given_rights``."""
+    """Return the groups of a profile, except names whose rights are all in ``given_rights``."""
     groups = []
     for group in profile.groups:
         names = tuple(

@@ -165,9 +165,9 @@ def _topics(node: ObservedNode, direction: str) -> list[str]:
 _NODE_NAME = "_sros_observer_" + secrets.token_hex(8)
 """Name of the observer's node; random, so that no other program knows it before the node starts."""
 
-_PREFIX_BYTES = 12  # of an endpoint's identifier: its participant (RTPS 2.3, 9.3.1)
+_PREFIX_BYTES = 12  # length of the participant's part of an endpoint's identifier (RTPS 2.3, 9.3.1)
 _DISCOVERY = "ros_discovery_info"
-# These keep their participants sorted by identifier, and list nodes in that order.
+# These RMWs keep their participants sorted by identifier, and list nodes in that order.
 _ORDERED = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp", "rmw_cyclonedds_cpp", "rmw_connextdds")
 _LOG_FLUSH_SECONDS = 0.3
 """Time to wait before exit, so that the logging thread of Fast DDS prints why the node failed."""
@@ -189,7 +189,7 @@ def main() -> int:
         context = rclpy.Context()
         rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
         stage = "node"
-        # With as few endpoints as rclpy allows, so that an observer needs few permissions.
+        # A node with as few endpoints as rclpy allows, so that an observer needs few permissions.
         node = rclpy.create_node(
             _NODE_NAME,
             context=context,
@@ -198,7 +198,7 @@ def main() -> int:
             start_parameter_services=False,
             parameter_overrides=[Parameter("start_type_description_service", value=False)],
         )
-    except Exception as error:  # whatever rclpy raises has to reach the parent as a reason
+    except Exception as error:  # the parent gets any error of rclpy as the reason
         time.sleep(_LOG_FLUSH_SECONDS)
         send(report, {"failed": stage, "reason": f"{type(error).__name__}: {error}"})
         return 1
@@ -224,7 +224,7 @@ class GraphObserver(Protocol):
 def report_graph(observer: GraphObserver, report: Any, period: float, *, ordered: bool) -> None:
     """Report the graph after each change until standard input is closed.
 
-    A graph that has changed is read again at once, before a node leaves that is not complete yet.
+    A changed graph is read again soon, because a node that is not complete yet may leave.
     ``ordered`` says that the nodes are listed by ascending participant.
     """
     before: object = None
@@ -275,7 +275,7 @@ class _Observer:
         """
         endpoints = set()
         for topic, _ in self._node.get_topic_names_and_types(no_demangle=True):
-            if topic == _DISCOVERY:  # every participant has it, and no policy mentions it
+            if topic == _DISCOVERY:  # every participant has this topic, and no policy mentions it
                 continue
             for direction, infos in (
                 (PUBLISH, self._node.get_publishers_info_by_topic(topic, no_mangle=True)),

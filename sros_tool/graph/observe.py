@@ -102,7 +102,7 @@ class RosGraph:
                 stderr=subprocess.STDOUT,
                 pass_fds=[write_end],
                 env=self._environment,
-                process_group=0,  # Ctrl-C reaches this process only, which then ends the observer
+                process_group=0,  # Ctrl-C then reaches only this process, which ends the observer
             )
         except BaseException:
             os.close(read_end)
@@ -263,8 +263,7 @@ class Snapshot:
 def settle(source: GraphSource, settling: Settling, clock: Clock) -> Snapshot:
     """Return the graph once it stops changing, at the latest after ``settling.most`` seconds.
 
-    It does not count as still before the observer has reported it for the first time: on a slow
-    machine, that takes long.
+    Time counts from the observer's first report, which takes long on a slow machine.
     """
     begin = clock()
     changed: float | None = None
@@ -305,8 +304,8 @@ def watch(
 
     ``report`` is called with the union after it has grown and then not changed for ``still``
     seconds, so that no node is reported before it is discovered completely; at the latest
-    ``patience`` seconds after the union has grown.  The watch ends as much later at most, while
-    a node that has just started is not announced yet.
+    ``patience`` seconds after the union has grown.  The watch ends at most ``patience`` later, if a
+    node that has just started is not announced yet.
     """
     begin = clock()
     seen = union = reported = Observation()
@@ -336,7 +335,7 @@ def watch(
 Listed = tuple[str, str, str]
 """An announced node: enclave, namespace, name."""
 _Name = tuple[str, str]
-# What rmw reports for an endpoint that no announced node claims (rmw_dds_common, graph_cache).
+# Node name of an endpoint that no announced node claims (rmw_dds_common, graph_cache).
 NOBODY = "_NODE_NAME_UNKNOWN_"
 
 
@@ -408,7 +407,8 @@ def _enclaves(
         ]
         if not news:
             return candidates
-        # A listed node of a decided process cannot belong to another: that may decide others.
+        # A listed node of a decided process cannot belong to another process, which may decide that
+        # one.
         for process in news:
             settled.add(process)
             (enclave,) = candidates[process]
@@ -444,7 +444,7 @@ def _with_enclaves_by_order(
         len(enclaves) > 1 or not enclaves <= candidates[owner]
         for owner, enclaves in by_owner.items()
     ):
-        return candidates  # the list is not in the documented order
+        return candidates  # the order of the list is not the documented one
     return {process: frozenset(by_owner.get(process, left)) for process, left in candidates.items()}
 
 

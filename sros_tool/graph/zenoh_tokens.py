@@ -4,8 +4,9 @@
 (`sros_tool.graph.observation`), with the DDS topics of the same ROS names.  It needs no RMW: it
 takes the configuration from the variables of rmw_zenoh, and announces nothing of itself.
 
-A token is ``@ros2_lv/DOMAIN/SESSION/NODE/ENTITY/KIND/ENCLAVE/NAMESPACE/NAME``, and for what a node
-has also ``/TOPIC/TYPE/HASH/QOS``; "/" in a name is "%" (ros2/rmw_zenoh, docs/design.md).
+A token is ``@ros2_lv/DOMAIN/SESSION/NODE/ENTITY/KIND/ENCLAVE/NAMESPACE/NAME``, with
+``/TOPIC/TYPE/HASH/QOS`` at its end for a publisher, subscription, service or client; "/" in a name
+is "%" (ros2/rmw_zenoh, docs/design.md).
 """
 
 from __future__ import annotations
@@ -60,7 +61,8 @@ class _TokenObserver:
 
     def __init__(self, session: zenoh.Session, domain: str) -> None:
         self._tokens: set[str] = set()
-        self._session, graph = session, session.liveliness()  # it closes if nobody keeps it
+        # Kept, because an unused session closes.
+        self._session, graph = session, session.liveliness()
         self._kept = graph.declare_subscriber(f"@ros2_lv/{domain}/**", self._change, history=True)
 
     def _change(self, sample: zenoh.Sample) -> None:
@@ -107,4 +109,4 @@ def main() -> int:
 if __name__ == "__main__":
     status = main()
     sys.stderr.flush()
-    os._exit(status)  # the threads of an open session would delay the end
+    os._exit(status)  # without waiting for the threads of the open session

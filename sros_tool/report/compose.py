@@ -1,9 +1,10 @@
 """Compose the picture of one source, or the overlay of two, from rights and governance.
 
 A wildcard is replaced by the known names that it matches, and denials override permissions.  Known
-names are the exact names in the rights of all sources.  A wildcard that would not be seen then is
-drawn as a name, such as one whose known names are all denied.  An action is shown as one name, also
-for a right to only some of its parts, such as the right of a recorder that subscribes to ``/*``.
+names are the exact names in the rights of all sources.  A wildcard that would be invisible then,
+such as one whose known names are all denied, is drawn as a name.  An action is shown as one name,
+also for a right to only some of its parts, such as the right of a recorder that subscribes to
+``/*``.
 """
 
 from __future__ import annotations
@@ -244,7 +245,7 @@ def _picture(
 
     def sides(kind: str, name: str) -> Sequence[bool]:
         known = known_names.matching_names(kind, name) if is_expression(name) else ()
-        # What is not drawn under its own name is a part of an action, which has both sides.
+        # A known name that is not drawn is a part of an action, which has both sides.
         of_known = [drawn.get((kind, known_name), (True, True)) for known_name in known]
         return [any(ends) for ends in zip(drawn[kind, name], *of_known, strict=True)]
 
@@ -284,7 +285,7 @@ def _senders_and_receivers(edges: Iterable[Edge]) -> Mapping[tuple[str, str], li
     allowed: dict[tuple[str, str], list[bool]] = defaultdict(lambda: [False, False])
     for edge in edges:
         if edge.qualifier is ALLOW:
-            # Who publishes feedback serves an action, who subscribes to it is a client of it.
+            # A publisher of feedback serves the action; a subscriber to feedback is a client.
             sends = edge.sends != (edge.kind == "actions" and edge.right in _ONE_WAY)
             allowed[edge.kind, edge.name][0 if sends else 1] = True
     return allowed
@@ -399,10 +400,10 @@ def _marked_rights(
 
 
 def _neutral_edge(edge: Edge, unseen: frozenset[str], observed: NamesOfRights) -> Edge:
-    """Return ``edge`` marked BOTH if nothing shows whether it was used.
+    """Return ``edge``, marked BOTH if nothing shows whether it was used.
 
-    That is so for a denial, for an enclave in ``unseen``, and for a wildcard drawn as a name that
-    matches a name in ``observed``.
+    This is the case for a denial, for an enclave in ``unseen``, and for a wildcard drawn as a name
+    that matches a name in ``observed``.
     """
     neutral = edge.qualifier is not ALLOW or edge.enclave in unseen
     neutral = neutral or (is_expression(edge.name) and observed.match(edge))
@@ -479,7 +480,7 @@ def _with_all_wildcards(
     """Return the names to draw and the edges to them, so that every wildcard is visible.
 
     Edges to known names do not show a wildcard if all names that it matches are denied, or if the
-    enclave also has rights to these names themselves.  Then it is drawn as a name.
+    enclave also has rights to these names themselves.  Such a wildcard is drawn as a name.
     """
     known = Known(rights)
     edges = edges_of(known)

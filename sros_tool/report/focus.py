@@ -67,7 +67,7 @@ _VERBS = {
 """Words by kind of name: verb of senders, noun for senders, verb of receivers."""
 _ONE_WAY = ("publish", "subscribe")
 _COMMANDS = ("send_goal", "cancel_goal")
-_NAMED = 3  # enclaves that a sentence names; of more it says the number
+_NAMED = 3  # maximum number of enclaves that a sentence names; more are counted
 
 
 def focused_picture(
@@ -161,7 +161,7 @@ class FocusFlow:
                 ):
                     hops_of[enclave] = min(hops, hops_of.get(enclave, hops))
         for edge in picture.edges:
-            # Those that are denied a name, or that use a part of an action, belong to it.
+            # Enclaves that are denied a target, or use a part of it, belong to the focus, too.
             if (edge.kind, edge.name) in targets:
                 (before if edge.sends else after).setdefault(edge.enclave, 1)
         flow = cls(focused, targets, before, after, {})
@@ -189,7 +189,7 @@ class FocusFlow:
         )
 
     def _stages(self, edge: Edge) -> tuple[set[int], set[int]]:
-        """Return the columns where the edge's enclave could write the name, and could read it."""
+        """Return the columns in which an edge's enclave may write its name, and may read it."""
         writes: set[int] = set()
         reads: set[int] = set()
         before, after = self.before.get(edge.enclave, 0), self.after.get(edge.enclave, 0)
@@ -444,8 +444,8 @@ def _enclaves_text(enclaves: Collection[str], *, partial: bool) -> str:
 
 HOPS = 2
 """Default number of hops to draw."""
-_MOST_ENCLAVES = 24  # with more in a column, groups are drawn; with as many groups, one card
-_MOST_BUNDLES = 40  # with more at one stage, names with the same senders are joined
+_MOST_ENCLAVES = 24  # if a column has more, groups are drawn; with more groups, one card
+_MOST_BUNDLES = 40  # if a stage has more, names with the same senders are joined
 _GUTTER, _LETTER, _SMALL_LETTER = 76, 7.4, 6.2
 _ROOM = {"names": 66, "enclave": 24, "group": 24}
 """Width on a card that its text does not use, in pixels."""
@@ -528,7 +528,7 @@ class _Draft:
             for side, fits in enumerate(self._flow.ends(edge, stage)):
                 if fits:
                     edges[side].append(edge)
-        # The mark of a side is in the name of the node, so that both fold together.
+        # The node's name begins with its side, so that one call of `fold` can handle both sides.
         sides = [
             [replace(e, enclave=f"{'lr'[n]}{self._node(n, stage, e.enclave)}") for e in drawn]
             for n, drawn in enumerate(edges)
@@ -597,7 +597,7 @@ class _Draft:
             if paths:
                 side = self._side(before)
                 notes = [f"over up to {max(side[path] for path in paths)} hops"]
-                column = 1 if before else self.columns - 2  # next to the last hop
+                column = 1 if before else self.columns - 2  # one column before the outermost one
                 card = "s:" if before else "l:"
                 yield side_card(card, column, f"{len(paths)} more", notes, paths)
 

@@ -61,7 +61,7 @@ _Part = tuple[int, tuple[int, ...]]
 
 
 class Folding(NamedTuple):
-    """A picture with equal units drawn as one, and the real names behind its labels."""
+    """A picture in which equal units are drawn as one, and the real names for its labels."""
 
     picture: Picture
     equal: tuple[EqualUnits, ...]
@@ -273,7 +273,7 @@ class _Draft:
             self._seen = tuple(self._sightings())
             classes = self._find_classes()
             if self._picture.focus:
-                # What goes from one robot to another one is at two stages of the flow.
+                # A name from one robot to another robot appears at two stages of the flow.
                 classes = {
                     n: units for n, units in classes.items() if self._is_kept_apart(units[0])
                 }
@@ -302,8 +302,8 @@ class _Draft:
     def _sightings(self) -> Iterator[tuple[int, tuple[int, ...], Edge | str]]:
         """Yield each enclave and drawn right whose texts have names of units.
 
-        Yields the number of a kind, the units, and the enclave or right; those of the same kind
-        differ only in their units.
+        Yields a number, the units, and the enclave or right; items with the same number differ only
+        in their units.
         """
         alarming = {
             finding.enclave for finding in self._picture.findings if finding.severity == "error"
@@ -649,7 +649,7 @@ class _Draft:
                 differing_parts.update(more)
                 only = dict.fromkeys(self._in_words(more, n))
                 missing = dict.fromkeys(self._in_words(fewer, n, near[n]))
-                # An enclave that both have differs by something else, such as a fault.
+                # An enclave that both units have differs in something else, such as a fault.
                 has = tuple(text for text in only if text not in missing)
                 lacks = tuple(text for text in missing if text not in only)
                 if has or lacks:

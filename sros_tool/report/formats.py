@@ -123,7 +123,7 @@ _LOCKS = {
 def render_svg(picture: Picture, scene: Scene) -> str:
     """Return the scene as an SVG document; the same scene gives the same bytes."""
     legend = list(_legend(picture, scene))
-    # Use without permission is drawn like a violation.
+    # A used right that is not allowed is drawn like a violation.
     use = picture.overlay is not None and picture.overlay.kind == "use"
     palette = {**_PALETTE, "second": _PALETTE["deny"]} if use else _PALETTE
     text_lines = [
@@ -459,7 +459,7 @@ def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
 
 
 def _who_for_single_names(picture: Picture, name: Name, *, sends: bool) -> str:
-    """Return a remark on a wildcard of which enclaves may use only known names on one side."""
+    """Return a remark on a wildcard of which, on one side, enclaves may use only known names."""
     single = (
         edge
         for edge in picture.edges

@@ -37,11 +37,11 @@ LINE, PAD, SMALL = 16, 7, 14
 """Height of a text line, padding of a card, and height of a note line, in pixels."""
 _GAP, _LEAD, _TOP, MARGIN = 9.0, 24.0, 34.0, 14
 _SIDE_LETTERS, _NAMES_LETTERS = 20, 35  # letters per line on a card
-_ONLOOKER_LINES, _ONLOOKER_SHARE = 8, 0.3  # onlookers have more bundles than both limits
-_MOST_ONLOOKERS = 26  # the number of letters
-_FEW_BUNDLES, _MOST_BUNDLES = 24, 80  # with more: private names are counted; bundles joined
-_MOST_ENCLAVES = 40  # with more, groups are drawn
-_MOST_NAMES, _SHOWN_NAMES = 8, 4  # a card has up to 8 names; of more, the first 4
+_ONLOOKER_LINES, _ONLOOKER_SHARE = 8, 0.3  # onlookers exceed both limits
+_MOST_ONLOOKERS = 26  # one for each letter
+_FEW_BUNDLES, _MOST_BUNDLES = 24, 80  # above: private names are only counted; bundles are joined
+_MOST_ENCLAVES = 40  # above this number, groups are drawn
+_MOST_NAMES, _SHOWN_NAMES = 8, 4  # a card lists up to 8 names; if there are more, the first 4
 _SWEEPS = 24
 
 KIND_NAMES = {"topics": "topic", "services": "service", "actions": "action", "dds": "DDS topic"}
@@ -545,7 +545,7 @@ LinkedTie = tuple[str, str, Tie]
 
 
 def links_of(cards: Mapping[str, Card], ties: Iterable[LinkedTie]) -> list[Link]:
-    """Return the links for some rights, without positions; one for those that are drawn alike."""
+    """Return links for rights, without positions; rights that are drawn alike share a link."""
     groups: dict[tuple[str, str, Qualifier, bool, OverlaySide, bool, bool], set[str]]
     groups = defaultdict(set)
     for source, target, tie in ties:

@@ -174,10 +174,10 @@ def _with_denial_flag(value: dict[str, Any]) -> dict[str, Any]:
 
 
 def _bundles_json(bundles: Iterable[Bundle], enclaves: Sequence[str]) -> dict[str, Any]:
-    """Return bundles as JSON, in which what bundles or ties have in common is there only once.
+    """Return bundles as JSON, in which common parts of bundles and of ties are listed once.
 
-    A bundle is its names, the number of its traits, and its ties: each list is the number of what
-    ties have in common, followed by the numbers of their enclaves.
+    A bundle is its names, the number of its traits, and its ties: each list is the number of a
+    common part of ties, followed by the numbers of their enclaves.
     """
     numbers = {path: number for number, path in enumerate(enclaves)}
     traits: dict[Bundle, int] = {}
@@ -347,7 +347,7 @@ def _demo_head(result: Json, made: str) -> str:
 
 
 def _demo_open(rows: Sequence[Json]) -> str:
-    """Return a list of what is open, why, and what to do, or ""."""
+    """Return a list of the rows that are open, with the reason and the remedy, or ""."""
     names: dict[tuple[bool, str, str, str], list[str]] = {}
     for row in rows:
         if row.get("open_because") and row["observed"] in (row["expected"], _SKIPPED):
@@ -409,7 +409,7 @@ def _untried_attempts(scenario: Json) -> Sequence[str]:
 
 
 def _demo_scenario(scenario: Json, *, is_only: bool) -> str:
-    """Return a section, folded if it is long or one of several and nothing needs a look."""
+    """Return a scenario's section, folded unless it is short and alone, or needs attention."""
     rows = scenario["rows"]
     good, not_tried = _number_as_expected(rows), _untried_attempts(scenario)
     opened = sum(bool(row.get("open_because")) for row in rows)
@@ -509,7 +509,7 @@ def render_fleet_page(
     Args:
         status: what ``sros fleet status --json`` prints.
         words: state → its words, where they differ from its name.
-        facts: what is to be said of the fleet as a whole.
+        facts: sentences about the fleet as a whole.
         rows: of robots with the same state: this state, their names, when they confirmed, their
             first expiry, what to do, and why.
         remedies: what to do → how it is done.
@@ -557,7 +557,7 @@ def render_fleet_page(
 
 
 def _dds_finding(finding: Json) -> str:
-    """Return a finding on the DDS of robots, of which the path and the numbers are folded."""
+    """Return a finding on the DDS of robots; its path and numbers are in a part that unfolds."""
     text, comma, rest = finding["text"].partition("; in '")
     folded = f"In '{rest}. {finding['remedy']}" if comma else ""
     return _fold(f"{finding['subject']}: {text}", folded)

@@ -379,8 +379,8 @@ class PicturedViolation(NamedTuple):
     """Uses of names that break the requirement."""
 
 
-_SAID = 5  # violations, and units that differ, that the headlines say; JSON has all
-_SHOWN = 2  # rights that they say of one unit
+_SAID = 5  # violations, and differing units, in the headlines; JSON has all
+_SHOWN = 2  # rights of one unit in the headlines
 
 
 class Requirements(NamedTuple):
@@ -521,7 +521,7 @@ class Picture:
 
     @property
     def answers(self) -> tuple[str, ...]:
-        """What the picture answers, and what it lacks, as sentences without a full stop."""
+        """The answers of the picture, and its omissions, as sentences without a full stop."""
         requirements = self.requirements.sentences() if self.requirements else ()
         return (*requirements, *self.other_answers)
 
@@ -534,7 +534,7 @@ class Picture:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the drawing shows as one, and what differs, as sentences without a full stop."""
+        """Sentences without a full stop: which units are drawn as one, and which differ."""
         equal = (f"{units.title} are drawn as one" for units in self.equal)
         more = len(self.different) - _SAID
         different = [unit.sentence() for unit in self.different[:_SAID]]

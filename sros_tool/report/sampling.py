@@ -1,9 +1,9 @@
 """Choose the enclaves of a large keystore that a picture reads in full.
 
 Reading an enclave as vendors do takes milliseconds, and equal units (robots, or namespaces and
-enclaves that look alike) are drawn as one anyway.  So of units whose signed permissions have the
-same text but for their names, only the first and the last are read; of the others, that text is
-compared, and nothing else of them is in the picture.
+enclaves that look alike) are drawn as one anyway.  So if the signed permissions of units have the
+same text except for the units' names, only the first and the last of these units are read in full.
+Of the others, only this text is compared, and nothing else is in the picture.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def sample_of(
         robots: the robots of its fleet, by enclave.
         wanted_names: names of units that are read in any case.
 
-    Units that use names of other units are all read.  So is everything where names of units cannot
-    be told apart, or where too much is not alike.
+    All units that use names of other units are read.  Everything is read if names of units cannot
+    be told apart, or if too few units are alike.
     """
     paths = keystore.names
     whole_keystore = SampledKeystore(keystore, paths)
@@ -78,7 +78,7 @@ def sample_of(
     for n in sorted(enclaves, key=lambda n: name_order(units[n].name)):
         digest = _digest_of(keystore, enclaves[n], units[n], names)
         equal_units[units[n].family, digest or n].append(n)
-    # Equal units name the same other ones, so it is enough to look at the first.
+    # Equal units name the same other units, so looking at the first one is enough.
     few = {
         n: number
         for number, (first, *further) in enumerate(equal_units.values())
@@ -110,7 +110,7 @@ def sample_of(
 
 
 def _is_ambiguous(word: str, words: Collection[str]) -> bool:
-    """Return whether a part of a unit's word is the word of another unit, as of r1_2 and r1."""
+    """Return whether a part of a unit's word is the word of another unit, such as r1 in r1_2."""
     pieces = word.split("_")
     return any(
         "_".join(pieces[begin:end]) in words

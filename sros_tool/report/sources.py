@@ -86,12 +86,13 @@ class Drawing:
 
     ``sources`` are paths of policies, permissions, enclaves, keystores or observations;
     ``observed`` are paths of observations to compare with a single source.  ``template`` is the
-    keystore template whose protection policies get; ``hosts`` are texts ``HOST=ENCLAVE``;
-    ``fleets`` has, for each source, the fleet whose robots fill in the placeholders; ``focus`` are
-    names or paths of enclaves.  With ``checked``, the picture has the findings of ``sros check``;
-    with a file of ``requirements``, also the rights that break a requirement.  Dates in permissions
-    are read in the time zone ``zone``.  With ``sampled``, of equal robots, namespaces or enclaves
-    in a large keystore only some are read in full, above all those named in ``robots``.
+    keystore template that decides the protection in a policy's picture; ``hosts`` are texts
+    ``HOST=ENCLAVE``; ``fleets`` has, for each source, the fleet whose robots fill in the
+    placeholders; ``focus`` are names or paths of enclaves.  With ``checked``, the picture has the
+    findings of ``sros check``; with a file of ``requirements``, also the rights that break a
+    requirement.  Dates in permissions are read in the time zone ``zone``.  With ``sampled``, of
+    equal robots, namespaces or enclaves in a large keystore only some are read in full, above all
+    those named in ``robots``.
     """
 
     sources: Sequence[Path]
@@ -206,7 +207,7 @@ def _compared_picture(
     if "zenoh" in kinds:
         first, second = sorted(sources_read, key=lambda source: source.origin.kind == "zenoh")
         return overlay(first, second, "worlds", hosts)
-    # Drift is shown from the side of the policy, whichever was named first.
+    # For drift, the policy is the first side, in whatever order the sources were named.
     first, second = sorted(sources_read, key=lambda source: source.origin.kind != "policy")
     return overlay(first, second, "drift", hosts)
 
@@ -582,7 +583,7 @@ def _with_keystore(source: PictureSource, sample: SampledKeystore, now: datetime
     problem = None
     try:
         governances.append(keystore.governance)
-    except SrosError as error:  # an export has it in the folders of its enclaves
+    except SrosError as error:  # an export has the governance in the folders of its enclaves
         problem = PicturedFinding("view.no-governance", "error", str(error))
     enclaves, validities = [], set()
     for name in sample.enclaves:

@@ -67,7 +67,7 @@ _BUILTIN_SUBSCRIPTIONS = 0x7FFF0000 + 4
 _KEEP_LAST, _BEST_EFFORT, _RELIABLE, _XCDR1, _XCDR2 = 0, 0, 1, 0, 2
 _STRING_OPS = (ctypes.c_uint32 * 3)(0x01 << 24 | 0x05 << 16, 0, 0)
 _OCTET_OPS = (ctypes.c_uint32 * 3)(0x01 << 24 | 0x01 << 16, 0, 0)
-"""One byte, with which every message begins: the rest of a message is not read."""
+"""Reads only the first byte of a message."""
 _NO_OPTIMIZE = 1
 
 _FILE_PROPERTIES = {
@@ -81,7 +81,7 @@ _FILE_PROPERTIES = {
 """The properties of a participant that name the files of its enclave."""
 ENCLAVE_FILES = tuple(_FILE_PROPERTIES.values())
 """The files that an enclave must have."""
-_PLUGINS = {  # by part of the property name: the library, and the name in its functions
+_PLUGINS = {  # part of the property name → library, and the name in its functions
     "auth": ("dds_security_auth", "authentication"),
     "access": ("dds_security_ac", "access_control"),
     "crypto": ("dds_security_crypto", "crypto"),
@@ -171,7 +171,7 @@ class Participant:
         return tuple(sorted(self._discovered(_BUILTIN_SUBSCRIPTIONS, _publication_of)))
 
     def process_ids(self) -> dict[str, int]:
-        """Map the discovered participants of this machine to the process ids that they state.
+        """Map discovered participants on this machine to the process ids that they state.
 
         A participant is the first 12 bytes of its identifier, in hexadecimal.
         """
@@ -194,7 +194,7 @@ class Participant:
         }
 
     def _discovered(self, topic: int, copy: Callable[[int], _Value]) -> list[_Value]:
-        """Return the samples of a topic on what was discovered."""
+        """Return the samples of a built-in topic that lists discovered objects."""
         reader = self._library.api.dds_create_reader(self.handle, topic, None, None)
         if reader < 0:
             raise self._dds_error(reader, "cannot read what was discovered")
@@ -240,7 +240,8 @@ class Participant:
             api.dds_qset_reliability(qos, _RELIABLE if reliable else _BEST_EFFORT, 100_000_000)
             api.dds_qset_history(qos, _KEEP_LAST, 10)
             api.dds_qset_data_representation(qos, len(forms), (ctypes.c_int16 * len(forms))(*forms))
-            # Without QoS: topics of one name and several types must not differ in it.
+            # Without QoS, because topics of one name must not differ in QoS, even if their types
+            # differ.
             made = api.dds_create_topic(
                 self.handle, ctypes.byref(descriptor), topic.encode(), None, None
             )

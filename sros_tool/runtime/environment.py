@@ -170,7 +170,7 @@ _UNREADABLE: dict[str, Callable[[str], bool]] = {
     "systemd": _is_not_printable,
     "docker": _is_interpreted,
 }
-"""For each format, whether it cannot express a value; sh and fish can express all values."""
+"""Format → function that tells if the format cannot express a value; sh and fish express all."""
 
 # ── the command line of a node ─────────────────────────────────────────────────────────────
 
@@ -246,7 +246,7 @@ def possible_nodes(command: Sequence[str]) -> dict[str, tuple[str, str]]:
     names, namespaces = _node_rules(command)
     nodes = {}
     for own, name in names.items():
-        # rcl looks for the rule of the namespace under the new name (rcl/src/rcl/node.c).
+        # rcl looks up the rule for the namespace by the node's new name (rcl/src/rcl/node.c).
         ns = next((ns for of, ns in namespaces.items() if of in ("", name)), "/")
         nodes[own] = (ns, name)
         if not own:
@@ -255,7 +255,7 @@ def possible_nodes(command: Sequence[str]) -> dict[str, tuple[str, str]]:
 
 
 def started_nodes(command: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Yield namespace and name that a command may give a node; "" for what it leaves out.
+    """Yield namespace and name that a command may give a node; "" if the command does not set one.
 
     The last pair is that of a node whose own name no rule names (``-r talker:__node:=NAME``).
     """
@@ -266,15 +266,16 @@ def started_nodes(command: Sequence[str]) -> Iterator[tuple[str, str]]:
 
 
 def nodes_with_rules(command: Sequence[str]) -> list[str]:
-    """Return the node names that remapping rules of a command are for (``-r talker:a:=b``)."""
+    """Return the nodes for which a command has remapping rules (``-r talker:a:=b``)."""
     return [node for node in dict.fromkeys(node for node, _, _ in _rules(command)) if node]
 
 
 def _node_rules(command: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the rules for names and for namespaces of nodes, by the node that they are for.
+    """Return the rules for node names and for node namespaces, each by the node that it applies to.
 
     "" stands for every node.  The rules are ``-r __node:=NAME`` and ``-r __ns:=NAMESPACE`` behind
-    ``--ros-args``.  They are in their order: rcl takes the first that matches a node (``remap.c``).
+    ``--ros-args``.  The order is that of the command: rcl takes the first rule that matches a node
+    (``remap.c``).
     """
     names: dict[str, str] = {}
     namespaces: dict[str, str] = {}
@@ -542,7 +543,7 @@ def _service(container: Container) -> dict[str, Any]:
         "source": folder,
         "target": folder,
         "read_only": True,
-        # Docker would make an empty folder of root, and say nothing.
+        # Otherwise Docker silently creates a missing folder, empty and owned by root.
         "bind": {"create_host_path": False},
     }
     service = {

@@ -144,7 +144,7 @@ LET_ENTER_ORIGINAL = (
     "enclave into a folder of the user of the node. If the folder was made after the node started, "
     "restart the node."
 )
-"""The same, in a keystore with its CA keys."""
+"""The same remedy, in a keystore with its CA keys."""
 _SET_DOMAIN = (
     "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env KEYSTORE ENCLAVE --domain ID` prints "
     "the variables."
@@ -677,7 +677,7 @@ _DENIED_TOPIC_TEXTS = (
         r"(?P<topic>\S+) (?P<rule>denied by default rule|found in deny_rule)",
         refuses=RefusedObject.TOPIC,
     ),
-    _log_text(  # rmw_cyclonedds, which names other reasons than a refusal
+    _log_text(  # rmw_cyclonedds, which also has reasons other than a refusal
         "topic-denied", _CYCLONE,
         r"failed to create topic \[(?P<topic>[^\]\s]+)\] for unknown reasons",
         refuses=RefusedObject.TOPIC,
@@ -743,9 +743,9 @@ UNKNOWN = LogText(
     _ROS,
     re.compile(
         r"\[\w{0,40}SECURITY\w{0,40} (?:Error|Warning)\]"
-        # Any line of the file of ROS_SECURITY_LOG_FILE: without trouble, it stays empty.
+        # Any line of the file of ROS_SECURITY_LOG_FILE, which stays empty without problems.
         r"|\[[A-Z]{4,13}\] [^\s|]+\|[^\s|]+ \d+ \w+::\w+ :"
-        # Cyclone DDS; what it traces of success is no trouble.
+        # Cyclone DDS, except its trace of success.
         r"|\A\d+\.\d+ \[\d*\]\s+\S+: (?! *(?:set|send|remember) \w+ tokens"
         r"| *(?:set|match)_remote_|.*(?:DDS Security plugins have been loaded|is already loaded"
         r"|using security settings from|allow non-secure remote|FSM: |handshake (?:delete|resend)"

@@ -85,7 +85,7 @@ def try_isolation() -> Isolation:
             enter_isolation()
         except OSError as error:
             reason = f"no separate network namespace: {error.strerror or error}"
-        except BaseException as error:  # a forked child must never return into its caller
+        except BaseException as error:  # a forked child must never return to its parent's code
             reason = f"no separate network namespace: {error}"
         finally:
             os.write(write_end, (reason or "yes").encode())

@@ -66,15 +66,15 @@ _ROUTERS = ("rmw_zenohd", _ZENOHD)
 _BRIDGES = ("zenoh-bridge-ros2dds", "zenoh-bridge-dds")
 _INTERPRETER = re.compile(r"(?:python[\d.]*|sh|bash|dash|perl|ruby|node)\Z")
 _FLAGS = re.compile(r"-[BEIOPbdiqsuvx]+\Z")
-"""Options of an interpreter that take no word: those of python (-u), of which shells have some."""
+"""Options without a value of Python (such as -u), some of which shells have, too."""
 _SCRIPTS_OF_SROS = ("sros", "sros_tool")
 
 _LOADING = timedelta(milliseconds=20)
 """Shortest time from a process's start (known in steps of 10 ms) to loading its enclave."""
 _CLOCK_TOLERANCE = timedelta(seconds=1)
-"""Longest time by which the clock of a process's folder can be behind without having been set."""
+"""Longest time by which a process's folder can look older than the process if no clock was set."""
 _FIRST_LOOK = timedelta(minutes=1)
-"""Longest time from a start to a first look, for the process that somebody looked at soonest."""
+"""Longest time from a start to a first look, for the process that was seen soonest."""
 _MOST_BYTES = 4 * 1024 * 1024
 _MOST_MAPS = 32 * 1024 * 1024
 _MOST_TRIES = 3
@@ -99,7 +99,7 @@ class MappedLibrary(NamedTuple):
 
     @property
     def packaged(self) -> bool:
-        """Whether it is from a Debian or Ubuntu package, which can have fixes of later releases."""
+        """Whether it is from a Debian or Ubuntu package, which can have later fixes."""
         return self.path.startswith(("/usr/lib/", "/lib/"))
 
 
@@ -180,7 +180,7 @@ class Process:
 
     @property
     def is_router(self) -> bool:
-        """Whether the process is a Zenoh router, by its program, or as it could be nothing else.
+        """Whether the process is a Zenoh router, by its program or by its environment.
 
         In the environment that ``sros run`` gives a router, no session of rmw_zenoh starts.
         """
@@ -376,7 +376,7 @@ class ProcessTable:
                     advanced = max(advanced, *self._clock_advances(now - uptime))
                     started -= advanced + _FIRST_LOOK
                 if before and before.process and before.stat.identity == stat.identity:
-                    # The same, whatever the clock is set to.
+                    # Kept from the last look, because the clock may have been set since.
                     started, advanced = before.process.started, before.process.clock_advanced
                 process = _examine(pid, folder, command, started)
                 process = process and replace(process, clock_advanced=advanced)
@@ -391,10 +391,10 @@ class ProcessTable:
         return _ProcessData(stat, None, UnseenProcess(pid, command, why, _may_speak(command)))
 
     def _clock_advances(self, begin: datetime) -> Iterator[timedelta]:
-        """Yield how far the clock was set forward, as each process that /proc shows tells it.
+        """Yield how far the clock was set forward since each process started, as /proc shows.
 
-        ``begin`` is when the machine started, by the present clock.  The later somebody looked at
-        a process, the less it tells.
+        ``begin`` is when the machine started, by the present clock.  The later somebody first
+        looked at a process, the smaller is the result.
         """
         yield timedelta()
         for pid in filter(str.isdigit, os.listdir(self._proc)):
@@ -419,8 +419,8 @@ class ProcessTable:
     def _waiting_processes(self, processes: list[Process]) -> set[int]:
         """Return the ids of processes that only wait for another, which uses ROS 2 or DDS.
 
-        An example is ``timeout 60 sros run KEYSTORE ENCLAVE -- talker --ros-args``: no library of
-        ROS 2 or DDS, and a process below it that has them.
+        An example is ``timeout 60 sros run KEYSTORE ENCLAVE -- talker --ros-args``: it has mapped
+        no library of ROS 2 or DDS, but its child process has.
         """
         parents = {pid: looked_at.stat.parent for pid, looked_at in self._looked.items()}
         above: set[int] = set()
@@ -450,7 +450,7 @@ def with_files(process: Process, root: ProcessRoot, folder: str) -> Process:
 
 
 def dds_of(pid: int) -> tuple[MappedLibrary, ...]:
-    """Return the DDS libraries that a process has mapped; empty if that cannot be seen."""
+    """Return the DDS libraries that a process has mapped; empty if they cannot be seen."""
     try:
         folder = os.open(f"/proc/{pid}", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
@@ -476,7 +476,7 @@ def _with_versions(
 
 
 def _with_version(library: MappedLibrary, root: ProcessRoot) -> MappedLibrary:
-    """Return a library with the version in the name of its only copy, as wheels have no links."""
+    """Return a library with the version in the name of its only copy: wheels have no links."""
     versions = {_version(name) for name in root.copies(library.path)} - {""}
     return library._replace(version=versions.pop()) if len(versions) == 1 else library
 
@@ -495,7 +495,7 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
     for word in _words(folder, "environ"):
         name, mark, value = word.partition("=")
         if mark:
-            environment.setdefault(name, value)  # getenv(3) takes the first one
+            environment.setdefault(name, value)  # getenv(3) takes the first value
     maps = _read(folder, "maps", _MOST_MAPS)
     libraries = frozenset(library.decode() for library in _LIBRARIES.findall(maps))
     if not libraries and not _may_speak(command):
@@ -587,7 +587,7 @@ _LIBRARY_FILE = re.compile(rf"lib({'|'.join(map(re.escape, map(bytes.decode, _PR
 
 
 class ProcessOrigin(NamedTuple):
-    """How a process was started: each part is empty if the process lacks or hides it, or ended.
+    """How a process was started; a part is empty if it does not exist or cannot be seen.
 
     ``unit`` is its systemd system service, ``folder`` its working directory, ``launch`` the
     command of the ``ros2 launch`` that started it (its own, for a launch), and ``container`` the
@@ -635,7 +635,8 @@ _SERVICE = re.compile(
 )
 """A line of /proc/PID/cgroup, of version 2 or 1 (cgroups(7)); not for users' own services."""
 _CONTAINER = re.compile(r"/(?:docker|libpod)[-/]([0-9a-f]{64})(?:\.scope)?(?:/|$)", re.M | re.A)
-"""The same for a container, as the two cgroup drivers of Docker and of Podman name it."""
+"""A line of /proc/PID/cgroup for a container, as both cgroup drivers of Docker and Podman write it.
+"""
 
 
 def _version(name: str) -> str:
@@ -649,12 +650,12 @@ _FIRST_PID_NAMESPACE = "pid:[4026531836]"
 
 
 def _programs_in(command: tuple[str, ...]) -> set[str]:
-    """Return the names that may be the program's, or that of a script which is interpreted."""
+    """Return the names that may be those of the program, or of the script that it interprets."""
     return {Path(word).name for word in command[:3]}
 
 
 def _may_speak(command: tuple[str, ...]) -> bool:
-    """Return whether the command of a process shows that it uses ROS 2 or Zenoh."""
+    """Return whether a command shows that its process uses ROS 2 or Zenoh."""
     is_of_zenoh = not _programs_in(command).isdisjoint((*_ROUTERS, *_BRIDGES))
     is_daemon = any(mark in word for word in command[:3] for mark in _DAEMON)
     return ROS_ARGS in command or is_of_zenoh or is_daemon
@@ -682,7 +683,7 @@ def _configuration_of(process: Process) -> LoadedFile | None:
     if not is_certain and {session, router}.isdisjoint({"", NO_CONFIGURATION}):
         return LoadedFile("", problem=f"its program chooses {SESSION_URI} or {ROUTER_URI}")
     path = router if process.is_router else session
-    if path == NO_CONFIGURATION:  # nothing of rmw_zenoh would run
+    if path == NO_CONFIGURATION:  # with this path, no process of rmw_zenoh runs
         return LoadedFile("", problem="its program or its arguments choose it")
     return LoadedFile(path) if path else None
 
@@ -707,7 +708,8 @@ def _stat(folder: int) -> _Stat:
 _USERS = re.compile(rb"^Uid:\s+(\d+)\s+(\d+)\s+(\d+)\s+(\d+)", re.MULTILINE)
 """The real, effective, saved and file system user id in /proc/PID/status."""
 SEVERAL_USERS = 0xFFFFFFFF
-"""In place of a user id that no process has (setresuid(2)): several users may have a say in it."""
+"""Stands for several users who may have a say in a process; no process has this id (setresuid(2)).
+"""
 _OWN_PID = re.compile(rb"^NSpid:(?:\s+\d+)*\s+(\d+)$", re.MULTILINE)
 """The process id in the innermost PID namespace, in /proc/PID/status."""
 
@@ -741,7 +743,7 @@ def _user(folder: int, status: bytes) -> int:
     auxiliary = _read(folder, "auxv", _MOST_BYTES)
     length = len(auxiliary) - len(auxiliary) % 16
     values = dict(struct.iter_unpack("QQ", auxiliary[:length]))
-    if any(name > 0xFFFFFFFF for name in values):  # the words of a process of 32 bits
+    if any(name > 0xFFFFFFFF for name in values):  # a 32-bit process has words of half the size
         values = dict(struct.iter_unpack("II", auxiliary[:length]))
     match = _USERS.search(status)
     users = set(map(int, match.groups())) if match else {SEVERAL_USERS}
@@ -792,7 +794,7 @@ def _namespace(path: Path) -> str:
 _CRL = "crl.pem"
 _KEY, _KEY_ON_TOKEN = "key.pem", "key.p11"
 _UNREAD = (_KEY, _KEY_ON_TOKEN, "governance.p7s")
-"""Files whose content says nothing about a process; private keys are never read."""
+"""Files that are not read: private keys, and files whose content says nothing about a process."""
 _MOST_FILE_BYTES = 16 * 1024 * 1024
 _MOST_BYTES_OF_FILES = 64 * 1024 * 1024
 _LAST_SECOND = 253402300799
@@ -822,10 +824,10 @@ class ProcessEnclave:
 
     ``keystore`` is the path that the process names.  ``moved`` maps folders of the keystore whose
     last change added or removed no file (they were moved, or got another mode) to the time of that
-    change.  ``writable`` names a folder that others than the owner of the keystore can change.
-    ``here`` is the path of the keystore for this process; None if that path is another folder here.
-    ``folders`` are the device and inode of the keystore and of the enclave, as far as they are
-    there.  ``problem`` is a clause on why the enclave could not be examined.
+    change.  ``writable`` is a clause on a folder that users other than the keystore's owner can
+    change. ``here`` is the path of the keystore for this process; None if that path is another
+    folder here. ``folders`` are the device and inode of the keystore and of the enclave, as far as
+    they are there.  ``problem`` is a clause on why the enclave could not be examined.
     """
 
     keystore: str
@@ -843,7 +845,7 @@ class ProcessEnclave:
         return next((file for file in self.files if file.name == name), LoadedFile(name))
 
     def is_of(self, keystore: Path) -> bool:
-        """Return whether this is an enclave of a keystore of this machine, by whatever path.
+        """Return whether this is an enclave of a keystore on this machine, whatever path names it.
 
         The folder of the enclave decides, or the folder of the keystore: links, ``..`` and the
         mounts of a container give a folder other paths.  For a folder that does not exist, the path
@@ -889,7 +891,7 @@ class FileReader:
                 raise OSError(errno.EINVAL, "it is not a regular file")
             if state.st_size > min(_MOST_FILE_BYTES, self._left):
                 raise OSError(errno.EFBIG, "it is larger than sros reads")
-            # By the link of the handle, so that it is still the same file.
+            # Opened by the link of the handle, so that it is certainly the same file.
             opened = os.open(f"/proc/self/fd/{handle}", os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
             with open(opened, "rb") as file:
                 self._read[key] = file.read(state.st_size)
@@ -1080,7 +1082,7 @@ def _reason(error: OSError) -> str:
 
 
 def _writable_folder_clause(folders: list[tuple[str, os.stat_result]], user: int) -> str:
-    """Return a clause on a folder that other users can change than root, ``user`` and the owner."""
+    """Return a clause on a folder that users other than root, ``user`` and its owner can change."""
     trusted = frozenset({0, user, folders[0][1].st_uid})
     for path, state in folders:
         if why := other_writers(state, trusted):
@@ -1103,5 +1105,5 @@ def _same_here(path: str, folders: Sequence[tuple[str, os.stat_result]]) -> Path
 
 
 def _moment(nanoseconds: int) -> datetime:
-    # A file system can state any moment; later ones than a datetime can be are as good.
+    # A file system can state any moment; moments after the last datetime count as the last one.
     return datetime.fromtimestamp(min(max(nanoseconds / 1e9, 0), _LAST_SECOND), UTC)

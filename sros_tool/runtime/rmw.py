@@ -178,7 +178,7 @@ def vendor_here(
     rmw, why = "", ""
     if vendor_of(named):
         rmw, why = named, f"{RMW} is {named}"
-    elif distribution is None:  # the RMWs that are installed are those of this machine
+    elif distribution is None:  # installed RMWs say nothing about another distribution
         rmw = next(filter(vendor_of, rmw_implementations(environment)), "")
         why = f"{rmw} is installed here" if rmw else ""
     why += _lacks_security(rmw, environment) if distribution is None else ""

@@ -486,7 +486,7 @@ def _report_failure(
     refused = isinstance(error, SecurityRefusedError)
     reason = f"{type(error).__name__}: {error}"
     if isinstance(error, SrosError):
-        # Without the remedy, which depends on the results of all stacks.
+        # The remedy is left out: it depends on the results of all stacks.
         reason = str(SrosError(error.what, error.why)).rstrip(".")
     if stage is not ProcessStage.ENDPOINT:
         time.sleep(_LOG_FLUSH_SECONDS)

@@ -114,7 +114,7 @@ def unit_instance(enclave: str) -> str:
 def _check_path(path: str, kind: str, option: str = "") -> str:
     """Return ``path`` if all directives of a unit read it in the same way.
 
-    ``option`` is the option that names another path.
+    ``option`` is the command-line option with which the user can name another path.
 
     Raises:
         UsageError: the path is not absolute, or has characters with a meaning in some directives.
@@ -355,7 +355,7 @@ def _guard(keystore: str, sros: str, domain: int) -> str:
     """Return the service that watches the processes of a machine as long as it runs."""
     root = _check_path(keystore, "the keystore")
     variables = {KEYSTORE: root, ENABLE: "true", STRATEGY: "Enforce", DOMAIN: str(domain)}
-    # Without rights of root that it does not need; only these let it look at all processes.
+    # Only the two capabilities of root that are needed to look at all processes.
     rights = "CapabilityBoundingSet=CAP_SYS_PTRACE CAP_DAC_READ_SEARCH"
     return f"""\
 {_MADE}
@@ -387,7 +387,7 @@ def _agent(folder: str, *, user: str, sros: str, writable: Sequence[str] = ()) -
     )
     places = " ".join((root, *(f"-{_check_path(place, 'the inbox')}" for place in writable)))
     description = f"Keep the enclaves in {root} up to date"
-    # It asks the kernel whether the clock is set; without capabilities it cannot set it anyway.
+    # The agent asks the kernel whether the clock is set, which ProtectClock would forbid.
     closed = _CLOSED.replace("ProtectClock=yes\n", "")
     service = f"""\
 {_MADE}

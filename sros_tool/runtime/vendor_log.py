@@ -30,7 +30,7 @@ _LINE_FORMATS = (
 def vendor_of_line(line: str) -> Vendor | None:
     """Return the vendor whose log has lines of this form, or None.
 
-    ``line`` has no label of its process any more.
+    The label of the process has to be removed from ``line`` before.
     """
     return next((vendor for vendor, form in _LINE_FORMATS if form.search(line)), None)
 
@@ -51,7 +51,7 @@ LINE_DOMAIN = re.compile(r"\] \S+\|\S+ (\d{1,9}) \w+::\w+ :")
 """The domain in a line of ROS_SECURITY_LOG_FILE, after the participant's identifier."""
 
 CONTINUATION = re.compile(r"^(?:[0-9A-F]{8,}:error:|\(code: )")
-"""The start of a line that continues the line before it: OpenSSL's error stack."""
+"""The start of a line that belongs to the line before it: OpenSSL's error stack."""
 
 REMOTE_ENDPOINT = re.compile(r"check_remote_data|remote (?:writer|reader)")
 """The words that show that the permissions of a remote participant deny a topic."""
@@ -117,7 +117,7 @@ def _first_refusal(refused: RefusedObject, text: str) -> str:
 def denied_topic(line: str) -> tuple[Vendor, re.Match[str]] | None:
     """Return the vendor that denies a topic, and the match with group ``topic``.
 
-    Group ``rule`` says which rule denies it, if the line does.
+    Group ``rule`` is the rule that denies the topic, if the line names the rule.
     """
     for vendor, pattern in _TOPIC_DENIED:
         if match := pattern.search(line):
