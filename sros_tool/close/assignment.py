@@ -24,13 +24,11 @@ from sros_tool.close.processes import (
     process_text,
 )
 from sros_tool.errors import UsageError
-from sros_tool.graph.observation import ObservedNode
+from sros_tool.graph.observation import FAST_DDS, ObservedNode
 from sros_tool.runtime.environment import node_argument
 from sros_tool.runtime.processes import Process, ProcessOrigin, process_origin, program_of
 from sros_tool.runtime.units import unit_words
 
-_FAST_DDS = "010f"
-"""The first two bytes of a participant of Fast DDS: its vendor id (RTPS 2.3, 9.4.5.1)."""
 _CYCLONE_SECONDS = 30.0
 
 
@@ -78,7 +76,7 @@ def assign(
         elsewhere=sorted(
             enclave
             for enclave, observed_nodes in by_enclave.items()
-            if len({_process_prefix(node) for node in observed_nodes}) > counts[enclave]
+            if len({node.process for node in observed_nodes}) > counts[enclave]
         ),
     )
 
@@ -121,19 +119,10 @@ def _claims(
     return claims
 
 
-def _process_prefix(node: ObservedNode) -> str:
-    """Return the prefix of a GUID that is the same for all participants of a process.
-
-    With Fast DDS it states the host and the process id.
-    """
-    is_fast = node.participant.startswith(_FAST_DDS)
-    return node.participant[:12] if is_fast else node.participant
-
-
 def _shows_its_id(process: Process, node: ObservedNode, process_ids: Mapping[str, int]) -> bool:
     """Return whether a node's participant has or states the process id."""
     pid = process.own_pid or process.pid
-    if not node.participant.startswith(_FAST_DDS):
+    if not node.participant.startswith(FAST_DDS):
         return process_ids.get(node.participant) == pid
     low, high = pid & 0xFF, pid >> 8 & 0xFF
     is_fast = bool(process.libraries & {"libfastrtps", "libfastdds"})

@@ -621,11 +621,11 @@ def enclave_per_node(observation: Observation) -> NamedEnclaves:
     processes: dict[str, list[ObservedNode]] = {}
     for node in observation.nodes:
         if node.enclaves == UNSHOWN and not is_tool(node):
-            processes.setdefault(node.participant, []).append(node)
-    names = {participant: _enclave_name(nodes) for participant, nodes in processes.items()}
+            processes.setdefault(node.process, []).append(node)
+    names = {process: _enclave_name(nodes) for process, nodes in processes.items()}
     nodes = [
-        replace(node, enclaves=(names[node.participant],))
-        if node in processes.get(node.participant, ())
+        replace(node, enclaves=(names[node.process],))
+        if node in processes.get(node.process, ())
         else node
         for node in observation.nodes
     ]
@@ -655,8 +655,8 @@ def _notes(
     nodes: Sequence[ObservedNode],
 ) -> Iterator[Note]:
     several = [
-        f"{names[participant]} has {', '.join(sorted(node.fqn for node in nodes))}"
-        for participant, nodes in processes.items()
+        f"{names[process]} has {', '.join(sorted(node.fqn for node in nodes))}"
+        for process, nodes in processes.items()
         if len(nodes) > 1
     ]
     if several:
@@ -668,7 +668,7 @@ def _notes(
     users: dict[str, set[str]] = {}
     for node in nodes:
         for enclave in node.enclaves:
-            users.setdefault(enclave, set()).add(node.participant)
+            users.setdefault(enclave, set()).add(node.process)
     shared = [
         f"{name} ({len(users[name])} processes)"
         for name in sorted(set(names.values()))

@@ -37,6 +37,10 @@ class Endpoint(NamedTuple):
     """Whether the endpoint writes or reads the topic."""
 
 
+FAST_DDS = "010f"
+"""The first two bytes of a participant of Fast DDS: its vendor id (RTPS 2.3, 9.4.5.1)."""
+
+
 @shows("enclaves", "namespace", "name", "participant", "publish", "subscribe")
 @dataclass(frozen=True, slots=True, order=True)
 class ObservedNode:
@@ -72,6 +76,16 @@ class ObservedNode:
     def subscribe(self) -> list[str]:
         """DDS topics that the node reads."""
         return _topics(self, SUBSCRIBE)
+
+    @property
+    def process(self) -> str:
+        """The part of ``participant`` that all participants of the node's process share.
+
+        A process has a participant for each context of rclpy or rclcpp.  Fast DDS (2.6 to 3.6,
+        ``GuidUtils.hpp``) gives them a host, process id and random number in common; the
+        participants of other middleware show nothing in common.
+        """
+        return self.participant[:16] if self.participant.startswith(FAST_DDS) else self.participant
 
     @property
     def fqn(self) -> str:

@@ -79,7 +79,7 @@ def test_a_process_of_cyclone_dds_is_known_by_what_it_says() -> None:
 
 
 def test_nodes_of_the_same_name_elsewhere_are_reported() -> None:
-    own, same = node("a", "010f7f01a53001"), node("a", "010f7f01a53002")
+    own, same = node("a", "010f7f01a53057bc00"), node("a", "010f7f01a53057bc01")
     talker = process(0x30A5, "/opt/a")
     assert assign([own, same], [talker], 0).elsewhere == []
     for other in (node("a", "010f7f02a530"), node("a", "010f7f01ffff"), node("a", "0110aa")):

@@ -8,6 +8,10 @@ from sros_tool.graph.learn import enclave_per_node, learn
 from sros_tool.graph.observation import ObservedNode
 from tests.graph.graphs import graph, node
 
+FIRST, SECOND, OTHER = (
+    f"010f7f013101{process}{participant}000000"
+    for process, participant in (("57bc", "00"), ("57bc", "01"), ("e2a1", "00"))
+)
 LOADS = "reply ~/_container/load_node"
 
 
@@ -23,6 +27,12 @@ def unshown(fqn: str, *rights: str, participant: str = "p1", enclave: str = "/")
         ([unshown("/a"), unshown("/b", participant="p2")], {"/a", "/b"}),
         # One process has one enclave.
         ([unshown("/long_name"), unshown("/short")], {"/short"}),
+        # With Fast DDS, its participants show that they are of one process.
+        (
+            [unshown("/aa", participant=FIRST), unshown("/b", participant=SECOND)],
+            {"/b"},
+        ),
+        ([unshown("/aa", participant=FIRST), unshown("/b", participant=OTHER)], {"/aa", "/b"}),
         ([unshown("/x"), unshown("/the_container", LOADS)], {"/the_container"}),
         ([unshown("/a"), unshown("/a/transform_listener_impl_55aa")], {"/a"}),
         ([unshown("/bt_navigator"), unshown("/transform_listener_impl_55aa")], {"/bt_navigator"}),
