@@ -30,8 +30,12 @@ DRAWN = 20_000 if LONG else 100
 SEED = int(os.environ.get("SROS_DIFFERENTIAL_SEED", "5"))
 UNREADABLE = "it cannot be read"
 DAMAGED_FIRST = "a damaged certificate of the issuer's name stands before the right one"
-STRICTER = {UNREADABLE, DAMAGED_FIRST}
-"""Why sros refuses, on purpose, what OpenSSL accepts; and whatever sros says not to know."""
+EMPTY_NAME = "a certificate has an empty subject or issuer"
+STRICTER = {UNREADABLE, DAMAGED_FIRST, EMPTY_NAME}
+"""Why sros refuses, on purpose, what OpenSSL accepts; and whatever sros says not to know.
+
+OpenSSL accepts an empty subject next to critical alternative names, in a certificate of no CA.
+"""
 NOW = datetime.now(UTC).replace(microsecond=0)
 DAY = timedelta(days=1)
 KEYS = [ec.generate_private_key(ec.SECP256R1()) for _ in range(4)]
