@@ -48,7 +48,8 @@ def _checked(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
     """Decorate a public function so that it refuses arguments of other types than annotated."""
     code, annotations = function.__code__, function.__annotations__
     positional = code.co_varnames[: code.co_argcount]
-    others = code.co_varnames[code.co_argcount + code.co_kwonlyargcount :]  # "*paths" is the first
+    # The first is an argument such as "*paths".
+    others = code.co_varnames[code.co_argcount + code.co_kwonlyargcount :]
 
     @wraps(function)
     def call(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:
@@ -98,7 +99,7 @@ def _argument(name: str, annotation: str, argument: Any) -> Any:
             return argument
         else:
             texts.append(_TYPE_TEXTS.get(kind, f"a {kind}"))
-    if not annotation:  # Python itself refuses it
+    if not annotation:  # an unknown argument, which Python itself refuses
         return argument
     wanted, is_one = " or ".join(texts), isinstance(argument, str) and "a list" in texts
     raise UsageError(

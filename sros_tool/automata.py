@@ -219,7 +219,7 @@ class Automaton:
     def levels(self) -> tuple[tuple[int, int], ...]:
         """Pairs of a number of letters and positions (as bits), sorted by the number.
 
-        From these positions, at least so many letters lead to an accepting position.
+        From these positions, at least that number of letters leads to an accepting position.
         """
         before: dict[int, list[int]] = {}
         for at, letters, to in self.edges:
@@ -505,7 +505,7 @@ class NameSet:
             for kept, group in groupby(rules, key=lambda pair: pair[1])
         ]
         if not otherwise and joined and not joined[-1][1]:
-            joined.pop()  # it takes away what nothing accepts
+            joined.pop()  # removes names that no other rule accepts
         if not otherwise and len(joined) == 1:
             return cls._of(joined[0][0])
         return cls._of(_First(tuple(joined), otherwise))

@@ -1,4 +1,4 @@
-"""The ROS 2 distributions: the DDS and Zenoh that they ship, and by whose rules sros decides.
+"""The ROS 2 distributions: the DDS and Zenoh that they ship, and the vendors whose rules decide.
 
 Source: ``ros2.repos`` of the branches of ros2/ros2 and their release tags, November 2026; REP-2000.
 """
@@ -101,7 +101,7 @@ class Distribution(NamedTuple):
         return f"ROS 2 {self.title} {why}: assumed to decide as {self.name.capitalize()}."
 
     def reason_for(self, vendor: Vendor) -> str:
-        """Return why a vendor decides: ``as in ROS 2 Jazzy``, with what is assumed."""
+        """Return why a vendor decides, such as ``as in ROS 2 Jazzy``, with the assumptions."""
         parts = [f"as in ROS 2 {self.title}"]
         if self.stands_for:
             parts.append(f"which is assumed to be like {self.name.capitalize()}")
@@ -120,7 +120,8 @@ class Distribution(NamedTuple):
         """Return the release that it ships of a vendor's product, such as of ``cyclonedds``.
 
         Raises:
-            UsageError: it ships another release than the vendor names, or sros knows no release.
+            UsageError: the distribution ships another release than ``vendor`` names, or none that
+                sros knows.
         """
         shipped = self.shipped_product(vendor.traits.product)
         if shipped and (shipped.vendor is vendor or "-" not in vendor.value):

@@ -170,7 +170,8 @@ def loadable_environment(
             replace(enclave_environment, notes=()) if target else enclave_environment
         )  # they are about this process
     if (target and not rmw) or RMW_ZENOH in rmw_implementations(environment):
-        variables |= REFUSING_ZENOH  # what chooses it later, such as a launch file, starts no node
+        # If Zenoh is chosen later, such as in a launch file, no node starts.
+        variables |= REFUSING_ZENOH
     if rmw:
         variables[RMW] = rmw
     notes = () if target else tuple(unknown_distribution(environment))
@@ -188,7 +189,8 @@ def loadable_environment(
         notes += (Note("env.several-domains", text),)
     if not state.token:
         return EnclaveEnvironment(variables, notes)
-    # The module is only the one that the user names for this process: loading it runs its code.
+    # Only the module that the user names for this process is passed on, because loading it runs its
+    # code.
     module = environment.get(MODULE_VARIABLE)
     if module and not target:
         variables[MODULE_VARIABLE] = module
@@ -413,7 +415,7 @@ def _refuse_outdated(keystore: OpenedKeystore, name: str, now: datetime) -> None
         drift = zenoh_drift(keystore, network, keystore.domains, authority, moment)
         return any(file.enclave == name for file in drift.files)
 
-    # The router starts although the permissions of another enclave have expired since.
+    # Differences that only come from expired permissions of other enclaves do not count.
     if has_drifted(now) and has_drifted(None):
         where = quote(str(keystore.root))
         raise KeystoreError(
@@ -557,7 +559,7 @@ def _listens_here(port: int) -> bool:
         try:
             with open(table, encoding="ascii") as lines:
                 sockets = [line.split() for line in lines][1:]
-        except FileNotFoundError:  # such as without IPv6
+        except FileNotFoundError:  # for example, without IPv6
             continue
         except (OSError, ValueError):
             return True
@@ -814,10 +816,11 @@ def other_node_notes(
 ) -> tuple[Note, ...]:
     """Return a note if a command gives its nodes a name that the enclave's permissions lack.
 
-    A command that names no namespace counts as one for "/", if it certainly starts nodes.  Where
-    its rules depend on the node's own name, the note is for a command that gives only such names.
-    If the ledger lacks the permissions, sros knows only nodes that offer their standard services:
-    then it returns a note only if the permissions have the name in another namespace.
+    A command without a namespace counts as one for "/", if it certainly starts nodes.  If its rules
+    depend on the node's own name, a note is returned only if none of the possible names is in the
+    permissions. If the ledger lacks the permissions, sros knows only nodes that offer their
+    standard services: then it returns a note only if the permissions have the name in another
+    namespace.
     """
     from sros_tool.keystore.rights import RecordedRights
     from sros_tool.policy.rights import nodes_from_text, nodes_of_rights

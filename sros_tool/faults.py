@@ -42,7 +42,7 @@ ORIGINAL_KEYSTORE = "keystore that has the CA keys"
 REFUSE_STRANGERS = (
     "`sros update_keystore KEYSTORE --set protection.allow_unauthenticated_participants=false`"
 )
-"""The command with which a keystore admits no process without an identity any more."""
+"""The command after which a keystore admits no process without an identity."""
 
 _IN_EXPORT = {
     _CLOCK: "Set the clock of this host; if the clock is right, sign again in the keystore that "
@@ -466,7 +466,8 @@ class Fault(Enum):
 def remedy_in_original_keystore(remedy: str) -> str:
     """Return the remedy for an export: to do ``remedy`` in the keystore with the CA keys.
 
-    A remedy that goes on after the export is not done in the keystore alone.
+    A remedy with more steps after the export is returned whole, with a sentence that names the
+    keystore.
     """
     if "export the enclave again" in remedy.lower().removesuffix("export the enclave again."):
         return f"{remedy} KEYSTORE is the {ORIGINAL_KEYSTORE}."
@@ -482,7 +483,7 @@ NEEDS_CA_KEYS = re.compile(
 
 
 NOT_IN_THE_FILE = (Fault.CA_NOT_YET_VALID, Fault.FILE_UNREADABLE, Fault.FILE_NO_FILE)
-"""Faults of a file that stay if a link to the keystore's file replaces the file."""
+"""Faults that remain if a link to the keystore's file replaces the faulty file."""
 FAULTS = {fault.id: fault for fault in Fault}
 """All faults, by id."""
 

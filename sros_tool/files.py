@@ -69,7 +69,7 @@ def _locked_file(folder: Folder, prefix: str, mode: int) -> tuple[str, int]:
         fcntl.flock(handle, fcntl.LOCK_EX)
         if folder.state(name):
             return name, handle
-        os.close(handle)  # another process took it for a stale one before it was locked
+        os.close(handle)  # another process removed it as stale before it was locked
 
 
 def _remove_stale(folder: Folder, prefix: str) -> None:
@@ -281,7 +281,7 @@ def parse_toml(text: str, longest: int = _LONGEST_DOCUMENT) -> dict[str, Any]:
         raise
     except RecursionError as error:
         raise tomllib.TOMLDecodeError("it is nested too deeply") from error
-    except ValueError as error:  # a number of thousands of digits, or a date that does not exist
+    except ValueError as error:  # such as a number with thousands of digits, or an impossible date
         raise tomllib.TOMLDecodeError(str(error)) from error
 
 

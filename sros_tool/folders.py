@@ -144,7 +144,7 @@ class Folder:
         Raises:
             KeystoreError: a link leads out of the folder.
         """
-        try:  # faster, for a file or a simple link to one: `read` follows no link
+        try:  # a faster way for a file, or for a simple link to a file
             target = self.link_target(path)
             if target is None:
                 return self.read(path)
@@ -211,7 +211,7 @@ class Folder:
         with self._adding_path_to_errors(path):
             os.symlink(target, name, dir_fd=parent)
             if self._hand_over:
-                # By a handle: meanwhile, the owner of the folder could put another file there.
+                # By a handle, because the owner of the folder could replace the link meanwhile.
                 handle = os.open(name, os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=parent)
                 try:
                     if stat.S_ISLNK(os.fstat(handle).st_mode):
@@ -445,7 +445,7 @@ def flush_file_system(handle: int) -> None:
 
 @lru_cache(maxsize=1)
 def _c_library() -> ctypes.CDLL:
-    import ctypes  # what only reads needs none
+    import ctypes  # not needed by programs that only read
 
     return ctypes.CDLL(None, use_errno=True)
 

@@ -51,8 +51,8 @@ class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where i
     """Launch action that starts every later process with ``sros run --policy``, in its enclave.
 
     It sets the prefix of commands, in front of an existing prefix such as a debugger's.  Processes
-    with a prefix of their own get variables with which no node starts.  Launch has a node itself if
-    it talks to others, such as lifecycle nodes and composable nodes: its node starts in
+    with a prefix of their own get variables with which no node starts.  Launch itself has a node if
+    it talks to other nodes, such as lifecycle nodes and composable nodes: this node starts in
     ``enclave``, by default the enclave in which the policy has the node ``launch_ros_*``.
     """
 
@@ -111,7 +111,8 @@ class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where i
         run_command = [*_RUN, root, "--policy", file, "--"]
         prefix = context.launch_configurations.get(_PREFIX, "")
         context.launch_configurations[_PREFIX] = f"{shlex.join(run_command)} {prefix}".rstrip()
-        Executable.prepare = _prepare_labeled  # not where launch only looks for this action
+        # Set here, so that merely loading this module changes nothing.
+        Executable.prepare = _prepare_labeled
 
 
 def _secured_launch_actions(

@@ -175,7 +175,7 @@ _MOVES = re.compile(r"(^|/)(cmd_vel|[^/]*commands?\Z|joint_trajectory|follow_joi
 
 
 def moves_robot(name: str) -> bool:
-    """Return whether what usually moves a robot has this name, such as /cmd_vel.
+    """Return whether a name, such as /cmd_vel, is usual for commands that move a robot.
 
     ``MOVES`` in web/src/table.js is the same pattern.
     """

@@ -40,7 +40,7 @@ def replaceable_on_the_way(path: Path, trusted_users: frozenset[int]) -> Iterato
     """Yield the folders and links above ``path`` through which others can replace it, and why.
 
     A sticky folder such as ``/tmp``, in which only the owner of a file can rename it, counts only
-    if others own the next part of the path in it.
+    if others own the next part of the path.
     """
     for step, state in _path_states(path):
         kept = state.st_mode & stat.S_ISVTX and state.st_uid in trusted_users

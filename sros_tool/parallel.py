@@ -38,7 +38,7 @@ class Tally:
 
         self.total = 0
         self._memory = mmap.mmap(-1, 8 * _MOST_PROCESSES)
-        self._counts = memoryview(self._memory).cast("Q")  # of each process
+        self._counts = memoryview(self._memory).cast("Q")  # a number for each process
         self._began = 0.0
         self._place = 0
 
@@ -175,9 +175,10 @@ def _fork(
         return
     try:
         os.close(reader)
-        follow_parent()  # so that it stops writing
+        follow_parent()  # ends with the parent, and so stops writing
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it, too, and kills workers
+        # The parent gets the signal, too, and kills workers.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         for tally in _tallies:
             tally.use_worker_slot(len(workers) + 1)

@@ -256,10 +256,10 @@ class Network:
         return tuple(sorted({name for side in self._sides.values() for name in side.of}))
 
     def links(self, enclave: str, known: Container[str]) -> Iterator[tuple[str, Callable[[], Hop]]]:
-        """Yield each enclave that another enclave can influence directly, with how to get the hop.
+        """Yield each enclave that ``enclave`` can influence directly, with a function for the hop.
 
-        The search for a name, which a hop has, takes long.  Enclaves that are ``known`` when their
-        turn comes are left out.
+        The function searches for the hop's name, which takes long.  Enclaves that are ``known`` by
+        then are left out.
         """
         for writer, reader in self._meeting(enclave, True, set(), known):
             if reader.enclave != enclave and self._carries_a_topic(writer, reader):
@@ -271,7 +271,7 @@ class Network:
     def users(self, direction: str, topic: str) -> frozenset[str]:
         """Return the enclaves that may publish or subscribe (``direction``) to a DDS topic.
 
-        ``topic`` can be a wildcard: then they may use some topic that it matches.
+        ``topic`` can be a wildcard: then the enclaves may use some topic that it matches.
         """
         asked = _Access("", topic, ())
         ends = self._sides[direction].possibly_overlapping(topic)
@@ -444,7 +444,7 @@ def _shared_topic(*accesses: _Access) -> str:
 @lru_cache(maxsize=4096)
 def _shared_by_wildcards(topics: tuple[str, ...], wildcards_outside: tuple[str, ...]) -> str:
     for prefix, (_, _, end) in _WRITER_RIGHTS.items():
-        # In ROS terms first, so that the result is a valid ROS name.
+        # Compare the ROS parts first, so that the result is a valid ROS name.
         inner = [_ros_part(topic, prefix, end) for topic in topics]
         outer = [_ros_part(excluded, prefix, end) for excluded in wildcards_outside]
         name = common_name(inner, filter(None, outer)) if all(inner) else ""

@@ -186,7 +186,7 @@ def _values(
 def _narrow_first(rules: list[TopicRule]) -> list[TopicRule]:
     """Return ``rules``, reordered as little as needed so that no rule follows a wider one."""
     ordered: list[TopicRule] = []
-    wide: list[TopicRule] = []  # those of them with wildcards, in the same order
+    wide: list[TopicRule] = []  # the rules with wildcards, in the same order
     for rule in rules:
         place, among = next(
             (
@@ -283,7 +283,7 @@ def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
     for kind, right, name in _candidates(publish, subscribe):
         names = dds_names(right, name)
         if all(map(publish.get, names.publish)) and all(map(subscribe.get, names.subscribe)):
-            continue  # all topics already belong to an action
+            continue  # these topics already belong to an action
         if all(map(publish.__contains__, names.publish)) and all(
             map(subscribe.__contains__, names.subscribe)
         ):

@@ -40,7 +40,7 @@ def time_of_file(seconds: float) -> datetime:
 _SOON = timedelta(days=30)
 """How long before it expires a document counts as expiring soon, unless its validity is short."""
 AUTHORITY_SOON = timedelta(days=90)
-"""The same for a CA, whose replacement takes several stages."""
+"""How long before its expiry a CA counts as expiring soon: its replacement takes several stages."""
 
 
 def soon_limit(lifetime: timedelta, longest: timedelta = _SOON) -> timedelta:
@@ -84,13 +84,13 @@ class Window:
         """Return how long a document with this validity is valid after it was made.
 
         ``made_at`` is when it was made, or when its file arrived here; a time long before the
-        validity is ignored.  Without it, the document counts as made by sros, that is, `BACKDATE`
-        after its validity begins; other programs may make documents that are valid only from
+        validity is ignored.  Without ``made_at``, the document counts as made by sros, that is,
+        `BACKDATE` after its validity begins; documents of other programs may be valid only from
         ``made_at`` on.
         """
         length = self.not_after - self.not_before
         backdated = BACKDATE if length > BACKDATE else timedelta(0)
-        # By differences: a certificate may begin or end where `datetime` does.
+        # Computed by differences, because dates of a certificate may be the limits of `datetime`.
         if made_at is not None and (late := made_at - self.not_before) >= -BACKDATE:
             return length - min(max(late, timedelta(0)), backdated)
         return length - backdated
@@ -244,5 +244,5 @@ def parse_iso(text: str) -> datetime:
         moment = moment.replace(tzinfo=UTC)
     try:
         return moment.astimezone(UTC)
-    except OverflowError as error:  # its zone moves the time out of the years 1 to 9999
+    except OverflowError as error:  # the zone moves the time out of the years 1 to 9999
         raise ValueError(f"{text!r} is outside of the years 1 to 9999") from error

@@ -54,7 +54,7 @@ def read_file(
 ) -> tuple[os.stat_result, bytes]:
     """Return the fstat(2) of a regular file, and its content as `read_bytes` does."""
     try:
-        # Looked at first, because opening a pipe would wait for its writer.
+        # The file type is checked first, because opening a pipe would wait for its writer.
         state, data = path.stat(), b""
         if stat.S_ISREG(state.st_mode) and 0 < state.st_size <= max_bytes:
             state, data = _read_open(path, max_bytes)
@@ -145,7 +145,8 @@ def parse(
             "Remove the <!DOCTYPE ...> line.",
         )
     encoding = root.getroottree().docinfo.encoding or "UTF-8"
-    if b"\0" in data and encoding.upper() in _UTF_8:  # libxml2 before 2.14 says what is declared
+    # The library libxml2 before 2.14 returns the declared encoding.
+    if b"\0" in data and encoding.upper() in _UTF_8:
         encoding = "UTF-16"
     if as_bytes and encoding.upper() not in _UTF_8:
         raise DocumentError(

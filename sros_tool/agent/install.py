@@ -423,8 +423,7 @@ def _present_key(folder: Folder, name: str, files: Mapping[str, bytes]) -> Publi
         if (data := _content(folder, f"{place}/{REQUEST}")) is not None:
             return load_request(data, f"of enclave {name}").public_key
         pem = _content(folder, f"{place}/{CERTIFICATE_FILE}") or files.get(CERTIFICATE_FILE, b"")
-        # Type: ignore[return-value].
-        return load_certificates(pem, CERTIFICATE_FILE)[0].public_key()
+        return load_certificates(pem, CERTIFICATE_FILE)[0].public_key()  # type: ignore[return-value]
     raise KeystoreError(
         f"the key of enclave {name} {KEY_NOT_HERE}",
         "",

@@ -169,7 +169,7 @@ class Backend:
         if on_ros and wire:
             variables |= _ON_THE_WIRE
         if denied and not on_ros:
-            # Its C library's stderr is the log of `CycloneLog`.
+            # Traced to stdout, because `CycloneLog` takes the stderr of the C library.
             variables |= denial_trace_variables("stdout")
         elif denied and (below := middleware_of(self.rmw)):
             variables |= below.trace_variables
@@ -420,7 +420,7 @@ def run_by_hand(node: HandNode, say: Callable[[str], None]) -> int:
         command += ["--topic", node.topic, "--by-hand", "--type", node.type]
     if node.backend == ZENOH and os.environ.get(ENCLAVE):
         command += ["--ros-args", "--enclave", os.environ[ENCLAVE], "--"]
-    if node.backend == RCLPY:  # what it logs of its messages is said here already
+    if node.backend == RCLPY:  # this process already prints each message
         command += ["--ros-args", "--log-level", "warn", "--"]
     command += ["--report", f"/proc/self/fd/{writing}"]
     stopped = threading.Event()

@@ -193,7 +193,7 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario, now: datetime
     domains = keystore.governance.domains()
     read = _read_enclaves(keystore, now, next(iter(domains)))
     template = keystore.template
-    # A keystore created from this template gets new CA keys, not the user's.
+    # A keystore that is created from this template gets new CA keys instead of the user's keys.
     template = replace(template, identity_key="", permissions_key="")
     wanted = f"rt{topic}" if topic else ""
     rights = read.rights
@@ -235,9 +235,10 @@ class _Enclaves(NamedTuple):
     ``rights`` are the grants of sound enclaves.  ``faulty`` maps enclaves that the others do not
     accept to their first fault; ``revoked`` maps revoked enclaves to whether their own list names
     them.  ``unreadable`` have files that are not safe to read, such as an endless file of the
-    kernel. ``elsewhere`` are enclaves whose key is not in the keystore.  ``without_list`` lack the
-    newest revocation list of their keystore; ``other_governance`` have another governance than the
-    rest; ``other_domain`` are for other ROS domains than ``domain``, in which the enclaves meet.
+    kernel. ``elsewhere`` are enclaves whose key is not in the keystore.  ``without_list`` are
+    enclaves without the newest revocation list of their keystore; ``other_governance`` have another
+    governance than the rest; ``other_domain`` are for other ROS domains than ``domain``, in which
+    the enclaves meet.
     """
 
     rights: Mapping[str, Grant]
@@ -344,7 +345,7 @@ def _content(path: Path) -> bytes:
 
 
 def _strange_authority(keystore: OpenedKeystore, state: OpenedEnclave) -> str:
-    """Return the name of an enclave's CA file whose CA is none of the keystore's, or ""."""
+    """Return the name of an enclave's CA file with a CA that the keystore does not have, or ""."""
     for file, role in ((IDENTITY_CA_FILE, IDENTITY), (PERMISSIONS_CA_FILE, PERMISSIONS)):
         known = {digest(certificate) for certificate in keystore.authority(role)}
         if fingerprints(state.files[file]).isdisjoint(known):
@@ -358,7 +359,7 @@ def _best_cast(
     """Return the best enclaves for talker, listener and guest, and their DDS topic.
 
     An enclave that may only publish, or only subscribe, is better than one that may do both.  The
-    best listener is one of ``without_list``, which may not know who was revoked.
+    best listener is an enclave in ``without_list``, which may not know which enclaves were revoked.
     """
     best: tuple[int, dict[str, str], str] = (-1, {}, "")
     serving = _service_cast(rights)
@@ -697,6 +698,6 @@ def naming_arguments(role: Role, names: Sequence[str]) -> list[str]:
         if node != default:
             rules += ["-r", f"{default}:__node:={node}"]
         if namespace:
-            # rcl looks up the namespace under the new name of the node.
+            # rcl looks up the rule for the namespace by the node's new name.
             rules += ["-r", f"{node}:__ns:={namespace}"]
     return ["--ros-args", *rules, "--"] if rules else []

@@ -197,7 +197,7 @@ _NEEDED = {
     "client": _SERVICE_OF_TWO,
     "newcomer": "an enclave that the demo made without a policy",
 }
-"""What a keystore needs to have, by the part that none of its enclaves fits."""
+"""Part → what the keystore needs to have, if none of its enclaves fits the part."""
 
 
 Forge = Callable[[KeystoreCopy], None]

@@ -292,7 +292,7 @@ class OtherTypes:
 
 
 STRING = NodeOptions.type
-"""The type of what talkers publish by default, and listeners read."""
+"""The type that talkers publish by default, and that listeners read."""
 
 
 def ros_type(dds_type: str) -> str:

@@ -397,7 +397,7 @@ def _domains(
                 "Run it as root, or where unprivileged user namespaces are allowed.",
             )
         return (next(iter(user.domains)),) * len(scenario.rows)
-    if scenario.router:  # every row has a router of its own
+    if scenario.router:  # each row has its own router, so domains may repeat
         if not 0 <= options.domain <= MAX_DOMAIN:
             raise UsageError(
                 f"the demo cannot run in domain {options.domain}",
@@ -606,7 +606,7 @@ class _Runner:
     async def _play(self, index: int, row: Row, patience: _Patience) -> RowRecord:
         plan, domain = self._plan, self._plan.domains[index]
         folder = plan.folder / f"row_{index + 1:02}"
-        shutil.rmtree(folder, ignore_errors=True)  # of an attempt with less patience
+        shutil.rmtree(folder, ignore_errors=True)  # left by an attempt with shorter time limits
         folder.mkdir(parents=True)
         expiry = None
         if row.short_lived:
@@ -656,7 +656,7 @@ class _Runner:
             finally:
                 for process in processes.values():
                     process.end()
-                for path in segments:  # processes of Zenoh leave them
+                for path in segments:  # Zenoh processes leave their shared memory
                     path.unlink(missing_ok=True)
                 if tap is not None:
                     tap.close()

@@ -285,7 +285,7 @@ def _judge_hearing(case: _Case) -> _Finding:
     if not sent:
         return _undecided(f"{claim.talker} sent nothing in the window")
     heard = case.heard()
-    if record.row.meanwhile is not None:  # what was heard before the change proves nothing
+    if record.row.meanwhile is not None:  # messages before the change prove nothing
         heard = [event for event in heard if _is_in_window(event, record)]
     arrived = len(sent & {event.text for event in heard})
     heard_of = f"{arrived} of {len(sent)} messages of the {claim.talker}"
@@ -373,7 +373,7 @@ def _judge_forgery(case: _Case) -> _Finding:
     if injected is None or not injected.packets:
         return _undecided("no packet of the talker could be changed")
     sent = {event.text for event in talker.events if event.kind is EventKind.SENT}
-    sent.add(f"{talker.text}: {len(sent) + 1}")  # sent, and suspended before it was reported
+    sent.add(f"{talker.text}: {len(sent) + 1}")  # perhaps sent, but suspended before its report
     believed = sum(
         event.kind is EventKind.HEARD and event.time >= injected.time and event.text not in sent
         for event in case.subject.events
@@ -393,7 +393,7 @@ def _messages_heard(speaker: PartyRecord, listener: PartyRecord) -> list[Event]:
 def _judge_view(case: _Case) -> _Finding:
     claim, observer, topic = case.claim, case.subject, case.talker.topic
     serves = case.record.row.party(claim.talker).role is Role.SERVER
-    # A server only has to be there: nobody has to call it.
+    # A server only has to exist; no client has to call it.
     if not serves and not case.messages_sent(case.talker):
         return _undecided(f"{claim.talker} sent nothing in the window")
     looks = [
@@ -414,7 +414,7 @@ def _judge_loss(case: _Case) -> _Finding:
     most = max((event.publishers.get(topic, 0) for event in looks), default=0)
     if not most:
         return _undecided(f"{claim.subject} never saw a publisher on {topic}")
-    # After the window the talker itself ends.
+    # Only inside the window, because the talker ends after it.
     inside = [event for event in looks if _is_in_window(event, case.record)]
     if not inside:
         return _undecided(f"{claim.subject} counted nothing in the window")
@@ -920,7 +920,7 @@ def _attack_lines(
 def _twin_text(row: RowResult) -> str:
     """Return the result without the defense, such as ``heard with the right key``."""
     if row.defence_removed.startswith("the wrong "):
-        # The defense is a fault of the attacker's own files.
+        # Here, the defense that was removed is a fault of the attacker's own files.
         return f"{row.observed} with the right {row.defence_removed.removeprefix('the wrong ')}"
     return f"{row.observed} without {row.defence_removed}"
 

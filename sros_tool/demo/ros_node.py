@@ -72,7 +72,7 @@ def _run_role(build: _Build, options: NodeOptions, arguments: Sequence[str]) -> 
     except ImportError as error:
         return _fail(name, error, ProcessStage.IMPORT, events)
     except Exception as error:
-        if not ended():  # what ends in the middle may fail
+        if not ended():  # a failure while the node is stopped does not count
             return _fail(name, error, stage, events)
     finally:
         # Leave the domain and free shared memory; an incomplete node may raise here.
@@ -184,11 +184,11 @@ def _listener(node: Any, options: NodeOptions, events: EventWriter) -> None:
         node.get_logger().info(f"I heard: '{message.data}'")
         events.report(EventKind.HEARD, message.data, count=heard)
 
-    # rclpy keeps subscriptions alive through the node.
+    # The subscription needs no variable: its node keeps it alive.
     if not options.by_hand:
         node.create_subscription(String, options.topic, hear, _QUEUE_DEPTH)
         return
-    from rclpy.qos import qos_profile_sensor_data  # hears publishers of any reliability
+    from rclpy.qos import qos_profile_sensor_data  # receives from publishers of any reliability
 
     texts = node.create_subscription(String, options.topic, hear, qos_profile_sensor_data)
     types = partial(_types_of_endpoints, node.get_publishers_info_by_topic, options.topic)
@@ -200,7 +200,7 @@ def _listener(node: Any, options: NodeOptions, events: EventWriter) -> None:
             return f", which this listener cannot hear ({error}): add --backend cyclone"
         if {*types()} != {kind}:
             return ", which this listener cannot hear next to another type: add --backend cyclone"
-        node.destroy_subscription(texts)  # Fast DDS takes one type of a topic in a process
+        node.destroy_subscription(texts)  # Fast DDS allows one type per topic in a process
         get = (message, options.topic, lambda _raw: on_count(1), qos_profile_sensor_data)
         node.create_subscription(*get, raw=True)
         return ""

@@ -167,7 +167,7 @@ def _socket_inode(link: Path) -> str:
     try:
         target = str(link.readlink())
     except OSError:
-        return ""  # closed since it was listed
+        return ""  # the descriptor was closed meanwhile
     return target.removeprefix("socket:[").removesuffix("]") if target[:8] == "socket:[" else ""
 
 

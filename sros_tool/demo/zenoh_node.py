@@ -4,7 +4,7 @@ They take the configuration from the variables of rmw_zenoh, and use its key exp
 tokens, attachments and messages in CDR (ros2/rmw_zenoh, docs/design.md).  Services and actions have
 the names and messages of ROS 2, but send strings.  The role ``router`` is a Zenoh router.
 
-A process whose connection is not accepted reports a refusal only if the port is open.
+A process without a connection reports a refusal only if the router's port is open.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def _text_of(payload: zenoh.ZBytes | None) -> str:
 
 
 class _ZenohNode:
-    """One node in the graph; its enclave in tokens is what the process says of itself.
+    """One node in the graph; the enclave in its tokens is chosen by the process itself.
 
     Its messages have ``size`` bytes or more.  A router, which is no node, has no ``name``.
     """
@@ -94,7 +94,7 @@ class _ZenohNode:
         self._entities = 0
         self._graph: set[str] = set()
         self._declared: list[object] = []
-        self._keep = self._declared.append  # what nobody keeps is undeclared
+        self._keep = self._declared.append  # an object without a reference is undeclared
         if name:
             self._announce(NODE)
 
@@ -194,7 +194,8 @@ class _ZenohNode:
                 return
             self._graph.discard(token)
             if _kind_of(token) == NODE:
-                # As rmw_zenoh: all of the node goes with it, and nobody looks at the enclave.
+                # As in rmw_zenoh, all entities of the node go with its token, whatever enclave the
+                # token has.
                 node = _node_of(token)
                 self._graph.difference_update({e for e in self._graph if _node_of(e) == node})
 
@@ -318,7 +319,8 @@ def _open(config: zenoh.Config, patience: float, stop: threading.Event) -> zenoh
         zenoh.ZError: the session does not open for another reason.
     """
     mode = json.loads(config.get_json("mode"))
-    # The files of sros let a session wait for its router forever: here this function waits.
+    # By the files of sros, a session waits for its router forever; here, this function waits
+    # instead.
     config.insert_json5("connect/timeout_ms", "0")
     session = None
     latest = time.monotonic() + patience
@@ -368,7 +370,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     signal.signal(signal.SIGINT, end)
     signal.signal(signal.SIGTERM, end)
-    # It warns of each connection that names are not verified, as the configuration says.
+    # Without the warning at each connection that host names are not verified, which is configured.
     zenoh.init_log_from_env_or("error,zenoh_link_tls=warn,zenoh_link_tls::utils=error")
     stage = ProcessStage.PARTICIPANT
     try:
@@ -402,4 +404,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 if __name__ == "__main__":
     status = main()
     sys.stderr.flush()
-    os._exit(status)  # the threads of an open session would delay the end
+    os._exit(status)  # without waiting for the threads of the open session

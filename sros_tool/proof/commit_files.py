@@ -256,7 +256,8 @@ class CommitFiles:
         sizes = self.repository.sizes(dict.fromkeys(of_all))
         if sum(sizes.get(tree_entry.id, 0) for tree_entry in plain.values()) > _MOST_WRITTEN:
             raise DocumentError(f"'{path}' has more than {_MOST_WRITTEN} bytes")
-        for where, link in links.items():  # before they are read: many are too large together
+        # Checked before reading, because many links together may be too large.
+        for where, link in links.items():
             if not 0 < sizes.get(link.id, 1) <= _LONGEST_TARGET:
                 raise DocumentError(f"'{where}' is a link with an impossible target")
         places: dict[str, list[str]] = {}
@@ -272,7 +273,8 @@ class CommitFiles:
         top = self.folder / path
         with Folder(self.folder) as folder:
             _make_folders(folder, path)
-            for where, link in links.items():  # when all files are written: none goes through one
+            # Links come last, so that no file is written through a link.
+            for where, link in links.items():
                 _make_folders(folder, str(PurePosixPath(where).parent))
                 folder.symlink(os.fsdecode(contents[link.id]), where)
         for where in links:
@@ -314,7 +316,7 @@ class CommitFiles:
                 self.fell_back.append(where)
                 raise
             except SrosError as error:
-                if where not in self.files:  # so that no reader takes it for missing
+                if where not in self.files:  # so that the file does not count as missing
                     with Folder(self.folder) as folder:
                         _make_folders(folder, where)
                 texts = (
@@ -327,7 +329,7 @@ class CommitFiles:
             self._write(where, entry, content)
             return content
 
-        with suppress(SrosError):  # whoever reads the files finds it, too
+        with suppress(SrosError):  # every later reader of the files reports the error
             read_policy(place, placeholders=placeholders, policy_files=read)
         return self.folder / path
 
@@ -378,7 +380,8 @@ def converting_patterns(content: bytes) -> dict[str, str]:
         named = {attribute.partition("=")[0] for attribute in attributes}
         converting = next((attribute for attribute in _CONVERTING if attribute in named), "")
         if converting and not pattern.startswith("#") and patterns.get(pattern) != EXPORT_IGNORE:
-            patterns[pattern] = converting  # only export-ignore counts for all files of a folder
+            # Kept, because only export-ignore applies to all files of a folder.
+            patterns[pattern] = converting
         if len(patterns) > _MOST_PATTERNS:
             return {"*": converting}
     return patterns
@@ -391,7 +394,7 @@ def may_match(pattern: str, path: str) -> bool:
     files, too.
     """
     if pattern.startswith('"'):
-        return True  # can have spaces and any escape
+        return True  # a quoted pattern may have spaces and escapes
     pattern = pattern.removesuffix("/")
     wanted = (path if "/" in pattern else PurePosixPath(path).name).lower()
     parts = re.split(r"[*?]+/?|[\[\\].*", pattern.removeprefix("/").lower(), flags=re.DOTALL)
@@ -420,7 +423,7 @@ _WHOLE = re.compile(r"(?:xpointer\(/(?:\*|[\w.-]+)(?P<below>/\*)?\))?")
 
 def may_be_policy(content: bytes) -> bool:
     """Return whether a file may be a policy, or a part of one; its name does not matter."""
-    text = content.replace(b"\0", b"")  # UTF-16 has a zero in each letter
+    text = content.replace(b"\0", b"")  # in UTF-16, ASCII letters have a zero byte
     if text.startswith(_EBCDIC):
         return True
     if not text.lstrip(_BEFORE).startswith(b"<"):

@@ -2,8 +2,8 @@
 
 For each broken requirement there is a witness, which shows how it is broken.  "To do" something
 means to write one of its DDS topics: whoever may write the requests of a service can have them
-executed, even without the right to read the replies.  "To subscribe" means to read.  Only a
-requirement of what an enclave must be able to do needs all topics.
+executed, even without the right to read the replies.  "To subscribe" means to read. Only a
+requirement that an enclave must have a right needs all topics of the right.
 
 This module reads no files.
 """
@@ -353,7 +353,7 @@ def _witness_against_must(requirement: Must, world: World, limit: SearchLimit) -
                 if enclave not in world.idle:
                     own_names = _own_topics(world, enclave, part.writes)
                 topics = part.topics(name)
-                # Of a wildcard, only names that a node can have are asked for.
+                # For a wildcard, only names that a node can have are required.
                 topic = (topics.valid() - own_names).example(limit, longest=world.longest)
                 if topic:
                     lacking.append(_use(enclave, right, part, topics, topic))
@@ -422,7 +422,8 @@ def _witness_against_at_most(
                 for met in world.side(part.writes).users_of_topics(part.topics(expression), limit):
                     holders.setdefault(met.enclave, []).append((part, met))
             for part, met in holders.get(ANYBODY, ()):
-                # There is no limit to these processes.
+                # Any number of processes without an identity may exist, so a single use breaks the
+                # requirement.
                 if topic := world.use(met, part.topics(expression), limit):
                     return Witness((_use(ANYBODY, right, part, part.topics(expression), topic),))
             if len(holders) <= most:
@@ -461,7 +462,8 @@ def _shared_by(
 
     A name that an enclave states is preferred to a name that only wildcards match.
     """
-    exactly: Counter[str] = Counter()  # by holders without wildcards
+    # Name → number of holders that state it, all without wildcards.
+    exactly: Counter[str] = Counter()
     stated: set[str] = set()
     wild: list[NameSet] = []
     longest = world.longest
@@ -483,7 +485,7 @@ def _shared_by(
         return expression if is_shared(expression) else None
     known = [right for right in stated if is_shared(right)]
     valid = shortest(name for name in known if name in valid_topics("", ""))
-    if valid or len(wild) < count:  # nobody but holders with wildcards has a name not stated
+    if valid or len(wild) < count:  # only holders with wildcards have unstated names
         return valid or shortest(known)
     shared, any_topic = NameSet.at_least(count, wild), Topics("", expression, "")
     return (
@@ -562,7 +564,7 @@ def _witness_against_not_both(
 def _with_anybody(uses: Mapping[str, Sequence[Use]], world: World) -> Mapping[str, Sequence[Use]]:
     """Return uses in which each enclave also has the uses of processes without an identity.
 
-    A process that has an enclave's files can run without them.
+    A process with the files of an enclave can also run without an identity.
     """
     of_anybody = uses.get(ANYBODY, ())
     if not of_anybody:
@@ -617,7 +619,7 @@ def _witness_against_apart(requirement: Apart, world: World, limit: SearchLimit)
     sources = sorted(_matching_enclaves(requirement.sources, world.enclaves) - through)
     targets = _matching_enclaves(requirement.targets, world.enclaves) - through
     if sources and any(domain_world.open_topics for domain_world in (world, *world.elsewhere)):
-        sources.append(ANYBODY)  # their processes can run without an identity, too
+        sources.append(ANYBODY)  # a source's process can also run without an identity
     chain = _shortest_chain(world, sources, targets, through, limit)
     if not chain:
         return None
@@ -657,9 +659,9 @@ def _unused_names(
 ) -> tuple[list[str], list[str]]:
     """Return clauses on names in a requirement without users, and the names that no right states.
 
-    The latter are in use only by wildcards, or nobody may use them and they are to stay unused
-    (`Nobody`).  Such a name counts as one without users if a right states another name that differs
-    by one slip, as in ``/cmd_vle``, or if the name is in use as another kind (service or action).
+    The latter names may be used only by wildcards, or by nobody, as their requirement (`Nobody`)
+    demands.  Such a name counts as one without users if a right states another name that differs by
+    one slip, as in ``/cmd_vle``, or if the name is in use as another kind (service or action).
     """
     clauses, unnamed = [], []
     for right, name, parts in _restricted_names(requirement):
@@ -686,7 +688,7 @@ def _unused_names(
 def _restricted_names(requirement: Requirement) -> Iterator[tuple[str, str, tuple[_Part, ...]]]:
     """Yield each name whose use a requirement restricts: a right, the name, and parts to use it.
 
-    Of what nobody may do, and of what is protected, a use at the other side counts as well.
+    For `Nobody` and `Protected`, uses at the other side of a name count as well.
     """
     rights: RightNames = ()
     match requirement:
@@ -723,7 +725,8 @@ def _meant(name: str, stated: Callable[[str], bool]) -> str:
 def _with_one_slip(name: str) -> Iterator[str]:
     """Yield the names that differ by a letter within a word: wrong, missing, or in wrong order.
 
-    Digits, and letters that are a word of their own, tell things apart (``/arm_l``, ``/arm_r``).
+    Digits, and letters that are a word of their own, distinguish names on purpose (``/arm_l``,
+    ``/arm_r``).
     """
     for at in range(len(name) + 1):
         begin, end = name[:at], name[at:]
@@ -744,7 +747,7 @@ _LETTERS = tuple(f"{ascii_letters}_/")
 def _why_never_fails(requirement: Requirement, world: World) -> str:
     """Return why a requirement cannot fail with the current enclaves, as a clause, or "".
 
-    A list with the names of all present enclaves is no such reason: enclaves may be added.
+    That a list names all present enclaves is no reason, because enclaves may be added.
     """
     count = len(world.enclaves)
     if world.open_topics:
@@ -822,7 +825,7 @@ def _shortest_chain(
     domains passes on what it learns in one of them to the others.
     """
     starts = list(sources)
-    # A target can be a source, too, and must be reached from another one: so two are kept.
+    # A target that is a source must be reached from another source, so two sources are kept.
     most = 2 if any(start in targets for start in starts) else 1
     origins: dict[str, set[str]] = {start: {start} for start in starts}
     used: dict[tuple[int, str, str], set[str]] = {}
@@ -886,7 +889,7 @@ class _Flow:
         """Yield pairs of a topic and a reader to which information goes from an enclave.
 
         Only readers for which ``is_new`` returns True are considered.  Exact topics come first,
-        without those for which ``is_unused`` returns False; matches of wildcards follow.
+        without topics for which ``is_unused`` returns False; matches of wildcards follow.
         """
         written, around, exact = self._world.written_by(enclave, _IGNORED)
         for topic in sorted(exact, key=_topics_before_services):

@@ -226,7 +226,7 @@ def requirement_findings(
 ) -> list[Finding]:
     """Return a finding for each requirement that does not hold, or that cannot fail.
 
-    ``before`` are the rights before a change, which may have renamed what a requirement names.
+    ``before`` are the rights before a change, which may have renamed names in requirements.
 
     Raises:
         DocumentError: there are too many wildcards to decide a requirement.
@@ -237,7 +237,7 @@ def requirement_findings(
 def robots_left_out(system: System, namespaces: Sequence[str]) -> list[Finding]:
     """Return a finding if requirements in ``namespaces`` are not for all robots of the fleet.
 
-    The namespace ``/`` is the place of requirements that may be for every robot.
+    Requirements in the namespace ``/`` may be for every robot.
     """
     fleet = system.fleet() if {*namespaces} - {"/"} else None
     above = {place for namespace in namespaces for place in _with_those_above(namespace)}
@@ -250,7 +250,7 @@ def robots_left_out(system: System, namespaces: Sequence[str]) -> list[Finding]:
 
 
 def _with_those_above(namespace: str) -> Iterator[str]:
-    """Yield a namespace, and each one that it is in, except ``/``."""
+    """Yield a namespace and all namespaces above it, except ``/``."""
     while namespace.strip("/"):
         yield namespace
         namespace = namespace.rpartition("/")[0]
@@ -333,7 +333,7 @@ def _edit_text(violation: Violation) -> str:
             enclaves += [steps[0].use.enclave for steps in violation.differing]
         case Apart(through=listed, sources=sources):
             key, enclaves = "through", [violation.steps[-2].use.enclave]
-            if enclaves[0] in sources:  # it would be kept apart from nothing any more
+            if enclaves[0] in sources:  # the source would no longer be kept apart from anything
                 return ""
         case _:
             return ""
@@ -451,7 +451,7 @@ def _unnamed_finding(
     requirement: Requirement, names: Sequence[str], allowed_before: Iterable[Right]
 ) -> Finding:
     place = requirement.source
-    # A right that the requirement forbids had to go.
+    # That a forbidden right is gone shows no renaming.
     forbidden = (
         {right for right, _ in requirement.rights} if isinstance(requirement, Nobody) else ()
     )

@@ -272,8 +272,8 @@ class Growth:
     def without_renames(self, renamed: Mapping[str, str]) -> Growth:
         """Return this growth without access that only comes from the new names of enclaves.
 
-        ``renamed`` is what `renamed_between` returns.  If nothing else is added, nobody reaches
-        anybody whom it did not reach before, under the old names.
+        ``renamed`` is what `renamed_between` returns.  If no other access is added, all influence
+        is that of before, under the old names.
         """
         names = {*renamed, *renamed.values()}
 
@@ -293,8 +293,8 @@ class Growth:
 def renamed_between(base: AccessSource, head: AccessSource) -> dict[str, str]:
     """Map enclaves of BASE to enclaves of HEAD with the same rights under another name.
 
-    Their permissions are the same but for the subject; Zenoh rules are not compared, so that with
-    them no enclave counts as renamed.
+    Their permissions are the same except for the subject.  If a side has Zenoh rules, which are not
+    compared, no enclave counts as renamed.
     """
     if base.zenoh is not None or head.zenoh is not None:
         return {}
@@ -343,10 +343,10 @@ class NewAccess(NamedTuple):
 def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     """Return the access that ``head`` adds to ``base`` and removes from it.
 
-    A policy counts as signed, with a governance that controls all access.  As BASE it stands for
-    encryption wherever it demands no other protection, so a keystore that protects less has lost
-    protection. As HEAD it lowers no protection of a keystore.  A policy is for the domains of the
-    other side; enclaves of a fleet's robots are for the domain of their robot.
+    A policy counts as signed, with a governance that controls all access.  A policy as BASE stands
+    for encryption wherever it demands no other protection, so a keystore HEAD that protects less
+    has lost protection. A policy as HEAD lowers no protection of a keystore.  A policy is for the
+    domains of the other side; enclaves of a fleet's robots are for the domain of their robot.
 
     Raises:
         DocumentError: the comparison cannot be decided: there are too many wildcards, or
@@ -686,7 +686,7 @@ def _gains(
             worlds=tuple(world for world in order if world in worlds_of_gain),
             domains=tuple(sorted(domains)),
         )
-        # What the governance gives, it gives to many.
+        # Access that the governance gives is joined for all enclaves.
         same = joined_gain if joined_gain.right else replace(joined_gain, enclaves=())
         together.setdefault(same, []).extend(gain.enclaves)
     for gain, enclaves in together.items():
@@ -742,7 +742,7 @@ def _added_gains(
     for verb in _VERBS:
         gained_topics = topics[verb]
         if not before.joins:
-            gained_topics -= NameSet((ROS_DISCOVERY_TOPIC,))  # every participant has it
+            gained_topics -= NameSet((ROS_DISCOVERY_TOPIC,))  # every participant has this topic
         for gain in stated_rights.gains(place, verb, gained_topics):
             if not after.decide(verb, gain.topic) or before.decide(verb, gain.topic):
                 raise AssertionError(f"{gain} is not what {place.world.title} decides")
@@ -880,7 +880,7 @@ class _Stated:
         """
         enclave, world = place.enclave, place.world
         fitting_others = world.fitting_others(self._new, enclave)
-        # Often in several domains.
+        # Cached, because several domains often add the same access.
         key = enclave, fitting_others, verb, added_names, world.style, world.longest
         if key not in self._found:
             self._found[key] = list(self._searched_gains(place, verb, added_names))
@@ -906,7 +906,7 @@ class _Stated:
                 gain = self._gain(place, verb, right, expression, topic)
                 yield gain
                 if gain.denied and is_expression(expression):
-                    # Perhaps there is more than a denial that is gone.
+                    # Besides names whose denial is gone, the right may add others.
                     topic = self._example(own_names - denied.names, verb, expression, place)
                     if topic is not None:
                         yield self._gain(place, verb, right, expression, topic)
@@ -957,7 +957,7 @@ class _Stated:
         denied = self._denials(place.enclave, verb, place.world.style).of(topic)
         name, action = topic, "write" if verb is AccessVerb.PUBLISH else "read"
         if right:
-            at = expression.find(right.name)  # a name in permissions can be empty
+            at = expression.find(right.name)  # a name in permissions may be empty
             end = len(expression) - at - len(right.name)
             name, action = topic[at : len(topic) - end], right.right
         return Gain(
@@ -1003,7 +1003,7 @@ def _example(names: NameSet, expression: str, world: _World, limit: SearchLimit)
 
 
 _Edges = Mapping[str, Mapping[str, Callable[[], Hop]]]
-"""Maps pairs of enclaves (source, target) to what returns a hop from the first to the second."""
+"""Maps pairs of enclaves (source, target) to a function that returns a hop between them."""
 _MOST_REACH = 10_000
 _MOST_HOPS = 200_000
 
@@ -1136,7 +1136,7 @@ def _new_nodes(before: AccessSource, after: AccessSource, limit: SearchLimit) ->
                 for path in sorted((profiles.keys() & before.enclaves.keys()) - earlier)
                 if not any(map(node_of(profiles[path]).is_within, nodes_of(before.enclaves[path])))
             ]
-    if not assigned:  # of a large fleet, the rights are many
+    if not assigned:  # a large fleet has many rights, so they are not read in vain
         return
     old_rights, new_rights = map(_rights_by_enclave, (before.rights, after.rights))
     for node, path, profile, earlier, left in assigned:
@@ -1151,10 +1151,10 @@ def _new_nodes(before: AccessSource, after: AccessSource, limit: SearchLimit) ->
 def _gained_rights(
     had: Sequence[Collection[Right]], rights: Collection[Right], limit: SearchLimit
 ) -> tuple[Right, ...]:
-    """Return what ``rights`` of an enclave allow, and none of ``had`` does; see `NewNode.rights`.
+    """Return what ``rights`` of an enclave allow and ``had`` do not allow; see `NewNode.rights`.
 
-    ``had`` has the rights of several enclaves. What every node has, such as its own services, comes
-    last.
+    ``had`` has the rights of several enclaves. Rights that every node has, such as to its own
+    services, come last.
     """
     known, now = [_allowed_names(enclave) for enclave in had], _allowed_names(rights)
     stated = Rules(right for enclave in had for right in enclave)
@@ -1163,7 +1163,7 @@ def _gained_rights(
     for right in rights:
         for part in parts(right) if right.qualifier is ALLOW else ():
             if any(stated.allow(enclave, part.right, part.name) for enclave in enclaves):
-                continue  # is faster than automata
+                continue  # this test is faster than automata
             had_names = NameSet.union(names.get(part.right, NameSet()) for names in known)
             new_names = now[part.right] & names_of(Style.FNMATCH, (part.name,)) & _ROS_NAMES
             example = (new_names - had_names).example(limit)
@@ -1249,7 +1249,7 @@ def _enclaves_of_nodes(side: AccessSource, other: AccessSource) -> dict[_Node, _
 
 
 def _enclaves_near(robots: _EnclavesByRobot, robot: str) -> dict[str, Profile]:
-    """Return the enclaves of a node that are of a robot or of none; for "", all."""
+    """Return the enclaves of a node that belong to a robot or to no robot; all for ""."""
     near = (robots.get("", {}), robots.get(robot, {})) if robot else robots.values()
     return {path: profile for profiles in near for path, profile in profiles.items()}
 
@@ -1262,7 +1262,7 @@ def undenied_name(denied: Right, stated: Rules) -> str | None:
     if stated.cover(denied):
         return None
     allowed = stated.overlapping(denied._replace(qualifier=ALLOW))
-    if denied.kind == "dds":  # has no ROS name to search for
+    if denied.kind == "dds":  # it has no ROS name to search for
         return None if allowed else denied.name
     names = [right.name for right in (*allowed, *stated.overlapping(denied))]
     return common_name([denied.name], names)

@@ -122,7 +122,7 @@ def less_protection(
 ) -> Iterator[SettingChange]:
     """Yield the settings whose protection is weaker in ``new`` than in ``old``."""
     if "zenoh" in (old.kind, new.kind):
-        pass  # only what Zenoh permits is compared
+        pass  # a Zenoh configuration has no governance to compare
     elif old.governance and new.governance:
         yield from _looser_governance(old.governance, new.governance, limit)
     elif new.governance:
@@ -205,7 +205,7 @@ def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChan
     all_revoked = frozenset(entry for trust in old.trusts.values() for entry in trust.revoked)
     trusted: dict[int, list[str]] = defaultdict(list)
 
-    @lru_cache(maxsize=8)  # most enclaves have the same lists
+    @lru_cache(maxsize=8)  # most enclaves have the same lists, so this is cached
     def lost_revocations(before: frozenset[tuple[str, int]], after: Trust) -> list[int]:
         gone = before - after.revoked
         return sorted(serial for authority, serial in gone if authority in after.authorities)
@@ -397,7 +397,7 @@ def looser_router_rules(
 ) -> Iterator[SettingChange]:
     """Yield changes of routers' rules that allow other routers more than in ``old``.
 
-    A removed router counts only if the settings do not say which router its enclaves connect to
+    A removed router counts only if the settings do not say to which routers its enclaves connect
     now.
     """
     if new.routers and not (states_routers(old) and states_routers(new)):

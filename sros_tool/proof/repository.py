@@ -1,10 +1,9 @@
-"""Read objects and references of a git repository that nobody has to trust.
+"""Read objects and references of a git repository that need not be trusted.
 
-Git only reads objects here, and the hash of each object is verified.  So what is returned for a
-commit is the commit's content, whatever replacements, grafts, alternates, attributes or settings
-the repository has.  No program that the repository configures is run (hooks, filters, textconv,
-fsmonitor, transports), only `Repository.fetch_missing` fetches anything, and no file of the work
-tree is read.
+Git only reads objects here, and the hash of each object is verified. So the returned content of a
+commit is right, whatever replacements, grafts, alternates, attributes or settings the repository
+has.  No program that the repository configures is run (hooks, filters, textconv, fsmonitor,
+transports), only `Repository.fetch_missing` fetches anything, and no file of the work tree is read.
 """
 
 from __future__ import annotations
@@ -186,7 +185,7 @@ class Repository:
         places = ("refs/", "refs/tags/", "refs/heads/", "refs/remotes/")
         names = [f"{place}{name}" for place in places] + [f"refs/remotes/{name}/HEAD"]
         commits = self._targets(names)
-        if re.fullmatch(r"[A-Z_]+", name):  # such as FETCH_HEAD
+        if re.fullmatch(r"[A-Z_]+", name):  # a reference such as FETCH_HEAD
             target = self._ask("rev-parse", "--verify", "--quiet", "--end-of-options", name)
             commits |= {name: target} if target and target not in commits.values() else {}
         return commits
@@ -339,7 +338,7 @@ class Repository:
                 than ``maximum`` bytes.
         """
         known = self.sizes(wanted := dict.fromkeys(ids))
-        # A missing object is an error below.
+        # A missing object raises an error below.
         sizes = {object_id: known.get(object_id, 0) for object_id in wanted}
         if largest is not None:
             sizes = {object_id: size for object_id, size in sizes.items() if size <= largest}
@@ -526,7 +525,7 @@ def _top(repository: Repository, commit: str) -> TreeEntry:
     return TreeEntry(FOLDER, repository.tree(commit))
 
 
-@lru_cache(maxsize=1024)  # what has an id never changes
+@lru_cache(maxsize=1024)  # an object with a given id never changes
 def _folder(repository: Repository, digits: str) -> dict[str, TreeEntry]:
     return repository.folders([digits])[digits]
 

@@ -10,7 +10,7 @@ A requirement is a table of the file, such as::
 Names are ROS names, with the wildcards of policies; enclaves are names or patterns, as for
 ``--match``, and ``!`` before a name excepts an enclave from a list.  A file can be read for a
 namespace: then all enclaves, and the names without ``/`` or ``*`` at their beginning, are below it.
-It can also be read with remappings of names, as nodes are started with.
+It can also be read with remappings of names, such as those with which nodes are started.
 The class of each kind says what such a requirement demands.
 
 Names and enclaves can have the placeholders of policies, which a fleet fills in.  A table with
@@ -54,9 +54,9 @@ from sros_tool.wording import counted, first_few, shortened
 from sros_tool.xml import read_bytes
 
 _MOST_REQUIREMENTS = 1000
-_MOST_TEXTS = 1000  # of one key
-_MOST_PAIRS = 20_000  # that requirements of one file make of the names of two lists
-_MOST_FILLED = 20_000  # with the robots of a fleet
+_MOST_TEXTS = 1000  # per key
+_MOST_PAIRS = 20_000  # pairs of names from two lists, in all requirements of a file
+_MOST_FILLED = 20_000  # after filling in the robots of a fleet
 _LONGEST_TEXT = 500  # characters of a name or a reason
 EXCEPT = "!"
 """Prefix of an enclave that is excepted from a list of enclaves."""
@@ -871,8 +871,8 @@ class DroppedRequirement:
     """A requirement of the earlier file that the new file drops or weakens.
 
     ``requirement`` has its place in the earlier file; ``kept`` are requirements of the new file
-    about some of the same names or enclaves.  ``only_elsewhere``: the new file demands it, but not
-    in every other namespace.
+    about some of the same names or enclaves.  ``only_elsewhere``: the new file demands the same,
+    but not in every other namespace.
     """
 
     requirement: Requirement

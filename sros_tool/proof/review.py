@@ -1,8 +1,8 @@
 """Review a change in git: findings in HEAD, and access that HEAD adds to BASE.
 
-Whoever makes the change cannot influence how it is reviewed: both sides are the content of two
-commits, not of a work tree (`sros_tool.proof.repository`, `sros_tool.proof.commit_files`), and the
-result names what was not compared.
+The author of the change cannot influence the review: it compares the content of two commits, not of
+a work tree (`sros_tool.proof.repository`, `sros_tool.proof.commit_files`), and the result names
+what was not compared.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ class ReviewRequest:
     """The input of a review; paths are relative to the top of the repository.
 
     ``head`` is the commit to review, ``base`` the commit to compare with ("": none). With
-    ``namespaces`` and ``remaps``, the requirements are read for these; with
+    ``namespaces`` and ``remaps``, the requirements are read for these namespaces and names; with
     ``allow_new_access``, new access and unreviewed policies are shown but do not make the review
     fail; with ``allow_dropped_requirements``, neither do requirements that HEAD drops or weakens.
     The review fails if an enclave expires within ``renew_within``.  ``left_out`` are files and
@@ -207,7 +207,7 @@ class RightsChange:
 class DroppedRequirements:
     """Findings on requirements of BASE that HEAD drops or weakens, and how many they are.
 
-    Each such requirement has a finding, and a second one if HEAD breaks it.
+    Each such requirement has one finding, and another one if HEAD breaks the requirement.
     """
 
     count: int
@@ -385,14 +385,14 @@ class _Review:
     is_relative: bool = False
     """Whether a requirement has a name that moves with the namespace."""
     is_compared_elsewhere: bool = True
-    """Whether the review decided which of them the change breaks in another namespace."""
+    """Whether the review decided which requirements the change breaks in another namespace."""
 
     def _allows(self, kind: str) -> bool:
         """Return whether the request, or the kind itself, allows what steps of a kind find."""
         if kind == "requirements-before":
             return self.request.allow_dropped_requirements
-        # Whoever changes a policy seldom has the keys of the CAs, and only users know whether they
-        # put the nodes into another namespace.
+        # Authors of a policy seldom have the CA keys, so the keystore may be signed later; and only
+        # users know whether they put the nodes into another namespace.
         return kind in ("signed", "rights") or (
             kind in ("new-access", "files") and self.request.allow_new_access
         )
@@ -412,7 +412,7 @@ class _Review:
         of_head = yield from self._policies(self.head, head_fleet)
         of_base: list[Path] = []
         if self.base:
-            with suppress(SrosError, OSError):  # said by the comparison
+            with suppress(SrosError, OSError):  # the comparison reports the error
                 of_base = [
                     file
                     for path in asked.policies
@@ -425,7 +425,7 @@ class _Review:
         yield from self._step_result("policy", named, findings, only_with_result=bool(of_head))
         keystores = yield from self._keystores(self.head)
         for path, keystore in keystores.items():
-            with suppress(SrosError):  # what is wrong with it is a finding
+            with suppress(SrosError):  # faults of the fleet file are findings
                 self.robots[path] = load_fleet(OpenedKeystore(keystore))
         base_keystores: dict[str, Path] = {}
         if self.base:
@@ -456,7 +456,8 @@ class _Review:
         for path, keystore in keystores.items():
             earlier_keystore = base_keystores.get(path)
             yield from self._keystore(path, keystore, earlier_keystore, of_head, head_fleet)
-        # Whoever allows new access has read the commit, not what a checkout may make of it.
+        # Not allowed by --new-access: its user has read the commit, not a checkout, which may
+        # differ.
         yield from self._step_result("files", "", self._converted_step, can_be_allowed=False)
         yield from self._step_result("keystore", " ".join(asked.keystores), self._keys_step)
         if self.base:
@@ -485,7 +486,7 @@ class _Review:
             decided = decide()
         except SrosError as error:
             decided = _UNDECIDED, error
-        except OSError as error:  # such as a name that is too long for this system
+        except OSError as error:  # such as a file name that is too long for this system
             decided = _UNDECIDED, DocumentError(f"'{error.filename}': {error.strerror}")
         if decided:
             status, content = decided
@@ -578,7 +579,7 @@ class _Review:
     def _delivery_step(
         self, base: tuple[list[Path], Fleet | None], head: tuple[list[Path], Fleet]
     ) -> tuple[int, Content] | None:
-        """Return the step on robots whose keys would go to another place, or in another way."""
+        """Return the step on robots whose keys would be delivered elsewhere, or in another way."""
         lines: list[tuple[str, str]] = []
         robots = base[1].robots if base[1] else {}
         for name, new in head[1].robots.items():
@@ -603,7 +604,7 @@ class _Review:
         return (_FOUND, Facts(tuple(lines))) if lines else None
 
     def _converted_step(self) -> tuple[int, Content] | None:
-        """Return the step on reviewed files of which git may put another content into checkouts."""
+        """Return the step on reviewed files that git may change in a checkout or archive."""
         lines = []
         for folder in sorted({parent for path in self.head.files for parent in Path(path).parents}):
             path = str(folder / ATTRIBUTES_FILE)
@@ -622,7 +623,8 @@ class _Review:
                 )
                 if attribute := next(matching, ""):
                     does = "change it in a checkout or archive"
-                    if attribute == EXPORT_IGNORE:  # an include of it may have a fallback
+                    # For example, an include may then use its fallback.
+                    if attribute == EXPORT_IGNORE:
                         does = "leave it out of an archive"
                     text = f"git may {does} ({attribute} in {path})"
                     lines.append((text, file))
@@ -637,8 +639,8 @@ class _Review:
     def _keys_step(self) -> tuple[int, Content] | None:
         """Return the step on private keys in keystores of HEAD, and in files that change.
 
-        Whether options allow new access does not matter: whoever reads the repository has them.
-        Keys of keystores that are not reviewed, and were there before, are only named.
+        Options that allow new access do not apply: everybody who reads the repository has these
+        keys. Keys of keystores that are not reviewed, and were there before, are only named.
         """
         entries = dict(self._changed_files(self.head, self.base)) if self.base else {}
         entries |= {
@@ -647,7 +649,7 @@ class _Review:
             if _is_below(path, self.request.keystores)
         }
         earlier: dict[str, TreeEntry] = {}
-        with suppress(SrosError):  # `left_out` says that these were not looked for
+        with suppress(SrosError):  # `left_out` says that keys were not searched for
             walked = self._changed_files(self.head, None)
             earlier = {path: entry for path, entry in walked if path.endswith(KEY_FILE)}
         key_files = {**earlier, **entries}
@@ -687,8 +689,8 @@ class _Review:
         earlier = list(self._changed_files(self.base, self.head))
         for path in self._unreviewed_keystores([*changed, *earlier]):
             if not self._has(self.head, str(Path(path) / ENCLAVES)):
-                continue  # the change deletes it, or it only has certificates of CAs
-            is_top = path == "."  # of which every file of the repository would be a part
+                continue  # deleted by the change, or without enclaves
+            is_top = path == "."  # all files of the repository would belong to it
             review = "move it into a folder" if is_top else "name it with --keystore"
             place = f"{ENCLAVES} --leave-out {PUBLIC}" if is_top else quote(path)
             text = f"is a keystore that changes and is not reviewed: {review}, or leave it out with"
@@ -903,7 +905,7 @@ class _Review:
 
     def _changed_settings(self) -> list[str]:
         """Return changed TOML files that look like templates or requirements, and are not read."""
-        with suppress(SrosError):  # said by the step on changed files
+        with suppress(SrosError):  # the step on changed files reports the error
             changed = self._changed_files(self.head, self.base) if self.base else ()
             files = {
                 path: entry.id
@@ -937,7 +939,7 @@ class _Review:
         head = after()
         if not base_paths:
             assert self.base
-            for path in self.request.policies:  # raises the reason why it was not read
+            for path in self.request.policies:  # raises the error of a file that was not read
                 self.base.policies(path, placeholders=base_fleet is not None)
             text = f"is new, so that all of its access is new; if it is renamed, {_BOTH_NAMES}"
             new = ((text, " ".join(self.request.policies)),)
@@ -1017,7 +1019,7 @@ class _Review:
                 base_files, partial(_without_left_robots, before, system.fleet)
             )
             rights: frozenset[Right] = frozenset()
-            with suppress(SrosError, OSError):  # said by the comparison
+            with suppress(SrosError, OSError):  # the comparison reports the error
                 if subject in earlier_sources:
                     rights = earlier_sources[subject]().rights
             sources = moved.get(subject)
@@ -1076,7 +1078,7 @@ class _Review:
     ) -> Iterator[Finding]:
         """Yield a finding for each requirement that the change breaks in another namespace alone.
 
-        Users put the nodes of a package, and its requirements, into a namespace of their own.
+        Users may put the nodes of a package, and its requirements, into their own namespaces.
         ``requirements`` are those of ``files`` for the namespace / of ``system``.
         """
         asked = self.request
@@ -1145,7 +1147,7 @@ class _Review:
             return False
         try:
             return self.base.entry(choice) != self.head.entry(choice)
-        except DocumentError:  # a link is on its path, perhaps in the base alone
+        except DocumentError:  # a link is on the path, perhaps only in BASE
             return True
 
     def _keystore_fleet(self, path: str) -> Fleet | None:
@@ -1166,7 +1168,7 @@ class _Review:
         ]
         left: list[Finding] = []
         if moved:
-            with suppress(SrosError, OSError):  # said by the comparison
+            with suppress(SrosError, OSError):  # the comparison reports the error
                 left = list(_requirements_left(wanted_requirements, *moved()))
         if not (dropped or left):
             return None
@@ -1196,7 +1198,7 @@ class _Review:
         is_same = before is not None and _is_same_file(self.base, self.head, settings)
 
         stated: tuple[Policy, ...] = ()
-        with suppress(SrosError, OSError):  # said by the step on policies
+        with suppress(SrosError, OSError):  # the step on policies reports the error
             stated = tuple(read_policy_for(file, fleet) for file in policies)
         circumstances = replace(self._circumstances(self.robots.get(path)), policies=stated)
 
@@ -1263,7 +1265,7 @@ _TRUSTED = (CRL, *map(ca_certificate, ROLES))
 
 
 def _keystore_with(path: str) -> str | None:
-    """Return the keystore or export of which a file is, by its name; None for other files."""
+    """Return the keystore or export that a file belongs to, by its path; None for other files."""
     keystore, enclaves, file = f"/{path}".partition(f"/{ENCLAVES}/")
     if enclaves and Path(file).name in _FILES_OF_ENCLAVES:
         return keystore[1:]
@@ -1287,7 +1289,8 @@ def _is_same_file(base: CommitFiles | None, head: CommitFiles, path: str) -> boo
 def _fixed_or_moving_names(before: AccessSource, after: AccessSource) -> Iterator[PlacedRight]:
     """Yield the rights in ``after`` that are new only for nodes in another namespace.
 
-    Their names became absolute, or relative.  Denials that deny less there are yielded, too.
+    Their names became absolute, or relative.  Denials that deny less in another namespace are
+    yielded, too.
     """
     of_before, of_after = (
         [*chain.from_iterable(map(_moved_rights, source.enclaves.values()))]
@@ -1327,9 +1330,9 @@ def _moved_rights(enclave: Enclave) -> Iterator[tuple[PlacedRight, Right]]:
 def _namespaces_of_change(before: frozenset[Right], after: frozenset[Right]) -> list[str]:
     """Return namespaces in which requirements may be broken that hold in ``/``.
 
-    The first one has a name that no right has; it is as good as every other namespace without such
-    a name.  The others are those in the names of rights that the change adds or removes, or that
-    their wildcards match.
+    The first namespace has a name that is in no right; it stands for all other such namespaces.
+    The other namespaces are those in the names of added and removed rights, or are matched by
+    wildcards of these rights.
     """
     changed = sorted({right.name for right in before ^ after})
     examples = [name for name in (common_name([name, "/*/*"]) for name in changed) if name]
@@ -1391,7 +1394,8 @@ def _enclaves_by_node(enclaves: Iterable[Enclave]) -> dict[NodeName, set[str]]:
 def _without_left_robots(before: Fleet | None, after: FleetSource) -> Fleet | None:
     """Return the fleet ``before`` without the robots that left it.
 
-    So a robot that leaves drops no requirement.  A group that lost all its robots still has them.
+    So no requirement is dropped because its robot left.  A group that lost all of its robots keeps
+    them here.
     """
     now = after()
     if before is None or now is None:
@@ -1412,7 +1416,7 @@ def _undecided(kind: str, subject: str, error: SrosError | OSError) -> ReviewSte
 def _read_each(
     kind: str, paths: Iterable[str], read: Callable[[str], Value | None]
 ) -> Generator[ReviewStep, None, dict[str, Value]]:
-    """Return what is read from paths, without None; yield a step for each path that cannot be."""
+    """Return the values read from paths, without None; yield a step for each unreadable path."""
     values: dict[str, Value] = {}
     for path in paths:
         try:

@@ -158,7 +158,7 @@ class AccessSource:
         return next((grant.subject for grant in known.grants), "") if known else ""
 
     def as_rights(self) -> RightsSource:
-        """Return the rights that a policy gives, whatever the documents are signed with."""
+        """Return the rights that a policy gives, even if the signed documents differ."""
         return RightsSource(
             Path(self.shown),
             self.kind,
@@ -234,7 +234,7 @@ def _access_of_source(path: Path, source: RightsSource) -> AccessSource:
     if source.kind == "zenoh":
         (document,) = source.configurations.values()
         zenoh_files_here = {LONE: _zenoh_file(path, document)}
-        # Enclaves that its rules do not name get nothing by it.
+        # A Zenoh configuration gives nothing to enclaves that its rules do not name.
         return replace(
             side,
             zenoh=source.rights,
@@ -365,7 +365,7 @@ def _signed_text(message: bytes) -> bytes | None:
 
 
 def _exported_governance(root: Path, folders: Iterable[Path]) -> Governance:
-    """Return the governance of the enclaves of an export, after verifying each enclave's.
+    """Return the governance of an export's enclaves, after verifying the document of each enclave.
 
     Raises:
         DocumentError: enclaves have different governances, or an enclave lacks a file without
@@ -434,7 +434,7 @@ def _trusts(
             CA, of which OpenSSL takes one: it is uncertain what is revoked.
     """
 
-    @lru_cache(maxsize=8)  # most enclaves have the same files
+    @lru_cache(maxsize=8)  # most enclaves have the same files, so this is cached
     def trust(pem: bytes, own_list: bytes | None) -> Trust:
         authorities = load_certificates(pem, IDENTITY_CA_FILE)
         keys = [(authority, key_digest(authority.public_key())) for authority in authorities]  # type: ignore[arg-type]

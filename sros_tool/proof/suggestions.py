@@ -126,7 +126,7 @@ class _Stated:
         self.wild: dict[str, set[str]] = defaultdict(set)
         for right in rights:
             if right.kind == "dds" or expression_problem(right.name):
-                continue  # permissions of others may have any text
+                continue  # permissions that others wrote may have any text
             if is_expression(right.name):
                 self.wild[right.right].add(right.name)
             else:
@@ -153,7 +153,8 @@ def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Req
 def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
     """Yield a requirement for each up to three enclaves that alone use the same names.
 
-    What moves the robot has one for any number of enclaves, and also if nobody is known to receive.
+    Names that move the robot get a requirement for any number of enclaves, even without a known
+    receiver.
     """
     other = OTHER_SIDE[right]
     names: dict[tuple[str, ...], list[str]] = defaultdict(list)

@@ -91,9 +91,9 @@ class System:
     """The worlds of a policy or keystore.
 
     ``file`` is its path, ``rights`` are the allowed rights as it states them, and ``places`` tells
-    where it states them.  ``is_export`` says that it is an export, which may lack enclaves of its
-    keystore.  ``left_out`` is the reason why there is no Zenoh world, if Zenoh
-    cannot enforce the policy.  ``fleet`` returns the robots of the policy or keystore, or None.
+    where the rights are stated.  ``is_export`` says that it is an export, which may lack enclaves
+    of its keystore.  ``left_out`` is the reason why there is no Zenoh world, if Zenoh cannot
+    enforce the policy.  ``fleet`` returns the robots of the policy or keystore, or None.
     """
 
     file: str
@@ -426,7 +426,7 @@ def _keystore_system(keystore: OpenedKeystore, at: Circumstances) -> System:
                 continue
             if now is None:
                 idle.append(name)
-            # Those who read and write enforce rights by their governance, too.
+            # Readers and writers also enforce rights by their own governance.
             possible = (
                 _without_faults(enclave, grants.get(name, ()), document) for document in documents
             )
@@ -444,7 +444,7 @@ def _keystore_system(keystore: OpenedKeystore, at: Circumstances) -> System:
             )
         )
     for first in range(0, len(worlds), len(domains)):
-        _link_domains(worlds[first : first + len(domains)])  # those of one vendor
+        _link_domains(worlds[first : first + len(domains)])  # the worlds of one vendor
     if _ZENOH in at.vendors or (not at.vendors and has_zenoh_files(root, hidden=True)):
         on_zenoh = list(_zenoh_worlds(keystore, at.domain, stated))
         _link_domains(on_zenoh)
@@ -489,7 +489,7 @@ def _later_moments(name: str, grants: Iterable[Grant], moment: datetime) -> tupl
     """
     validities = []
     for grant in grants:
-        with suppress(UsageError):  # it ends before it begins
+        with suppress(UsageError):  # a validity that ends before it begins
             validities.append(grant.validity)
     later = (validity for validity in validities if moment < validity.not_before)
     moments = {
@@ -511,8 +511,8 @@ def _zenoh_worlds(
     """Yield the worlds of Zenoh, one for each domain.
 
     Only rules that other processes enforce on a session count, because a session can ignore its
-    own.  The routers that the settings name are part of the network, and no enclaves that a
-    requirement is about: they may pass on what their enclaves may send.
+    own.  Routers in the settings are part of the network, but requirements are not about them: they
+    may pass on what their enclaves may send.
 
     Raises:
         KeystoreError: there are no Zenoh configurations, or it is unclear what they enforce.

@@ -172,8 +172,8 @@ def _planned_files(policy: Policy, at: Circumstances) -> DecidedFiles:
 class UpgradeFindings(NamedTuple):
     """The findings on an update, and numbers of enclaves.
 
-    ``compared`` is the number of compared enclaves; ``enclaves`` also counts those that are for the
-    later distribution already.
+    ``compared`` is the number of compared enclaves; ``enclaves`` also counts enclaves that are for
+    the later distribution already.
     """
 
     findings: list[Finding]

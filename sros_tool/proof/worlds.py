@@ -224,7 +224,7 @@ class Side:
         for automaton, enclaves in self._wild.items():
             if automaton.may_meet(own_automaton):
                 met.update(enclaves)
-        limit.spend(len(met))  # they are kept
+        limit.spend(len(met))  # they are cached
         return frozenset(met)
 
     def users_of(self, topic: str) -> list[str]:
@@ -315,8 +315,8 @@ class World:
         are none.  ``demanded`` are the topics whose protection a policy demands, while the
         protection of all others is assumed; None if nothing is assumed.  ``needed`` are topics that
         every node has to write (True) and read (False).  ``idle`` are enclaves in which no process
-        starts with their files as they are: they may do what their rights give, but are able to do
-        nothing.  ``fitting_others`` maps an enclave to others whose permissions it can use as well.
+        starts with their files as they are: they count as allowed to use their rights, but not as
+        able to.  ``fitting_others`` maps an enclave to others whose permissions it can use as well.
         These count for what it may do, but not for what it must be able to do.  ``crossing`` is
         what passes between several Zenoh routers; None if all enclaves reach each other.
         ``open_topics`` are the topics that processes without an identity may write and read, or
@@ -468,7 +468,7 @@ class World:
     def shared_topic(
         self, writer: str, reader: str, written: NameSet, limit: SearchLimit
     ) -> str | None:
-        """Return a topic in ``written`` that the reader may read and that gets to it, or None.
+        """Return a topic in ``written`` that the reader may read and that reaches it, or None.
 
         ``written`` has to depend on the writer only.
         """

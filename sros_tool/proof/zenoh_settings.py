@@ -1,4 +1,4 @@
-"""Compare two sets of Zenoh configurations: which settings of the new ones permit more.
+"""Compare two sets of Zenoh configurations: find settings of the new set that permit more.
 
 Access-control rules are compared elsewhere.  A setting with an unknown effect is never ignored: it
 is reported as not compared, so that the result cannot be "nothing new".  Source of the settings:
@@ -204,7 +204,7 @@ def _changes(
                 setting == plugin or setting.startswith(f"{plugin}/") for setting in after.settings
             )
             if values[0] != values[1] and not gone and expression.fullmatch(path):
-                # The values may be secrets.
+                # The values are not shown, because they may be secrets.
                 words = ("missing" if value is None else "stated" for value in values)
                 old_word, new_word = words
                 yield (

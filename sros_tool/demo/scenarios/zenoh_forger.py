@@ -161,7 +161,7 @@ def _add_far_router(copy: KeystoreCopy, crossing: str) -> None:
                 for endpoint in endpoints
             ]
 
-    # The second host is this one: its router has another port.
+    # The second host is this machine, so its router needs another port.
     _edit_all(copy, listen_here)
     _edit(enclave_path(copy.root, FAR_ROUTER) / ROUTER_FILE, listen_here)
 
@@ -254,7 +254,7 @@ def tokens_of_any_name(copy: KeystoreCopy) -> None:
 
     def of_enclave(key: str) -> str:
         chunks = key.split("/")
-        enclave = chunks[6] if len(chunks) > 6 else ""  # Otherwise it is what all may see.
+        enclave = chunks[6] if len(chunks) > 6 else ""  # else a key that all may see
         return f"@ros2_lv/{copy.domain}/*/*/*/*/{enclave}/**" if enclave else key
 
     _widen_tokens(copy, of_enclave)
@@ -286,7 +286,7 @@ def earlier_session_file(copy: KeystoreCopy) -> None:
 
 
 def earlier_session_file_of_one_that_limits_itself(copy: KeystoreCopy) -> None:
-    """Put back the guest's earlier file where every session enforces only its own rights."""
+    """Put back the guest's earlier file; each session enforces only its own rights."""
     earlier = json.loads(_session_file_of_earlier_policy(copy))
     sessions_that_limit_themselves(copy)
     _give_rights_to_everybody(copy.router)(earlier)
@@ -335,7 +335,7 @@ def without_certificate(copy: KeystoreCopy) -> None:
     def change(document: _Document) -> None:
         _tls(document)["enable_mtls"] = False
         document["listen"]["endpoints"] = []
-        # Nobody can connect to it: so it has to connect, whichever id is greater.
+        # The talker does not listen, so it has to connect, whichever id is greater.
         gossip = document["scouting"]["gossip"]
         gossip["autoconnect_strategy"]["peer"]["to_peer"] = "always"
 
@@ -501,7 +501,7 @@ def zenoh_variables(
 ) -> Mapping[str, str]:
     """Return the variables with which rmw_zenoh uses the files of an enclave as they are written.
 
-    A process that ``ignores_rules`` does not enforce its own file.  One without a key shows no
+    A process that ``ignores_rules`` does not enforce its own file. A process without a key shows no
     certificate.
     """
     folder = enclave_path(root, enclave).absolute()
@@ -511,7 +511,7 @@ def zenoh_variables(
     variables = zenoh_environment(places, *files)
     override = variables[OVERRIDE]
     if not (folder / KEY_FILE).exists():
-        override, _, _ = override.partition(";")  # the CA comes first
+        override, _, _ = override.partition(";")  # only the CA, which comes first
     if ignores_rules:
         override = f"{override};{_WITHOUT_RULES}"
     return {**variables, DOMAIN: str(domain), OVERRIDE: override}
