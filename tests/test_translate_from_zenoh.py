@@ -17,11 +17,11 @@ from sros_tool.policy.model import ALLOW
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Rules, folded, policy_rights
 from sros_tool.translate_zenoh.rights import (
-    RightsBehindRules,
+    RightsOfSubject,
     name_of_key,
     policy_of,
     remote_rights,
-    rights_behind,
+    rights_of_subjects,
 )
 from sros_tool.zenoh.access import AccessControl, Flow, Message, Remote
 from sros_tool.zenoh.configuration import Configuration, Mode
@@ -36,8 +36,8 @@ MANY = 500 if LONG else 40
 """How many key expressions a rule may have here: reading back more of them may be refused."""
 
 
-def behind(document: str) -> tuple[RightsBehindRules, ...]:
-    return rights_behind(parse_configuration(document.encode(), "file.json5"))
+def behind(document: str) -> tuple[RightsOfSubject, ...]:
+    return rights_of_subjects(parse_configuration(document.encode(), "file.json5"))
 
 
 def rules(*stated: dict[str, Any], mode: str = "router", default: str = "deny") -> str:
@@ -142,7 +142,7 @@ def test_the_shipped_policies_come_back(policy: Path, tmp_path: Path) -> None:
     written = Configuration(
         Mode.ROUTER, ("tls/a:1",), (), AccessControl(tuple(remotes.values()))
     ).render()
-    found = rights_behind(parse_configuration(written, "router.json5"))
+    found = rights_of_subjects(parse_configuration(written, "router.json5"))
     assert not [one for each in found for one in each.rights if one.lacks]
     back = policy_of(found)
     (tmp_path / "back.xml").write_bytes(policy_xml(back))
@@ -167,7 +167,7 @@ def test_random_policies_come_back_without_more_rights() -> None:
         if any(len(each.key_expressions) > MANY for each in control.remotes[0].rules):
             continue  # denials inside of wildcards
         written = Configuration(Mode.ROUTER, ("tls/a:1",), (), control).render()
-        (found,) = rights_behind(parse_configuration(written, "router.json5"))
+        (found,) = rights_of_subjects(parse_configuration(written, "router.json5"))
         for name, (right, use) in product(NAMES, USES.items()):
             told = any(each.right == right and matches(each.name, name) for each in found.rights)
             allows = control.allows("/e", *use, f"0{name}/{TYPE}")
@@ -196,7 +196,7 @@ def test_random_rules_give_no_more_than_zenoh_decides() -> None:
             document = parse_configuration(rules(*stated).encode(), "drawn")
         except DocumentError:  # not canonical
             continue
-        (found,) = rights_behind(document)
+        (found,) = rights_of_subjects(document)
         for name in NAMES:
             if any(each.right == "publish" and matches(each.name, name) for each in found.rights):
                 told += 1

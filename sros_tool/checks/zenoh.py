@@ -10,7 +10,7 @@ from typing import Annotated, NamedTuple
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.errors import DocumentError
 from sros_tool.policy.patterns import ComparisonLimit
-from sros_tool.translate_zenoh.rights import RightsBehindRules, is_self_limiting
+from sros_tool.translate_zenoh.rights import RightsOfSubject, is_self_limiting
 from sros_tool.values import DryRun, FileChange, Notes, Words
 from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
@@ -573,13 +573,13 @@ class ReadConfiguration(NamedTuple):
     notes: Notes
 
 
-def subject_rights(rights_behind: RightsBehindRules) -> SubjectRights:
+def subject_rights(of_subject: RightsOfSubject) -> SubjectRights:
     """Return the rights of a subject as the JSON output has them."""
     return SubjectRights(
-        rights_behind.subject or None,
-        rights_behind.names,
-        rights_behind.self_limiting,
-        [AllowedName(VERBS[r.right], r.name, r.domain, r.lacks) for r in rights_behind.rights],
-        unsaid=[KeyRight(VERBS[right], key) for right, key in rights_behind.unsaid],
-        denied=[KeyRight(VERBS[right], key) for right, key in rights_behind.denied],
+        of_subject.subject or None,
+        of_subject.names,
+        of_subject.self_limiting,
+        [AllowedName(VERBS[r.right], r.name, r.domain, r.lacks) for r in of_subject.rights],
+        unsaid=[KeyRight(VERBS[right], key) for right, key in of_subject.unsaid],
+        denied=[KeyRight(VERBS[right], key) for right, key in of_subject.denied],
     )

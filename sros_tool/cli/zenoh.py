@@ -33,7 +33,7 @@ from sros_tool.wording import counted, first_few
 
 if TYPE_CHECKING:
     from sros_tool.keystore.template import Template
-    from sros_tool.translate_zenoh.rights import RightsBehindRules
+    from sros_tool.translate_zenoh.rights import RightsOfSubject
     from sros_tool.zenoh.configuration import ZenohNetwork
     from sros_tool.zenoh.document import ConfigurationDocument
 
@@ -304,14 +304,14 @@ def _show_from(
     from sros_tool.checks.kind import ERROR, WARNING
     from sros_tool.checks.zenoh import ReadConfiguration, document_findings, subject_rights
     from sros_tool.policy.document import policy_xml
-    from sros_tool.translate_zenoh.rights import policy_of, rights_behind
+    from sros_tool.translate_zenoh.rights import policy_of, rights_of_subjects
     from sros_tool.xml import read_bytes
     from sros_tool.zenoh.document import parse_configuration
 
     if output:
         check_output(output, force=force)
     document = parse_configuration(read_bytes(file, "Zenoh configuration"), str(file))
-    rights = rights_behind(document)
+    rights = rights_of_subjects(document)
     findings = sorted(
         document_findings(document),
         key=lambda finding: (-finding.severity.weight, finding.line or 0),
@@ -360,7 +360,7 @@ def _show_from(
 
 
 def _configuration_lines(
-    document: ConfigurationDocument, subjects: Sequence[RightsBehindRules]
+    document: ConfigurationDocument, subjects: Sequence[RightsOfSubject]
 ) -> Iterator[str]:
     from sros_tool.checks.zenoh import VERBS
 
@@ -393,7 +393,7 @@ def _kind(document: ConfigurationDocument) -> str:
     return mode if mode == "router" else f"session (mode {mode})"
 
 
-def _subject_text(rights: RightsBehindRules) -> str:
+def _subject_text(rights: RightsOfSubject) -> str:
     if rights.self_limiting:
         return f"the process itself ({rights.subject})"
     if rights.names is None:
@@ -401,7 +401,7 @@ def _subject_text(rights: RightsBehindRules) -> str:
     return first_few(rights.names, _MOST_KEYS)
 
 
-def _why_no_policy(subjects: Sequence[RightsBehindRules]) -> str:
+def _why_no_policy(subjects: Sequence[RightsOfSubject]) -> str:
     """Return a sentence on the subjects that have rights but are not enclaves."""
     strangers = [_subject_text(rights) for rights in subjects if rights.rights]
     if not strangers:
@@ -412,7 +412,7 @@ def _why_no_policy(subjects: Sequence[RightsBehindRules]) -> str:
     )
 
 
-def _untranslatable_notes(subjects: Sequence[RightsBehindRules]) -> Iterator[Note]:
+def _untranslatable_notes(subjects: Sequence[RightsOfSubject]) -> Iterator[Note]:
     """Yield notes about what the rules allow or deny but the policy does not state."""
     from sros_tool.translate_zenoh.rights import enclave_of
 

@@ -80,10 +80,10 @@ from sros_tool.zenoh.delivery import (
     Delivery,
     Route,
     ZenohProcess,
-    deliver_query,
-    deliver_sample,
-    deliver_token,
+    query_delivery,
     route,
+    sample_delivery,
+    token_delivery,
 )
 from sros_tool.zenoh.document import ZenohEndpoint, parse_configuration
 from sros_tool.zenoh.key_expressions import includes
@@ -682,13 +682,13 @@ class ZenohEvaluator:
         key = key or f"{self.domain}{right.name}/{ANY_TYPE}"
         match right.right:
             case "publish":
-                return deliver_sample(route, key)
+                return sample_delivery(route, key)
             case "subscribe":
-                return deliver_sample(route[::-1], key)
+                return sample_delivery(route[::-1], key)
             case "request":
-                return deliver_query(route, key)
+                return query_delivery(route, key)
             case _:
-                return deliver_query(route[::-1], key)
+                return query_delivery(route[::-1], key)
 
     def _graph_deliveries(
         self, process: ZenohProcess, other: ZenohProcess
@@ -704,7 +704,7 @@ class ZenohEvaluator:
             access.allowed_keys(process.name, *announcing),
             lambda key: access.decide(Remote(process.name), *announcing, key).allowed,
         )
-        return deliver_token((process, other), node, whole_domain), deliver_token(
+        return token_delivery((process, other), node, whole_domain), token_delivery(
             (other, process), whole_domain, whole_domain
         )
 

@@ -1,13 +1,14 @@
 """Graph tokens of rmw_zenoh: what a node may announce by its rights, and under which names.
 
 A node, publisher, subscription, server or client is announced by a liveliness token
-``@ros2_lv/DOMAIN/SESSION/NODE/ENTITY/KIND/ENCLAVE/NAMESPACE/NAME[/TOPIC/TYPE/HASH/QOS]``, each name
-with ``%`` for ``/`` (ros2/rmw_zenoh, docs/design.md).  A process removes an undeclared entity from
-its graph by session, node, namespace and name, and ignores the enclave (graph_cache.cpp).  So a
-rule has to check all names in a token.
+``@ros2_lv/DOMAIN/SESSION/NODE/ENTITY/KIND/ENCLAVE/NAMESPACE/NAME[/TOPIC/TYPE/HASH/QOS]``, in which
+names have ``%`` for ``/`` (ros2/rmw_zenoh, docs/design.md).  A process removes an undeclared entity
+from its graph by session, node, namespace and name, and ignores the enclave (graph_cache.cpp).  So
+a rule has to check all names in a token.
 
-A name is one chunk of a token, so ``$*`` means there what ``*`` means in ROS.  A denial is exact,
-too: a process takes wildcards in a token literally, as a name that no node or topic has.
+A name is one chunk of a token, so in a token ``$*`` means the same as ``*`` in ROS.  A denial is
+exact, too, because processes do not read wildcards in a token as such, but as a name that no node
+or topic has.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from sros_tool.zenoh.key_expressions import (
 GRAPH = "@ros2_lv"
 _NODE, _NAME = "NN", 9
 _KINDS = {"publish": "MP", "subscribe": "MS", "reply": "SS", "request": "SC"}
-"""The kind of entity that a right lets a node announce, as tokens write it."""
+"""Maps a right to the kind of entity that it lets a node announce, as written in tokens."""
 _MOST_TOKENS = 4096
 """Maximum number of key expressions for the tokens of one right of an enclave."""
 _EVERY_KIND = "*"
@@ -50,13 +51,13 @@ _ANNOUNCING = (Message.LIVELINESS_TOKEN,)
 _ASKING = (Message.LIVELINESS_QUERY, Message.DECLARE_LIVELINESS_SUBSCRIBER)
 _ANY_NODE = NodeName("*", "*")
 _LETTER = "[a-zA-Z0-9_]"
-"""Any character of a ROS name."""
+"""Matches any character of a ROS name."""
 
 
 class AnnouncedNodes(NamedTuple):
-    """The nodes that an enclave may announce, without those in ``denied``.
+    """The nodes that an enclave may announce: ``allowed`` without ``denied``.
 
-    A node is written as in its token: ``DOMAIN/NAMESPACE/NAME``, with ``%`` for ``/`` in a name.
+    A node is written as in a token: ``DOMAIN/NAMESPACE/NAME``, with ``%`` for ``/`` in names.
     """
 
     allowed: tuple[str, ...]
@@ -64,7 +65,7 @@ class AnnouncedNodes(NamedTuple):
 
 
 def announced_nodes(rules: Iterable[AccessRule], enclave: str) -> AnnouncedNodes:
-    """Return the nodes that an enclave may announce by rules of `graph_rules`."""
+    """Return the nodes that an enclave may announce by the rules that `graph_rules` returned."""
     nodes: dict[bool, list[str]] = {True: [], False: []}
     for rule in rules:
         if rule.messages == _ANNOUNCING:
@@ -79,9 +80,10 @@ def announced_nodes(rules: Iterable[AccessRule], enclave: str) -> AnnouncedNodes
 def announced_names(
     rules: Iterable[AclRule], enclave: str, domain: int, right: str
 ) -> dict[bool, tuple[str, ...]]:
-    """Return the names that rules of `graph_rules` allow (True) and deny to nodes of an enclave.
+    """Return the names that rules of `graph_rules` allow (True) and deny (False) to an enclave.
 
-    These are the names of topics or services for which the enclave has the right.
+    These are the names of the topics or services to which the enclave has the ``right`` in a
+    ``domain``.
     """
     names: dict[bool, dict[str, None]] = {True: {}, False: {}}
     begin, of_right = [GRAPH, str(domain)], [_KINDS[right], _part(enclave)]
@@ -94,18 +96,18 @@ def announced_names(
 
 
 def _named(part: str) -> str:
-    """Return the ROS name that a token writes as ``part``."""
+    """Return the ROS name for a chunk of a token, the inverse of `_part`."""
     return part.replace(ANY_PART, "*").replace("%", "/")
 
 
 def nodes_in_rules(rules: Iterable[AccessRule], enclave: str) -> tuple[NodeName, ...]:
-    """Return the nodes that rules of `graph_rules` allow to an enclave; denials are ignored."""
+    """Return the nodes that rules of `graph_rules` let an enclave announce, ignoring denials."""
     nodes = map(_node_of, announced_nodes(rules, enclave).allowed)
     return tuple(dict.fromkeys(nodes))
 
 
 def _node_of(place: str) -> NodeName:
-    """Return the node that a token writes as ``DOMAIN/NAMESPACE/NAME``."""
+    """Return the node that tokens write as ``DOMAIN/NAMESPACE/NAME``."""
     _, ns, name = map(_named, place.split("/"))
     return NodeName(ns, name)
 
@@ -113,13 +115,13 @@ def _node_of(place: str) -> NodeName:
 def graph_rules(
     enclave: str, domain: int, rights: Iterable[Right], nodes: Iterable[NodeName]
 ) -> Iterator[AccessRule]:
-    """Yield the rules for the graph tokens of processes of an enclave.
+    """Yield the rules for the graph tokens of an enclave's processes.
 
-    The processes may see all tokens.  For their enclave they may announce ``nodes``, the nodes
-    whose own services (such as set_parameters) they may offer, and the topics and services in
-    ``rights``.  If there is no such node, they may announce any node.  A node does not count if all
-    its own services are denied.  The expression for seeing tokens is exactly the one that rmw_zenoh
-    asks for.
+    The processes may see all tokens.  With their own enclave, they may announce the topics and
+    services in ``rights``, the nodes in ``nodes``, and the nodes whose own services (such as
+    set_parameters) they may offer.  Such a node does not count if all its own services are denied.
+    Without any such node, they may announce any node.  The expression for seeing tokens is exactly
+    the one that rmw_zenoh asks for.
     """
     rights, nodes = tuple(rights), tuple(nodes)
     offering, without = nodes_of_rights(rights), denied_nodes(rights)
@@ -127,7 +129,7 @@ def graph_rules(
     known = dict.fromkeys((*nodes, *left))
     tokens = _Tokens(enclave, domain, known if known or offering else [_ANY_NODE])
     allowed, denied = tokens.of(rights)
-    # A node of ``nodes`` stays, unless the denial is needed for others.
+    # A denial is left out if it only concerns nodes in ``nodes``, which may be announced.
     denied += tokens.of_nodes_and_endpoints(
         [
             denial
@@ -159,7 +161,7 @@ class _Tokens:
         }
 
     def of(self, rights: Iterable[Right]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return two tuples of key expressions: allowed tokens, and denied exceptions."""
+        """Return two tuples of key expressions: allowed tokens, and denied ones among them."""
         sides: dict[bool, dict[str, dict[str, None]]] = {True: {}, False: {}}
         for _, qualifier, right, name in rights:
             sides[qualifier is ALLOW].setdefault(right, {})[name] = None
@@ -186,9 +188,9 @@ class _Tokens:
         return tuple(allowed), tuple(denied)
 
     def of_nodes_and_endpoints(self, nodes: Sequence[NodeName]) -> tuple[str, ...]:
-        """Return key expressions for nodes, and for all endpoints that these nodes could have."""
+        """Return key expressions for nodes, and for all endpoints that these nodes can have."""
         named = (
-            # "$*" may stand for nothing: "/*" must not become the namespace "/", too.
+            # "$*" can match nothing, but the namespace "/*" does not include the namespace "/".
             NodeName(f"/{_LETTER}*", node.name)
             if node.ns == "/*" and NodeName("/", node.name) not in nodes
             else node
@@ -197,7 +199,7 @@ class _Tokens:
         return tuple(self._key(_EVERY_KIND, place, ANY_CHUNKS) for place in _token_names(named))
 
     def _announced(self, right: str, names: Mapping[str, None]) -> list[str]:
-        """Return key expressions for the tokens of names, for each node that may use the name."""
+        """Return key expressions for the tokens of names, for each node that may use a name."""
         parts = [part for name in names for part in _parts(name)]
         owners = {part: self._owner(right, part) for part in parts}
         everybody = self._nodes
@@ -210,7 +212,7 @@ class _Tokens:
         ]
 
     def _owner(self, right: str, part: str) -> str:
-        """Return the node that a service such as set_parameters belongs to; "" for other names."""
+        """Return the node to which a service such as set_parameters belongs; "" for other names."""
         node, _, service = part.rpartition("%")
         return self._of_names.get(node, "") if right == "reply" and service in NODE_SERVICES else ""
 
@@ -219,17 +221,18 @@ class _Tokens:
 
 
 def _listed_expressions(name: str) -> list[str]:
-    """Return expressions with ``*`` as only wildcard; a single wider one if there are too many."""
+    """Return expressions in which ``*`` is the only wildcard; one wider expression if too many."""
     try:
         return listed_expressions(name, _MOST_TOKENS)
-    except TooManyNames:  # the keys of the name cannot be listed either, and are refused
+    # The keys of such a name cannot be listed either, so the right is refused elsewhere.
+    except TooManyNames:
         return []
 
 
 def _parts(name: str) -> tuple[str, ...]:
-    """Return the token chunks that match a name.
+    """Return the token chunks that together match a name.
 
-    There are two if the name begins with ``*/``, because the star can match nothing.
+    There are two chunks if the name begins with ``*/``, because the star can match nothing.
     """
     if name.startswith("*"):
         rest = name.lstrip("*")
@@ -238,7 +241,7 @@ def _parts(name: str) -> tuple[str, ...]:
 
 
 def _token_names(nodes: Iterable[NodeName]) -> tuple[str, ...]:
-    """Return namespace and name of nodes in the form that tokens have."""
+    """Return the namespaces and names of nodes as written in tokens."""
     places = (
         f"{_part(ns)}/{_part(name)}"
         for node in nodes
@@ -250,7 +253,7 @@ def _token_names(nodes: Iterable[NodeName]) -> tuple[str, ...]:
 
 
 def _part(name: str) -> str:
-    """Return a name in the form that tokens have: ``%`` for ``/``."""
+    """Return a name as written in tokens, with ``%`` for ``/``."""
     return canonical((name.replace("/", "%").replace("*", ANY_PART) or "%",))
 
 
@@ -258,14 +261,14 @@ def _part(name: str) -> str:
 
 
 class SharedNodes(NamedTuple):
-    """Nodes that several enclaves may announce: each can remove the others' from the graph."""
+    """Nodes that several enclaves may announce; each can remove those of the others."""
 
     enclaves: tuple[str, ...]
-    """The enclaves that may announce all of these nodes."""
+    """The enclaves that may announce all nodes in `nodes`."""
     others: tuple[str, ...]
-    """Enclaves that may announce some of these nodes."""
+    """Other enclaves, which may announce some of the nodes."""
     nodes: tuple[str, ...]
-    """Full names of the nodes, perhaps with wildcards."""
+    """The full names of the nodes, perhaps with wildcards."""
 
     def __str__(self) -> str:
         """Return a clause about the first enclave: ``it may announce node /n, and so may /b``."""
@@ -332,7 +335,7 @@ def _is_wide(node: str) -> bool:
 
 
 def _included_nodes(nodes: AnnouncedNodes, in_order: Sequence[str]) -> Iterator[str]:
-    """Yield the nodes without wildcards in ``in_order`` that ``nodes`` include."""
+    """Yield the nodes without wildcards in ``in_order`` that are in the set ``nodes``."""
     never = KeyExpressions(nodes.denied)
     for wide in nodes.allowed:
         begin = _begin(wide)
@@ -344,7 +347,7 @@ def _included_nodes(nodes: AnnouncedNodes, in_order: Sequence[str]) -> Iterator[
 
 
 def _with_the_same_beginning(groups: Sequence[AnnouncedNodes]) -> Mapping[int, set[int]]:
-    """Map the number of each group to later groups whose nodes may begin with the same text."""
+    """Map the index of each group to the later groups whose nodes may begin with the same text."""
     begins = sorted(
         {(_begin(node), at) for at, nodes in enumerate(groups) for node in nodes.allowed}
     )
@@ -365,12 +368,12 @@ def _have_common(first: AnnouncedNodes, second: AnnouncedNodes) -> bool:
 
 
 def _begin(node: str) -> str:
-    """Return the text before the first wildcard, with which every included node begins."""
+    """Return the text of an expression before the first wildcard."""
     return node.partition("*")[0].rstrip("$")
 
 
 def _full_names(nodes: Iterable[str]) -> tuple[str, ...]:
-    """Return the full names of nodes, without those that wildcards of others cover."""
+    """Return the full names of nodes, without nodes that another one's wildcards include."""
     parts = map(_node_of, nodes)
     names = dict.fromkeys("/".join((ns.rstrip("/").removeprefix("*"), name)) for ns, name in parts)
     return tuple(
@@ -387,9 +390,9 @@ def example_token(
     key_expressions: Iterable[str],
     passes: Callable[[str], bool] = lambda _: True,
 ) -> str:
-    """Return an example of a node's token for an enclave, if possible a token that may pass.
+    """Return an example of an enclave's node token, if possible one that may pass.
 
-    Such a token is included in ``key_expressions``, and ``passes`` returns True for it.
+    A token may pass if ``key_expressions`` include it and ``passes`` returns True for it.
     """
     begin = f"{GRAPH}/{domain}/"
     places = [
@@ -414,9 +417,9 @@ def example_token(
 
 
 def _wildcard_like(name: str, part: str) -> str:
-    """Return an example of what a chunk of a liveliness token's key expression matches.
+    """Return an example that matches a chunk of the key expression of a token.
 
-    The example is ``name`` if the chunk ``part`` is only a wildcard, else the chunk without its
-    wildcards.
+    The example is ``name`` if the chunk ``part`` is only a wildcard; otherwise it is the chunk
+    without its wildcards.
     """
     return name if part == "*" else part.replace(ANY_PART, "")

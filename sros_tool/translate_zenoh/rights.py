@@ -1,10 +1,10 @@
 """Translation between ROS policies and Zenoh access control, without adding or losing rights.
 
-`translate` does the same for DDS.  Key expressions, messages and tokens are those of
-rmw_zenoh (ros2/rmw_zenoh, docs/design.md).  `rights_in_rules` reads back the rules that
-sros writes.  For other rules its result can be too wide, because a ROS ``*`` also matches slashes;
-it is never too narrow.  `rights_behind` reads the rules of others: a name is in its result only if
-the rules allow every key of that name.
+`translate` does the same for DDS.  Key expressions, messages and tokens are those of rmw_zenoh
+(ros2/rmw_zenoh, docs/design.md).  `rights_in_rules` reads back the rules that sros writes.  For
+rules that sros did not write, its result can be too wide, because a ROS ``*`` also matches slashes,
+but it is never too narrow.  `rights_of_subjects` reads rules that sros did not write: a name is in
+its result only if the rules allow every key of this name.
 """
 
 from __future__ import annotations
@@ -73,21 +73,21 @@ from sros_tool.zenoh.subtraction import (
 )
 
 _TYPE = ("$*::$*", "*")
-"""The type and its hash, with which the keys of topics and services end: rules do not check them.
+"""The type and its hash at the end of the keys of topics and services; rules do not check them.
 
-Every type has "::" and no part of a ROS name does.  So a wildcard in a name never matches into the
-type: keys below the key of another name are not keys of this name.
+Every type contains "::", which no part of a ROS name contains.  So a wildcard in a name never
+matches a part of the type, and keys below the key of one name are never keys of another name.
 """
 _IN_TYPES = "::"
 _UNTYPED = ("*", "*")
-"""Type and hash in rules that sros did not write."""
+"""The type and its hash in rules that sros did not write."""
 ANY_TYPE = "any::type/hash"
-"""An example of a type and its hash: the rules of sros decide the same for every type."""
+"""An example of a type and its hash; the rules of sros decide alike for all types."""
 _BELOW_TOPICS = (ANY_CHUNKS,) if any(release.below_topics for release in RELEASES) else ()
 _BELOW = {"publish": _BELOW_TOPICS, "subscribe": _BELOW_TOPICS}
-"""Chunks that a release of rmw_zenoh adds to the keys of a right, by right."""
+"""Maps a right to the chunks that some release of rmw_zenoh adds to its keys."""
 _ADVANCED = f"@adv/{ANY_CHUNKS}"
-"""Further keys of a topic with history (TRANSIENT_LOCAL), below its key."""
+"""The end of the keys for the history of a topic (TRANSIENT_LOCAL), below the topic's key."""
 _M = Message
 _IN, _OUT = Flow.INGRESS, Flow.EGRESS
 _DATA, _HISTORY = False, True
@@ -115,21 +115,24 @@ _MESSAGES: dict[str, tuple[tuple[Flow, tuple[Message, ...], bool], ...]] = {
         (_OUT, (_M.QUERY,), _DATA),
     ),
 }
-"""The messages of each right, from the view of the process that enforces it.
+"""The messages of each right, from the view of the process that enforces the right.
 
-The messages are on the key of the name, or (`_HISTORY`) on the keys of its history.
+The messages are on the key of the name, or with `_HISTORY`, on the keys of its history.
 """
 
 
 class StatedRight(NamedTuple):
-    """A right to one topic or service, or its denial, with the place that states it."""
+    """A right to one topic or service, or a denial of it, with the place that states it."""
 
     right: Right
     source: Source
 
 
 def stated_rights(enclave: Enclave) -> tuple[StatedRight, ...]:
-    """Return the rights of an enclave with absolute names, each action as its parts."""
+    """Return the rights of an enclave with absolute names, with actions as their parts.
+
+    The parts of an action are its topics and services.
+    """
     return tuple(
         StatedRight(part, placed.source)
         for placed in placed_rights(enclave)
@@ -138,7 +141,7 @@ def stated_rights(enclave: Enclave) -> tuple[StatedRight, ...]:
 
 
 def remote_rights(enclave: Enclave, domain: int) -> RemoteRights:
-    """Return the rights that a process gives processes of ``enclave`` in a ROS domain.
+    """Return the rights that a process gives to the processes of ``enclave`` in a ROS domain.
 
     `remote_of` does the same for several domains.
     """
@@ -150,16 +153,17 @@ def remote_of(
     stated_rights: Mapping[int, Sequence[StatedRight]],
     nodes: Collection[NodeName] = (),
 ) -> RemoteRights:
-    """Return the rights that every process gives to processes of an enclave.
+    """Return the rights that every process gives to the processes of an enclave.
 
-    ``stated_rights`` maps ROS domains to the enclave's rights.  The result includes the graph
-    tokens, which every node needs; `graph_rules` says which ``nodes`` the enclave may announce.
+    ``stated_rights`` maps ROS domains to the enclave's rights.  ``nodes`` are nodes that the
+    enclave may announce (`graph_rules`).  The result includes the graph tokens, which every node
+    needs.
 
     Raises:
-        PolicyError: Zenoh rules cannot express a right; the text names the place.
+        PolicyError: Zenoh rules cannot express a right; the error names the place of the right.
     """
     rules: list[AccessRule] = []
-    made_of: dict[tuple[Flow, tuple[Message, ...]], list[Difference]] = {}
+    differences: dict[tuple[Flow, tuple[Message, ...]], list[Difference]] = {}
     for domain, rights in stated_rights.items():
         of_names = [named.right for named in rights]
         rules += graph_rules(enclave, domain, of_names, nodes)
@@ -169,12 +173,14 @@ def remote_of(
                 rules.append(AccessRule(flow, messages, below if history else keys))
                 if difference:
                     of = difference.keys_below(_ADVANCED) if history else difference
-                    made_of.setdefault((flow, messages), []).append(of)
-    return RemoteRights(enclave, joined(rules), {place: tuple(of) for place, of in made_of.items()})
+                    differences.setdefault((flow, messages), []).append(of)
+    return RemoteRights(
+        enclave, joined(rules), {place: tuple(of) for place, of in differences.items()}
+    )
 
 
 def domains_of(control: AccessControl) -> set[int]:
-    """Return the ROS domains in which processes may ask for graph tokens, as all nodes do."""
+    """Return the ROS domains in which processes may ask for graph tokens, which all nodes do."""
     asked = {
         tuple(key.split("/"))
         for remote in control.remotes
@@ -186,9 +192,9 @@ def domains_of(control: AccessControl) -> set[int]:
 
 
 def stated_names(rules: Iterable[AccessRule]) -> list[tuple[str, str]]:
-    """Return pairs of a right and a name that rules of `remote_of` state, sorted.
+    """Return the pairs of a right and a name that rules of `remote_of` state, sorted.
 
-    A name with wildcards is returned as Zenoh writes it.
+    Names with wildcards are written as in Zenoh.
     """
     marks = {of[0][:2]: right for right, of in _MESSAGES.items()}
     return sorted(
@@ -202,17 +208,18 @@ def stated_names(rules: Iterable[AccessRule]) -> list[tuple[str, str]]:
 
 
 def _name_in(key: str) -> str:
-    """Return the name in the key expression of a right; domain, type and hash are left out."""
+    """Return the name in the key expression of a right, without domain, type and hash."""
     chunks = untyped(key).split("/")[1:]
-    last = chunks[-1:] if chunks[-1] == ANY_CHUNKS else []  # canonical: behind type and hash
+    # In canonical form, "**" for what is below stands after type and hash.
+    last = chunks[-1:] if chunks[-1] == ANY_CHUNKS else []
     name = chunks[: len(chunks) - len(last) - len(_UNTYPED)]
     return "/".join(["", *name, *last])
 
 
 def untyped(key: str) -> str:
-    """Return the key expression of a right as other tools write it, for any type.
+    """Return the key expression of a right as other tools write it, with wildcards for the type.
 
-    Keys below the key of the topic are not included.
+    A part below the key of the topic is left out.
     """
     for below in ((), (ANY_CHUNKS,)):
         end = "/".join(("", *_TYPE, *below))
@@ -224,7 +231,7 @@ def untyped(key: str) -> str:
 def as_router(router: str, own_rights: RemoteRights) -> RemoteRights:
     """Return the rights that a process with ``own_rights`` gives to its router.
 
-    A router passes on messages, so it may send what the process may receive, and receive what the
+    A router forwards messages, so it may send what the process may receive, and receive what the
     process may send.
     """
     return own_rights.mirrored(router)
@@ -246,20 +253,20 @@ def crossing_rules(names: Iterable[str], domains: Iterable[int]) -> tuple[Access
 
 
 _EXACT_NAMES = re.compile(r"(?:/[^/#$*?\[]+)+")
-"""Matches absolute names without wildcards, one or several joined, that are valid keys of Zenoh."""
+"""Matches absolute names without wildcards, one or several joined, that are valid as Zenoh keys."""
 _NO_KEY = re.compile(r"[#$]|//|/\Z")
-"""Text that no key of Zenoh may have."""
+"""Matches text that no Zenoh key may have."""
 
 
 def _allowed_keys(
     domain: int, stated_rights: Iterable[StatedRight]
 ) -> Iterator[tuple[str, tuple[str, ...], Difference | None]]:
-    """Yield each right with its allowed key expressions, and their `Difference`.
+    """Yield each right with its allowed key expressions, and the `Difference` that they express.
 
-    The key expressions leave out denied names.  The difference is None for names without wildcards.
+    The key expressions leave out denied names.  The difference is None if no name has wildcards.
 
     Raises:
-        PolicyError: a name, or a name without its denied part, cannot be expressed.
+        PolicyError: Zenoh cannot express a name, or a name without its denied part.
     """
     allowed: dict[str, dict[str, Source]] = {}
     denied: dict[str, dict[str, Source]] = {}
@@ -285,9 +292,9 @@ def _allowed_keys(
         difference = Difference(str(domain), end, _forms(wild), _forms(never))
         names = _with_keys_below(exact | _names_of(difference, right, wild, never))
         keys = tuple([canonical((str(domain), *name)) + end for name in names])
-        # Names of which one is now within a wildcard's expression are part of what makes that.
-        made_of = difference._replace(allowed=difference.allowed | exact.difference(names))
-        yield right, keys, made_of if wild else None
+        # Exact names that are now part of a wildcard's expression also belong to the difference.
+        full_difference = difference._replace(allowed=difference.allowed | exact.difference(names))
+        yield right, keys, full_difference if wild else None
 
 
 def _forms(places: Mapping[str, Source]) -> frozenset[Chunks]:
@@ -303,9 +310,9 @@ def _forms(places: Mapping[str, Source]) -> frozenset[Chunks]:
 def _names_of(
     difference: Difference, right: str, allowed: Mapping[str, Source], denied: Mapping[str, Source]
 ) -> frozenset[Chunks]:
-    """Return the chunks of the names in a difference.
+    """Return the names in a difference, as chunks of key expressions.
 
-    ``allowed`` and ``denied`` map its names to the lines that state them, for errors.
+    ``allowed`` and ``denied`` map the difference's names to the places that state them, for errors.
 
     Raises:
         PolicyError: the names cannot be expressed, or take more than `MOST_EXPRESSIONS`.
@@ -342,7 +349,7 @@ def _untranslatable_denial_error(
 
 
 def _with_keys_below(names: frozenset[Chunks] | set[Chunks]) -> set[Chunks] | frozenset[Chunks]:
-    """Return the same names, with one expression for a name and all names below it."""
+    """Return the same names, with one expression for a name together with all names below it."""
     below = ("*", ANY_CHUNKS)
     if not any(name[-1] == ANY_CHUNKS for name in names):
         return names
@@ -353,7 +360,7 @@ def _with_keys_below(names: frozenset[Chunks] | set[Chunks]) -> set[Chunks] | fr
 
 
 def _names_of_expression(name: str, place: Source) -> list[str]:
-    """Return the names of an expression, for each choice of its ``?`` and sets of characters.
+    """Return the names of an expression, one for each choice of its ``?`` and character sets.
 
     Raises:
         PolicyError: the names take more than `MOST_EXPRESSIONS`.
@@ -385,7 +392,7 @@ def _too_many_error(name: str, place: Source) -> PolicyError:
 
 
 def _number_of_chunks(name: str) -> int:
-    """Return a lower bound of the number of results of `chunks_of`: it doubles with each ``*``."""
+    """Return a lower bound for the number of results of `chunks_of`, which ``*`` can double."""
     stars_within = len(re.findall(r"(?<=[^/*])\*+(?=[^/*])", name))
     return 1 << stars_within
 
@@ -393,15 +400,15 @@ def _number_of_chunks(name: str) -> int:
 def chunks_of(name: str) -> list[Chunks]:
     """Return the chunks of the key expressions that together match the ROS names of ``name``.
 
-    ``name`` is absolute, with ``*`` as its only wildcard.  A ``*`` of a policy also
-    matches "/", so it becomes ``**`` where it stands next to a slash, and two expressions within a
-    part of a name: `_number_of_chunks` tells beforehand whether that is too many.
+    ``name`` is absolute, with ``*`` as its only wildcard.  A ``*`` of a policy also matches "/".
+    So a star next to a slash becomes ``**``, and a star within a part of a name takes two
+    expressions.  `_number_of_chunks` tells beforehand whether the result would be too large.
     """
     if "*" not in name:
         return [tuple(name[1:].split("/"))]
     while "**" in name:
         name = name.replace("**", "*")
-    if name.startswith("*"):  # a namespace with a wildcard: the star may also stand for nothing
+    if name.startswith("*"):  # a namespace with a wildcard: the star can also match nothing
         rest = name[1:]
         return (chunks_of(rest) if rest.startswith("/") else []) + chunks_of(f"/{name}")
     expressions: list[list[str]] = [[]]
@@ -415,7 +422,7 @@ def chunks_of(name: str) -> list[Chunks]:
 
 
 def _chunks_of_part(texts: list[str]) -> list[list[str]]:
-    """Return the chunks for one part of a name, whose stars stand between ``texts``."""
+    """Return chunks for one part of a name; ``texts`` are the texts between its stars."""
     if texts == ["", ""]:
         return [["*", ANY_CHUNKS]]
     first, *later_texts = texts
@@ -445,20 +452,20 @@ _USE = {
     (Flow.INGRESS, Message.QUERY): "request",
     (Flow.EGRESS, Message.QUERY): "reply",
 }
-"""The right that a message uses, by its direction and kind."""
+"""Maps the direction and kind of a message to the right that it uses."""
 _WILD = ("*", ANY_CHUNKS)
 _TYPE_AND_HASH = 2
 _MOST_ANY_CHUNKS = 6
-"""Maximum number of ``**`` in a key expression: each doubles the number of names."""
+"""Maximum number of ``**`` in a key expression; each of them doubles the number of names."""
 
 
 @dataclass(frozen=True, slots=True)
 class RightsInRules:
     """The rights that rules give to processes, by the common name of their certificate.
 
-    ``domains`` maps each right to the ROS domains in its keys, None for a wildcard.  ``enclaves``
-    are the common names in the rules.  ``left_out`` are key expressions that stand for no ROS topic
-    or service, sorted.
+    ``domains`` maps each right to the ROS domains in its keys; None stands for a wildcard.
+    ``enclaves`` are the common names in the rules.  ``left_out`` are the key expressions that match
+    no ROS topic or service, sorted.
     """
 
     domains: Mapping[Right, frozenset[int | None]]
@@ -469,8 +476,8 @@ class RightsInRules:
 class RouterLinks(NamedTuple):
     """The links between the routers of a Zenoh network, and the rights that may pass over them.
 
-    ``router_of`` maps enclaves to the routers that they connect to, and each router to itself.
-    ``passing`` maps each router to the rights that it gives the other routers.
+    ``router_of`` maps each enclave to the router that it connects to, and each router to itself.
+    ``passing`` maps each router to the rights that it gives to the other routers.
     """
 
     router_of: Mapping[str, str]
@@ -480,7 +487,7 @@ class RouterLinks(NamedTuple):
 def rights_in_rules(access: Enforcement) -> RightsInRules:
     """Return the rights that access control gives to enclaves, with their ROS domains.
 
-    Subjects without a common name are not enclaves, and are left out.
+    Subjects without a common name are no enclaves, and are left out.
     """
     domains: dict[Right, set[int | None]] = {}
     left_out: set[str] = set()
@@ -508,7 +515,7 @@ def rights_in_rules(access: Enforcement) -> RightsInRules:
 
 
 def _domain_of(key: str) -> int | None:
-    """Return the ROS domain in a key expression, None for a wildcard."""
+    """Return the ROS domain in a key expression; None for a wildcard."""
     chunk = key.partition("/")[0]
     return int(chunk) if _DOMAIN.fullmatch(chunk) and chunk != "*" else None
 
@@ -519,11 +526,12 @@ _NOWHERE = Source("", 0)
 def _differences_in(
     rules: Sequence[AclRule], enclave: str
 ) -> Mapping[tuple[str, int], Sequence[Right]]:
-    """Return the rights and denials of which rules list the names that remain, by right and domain.
+    """Return the rights and denials behind rules that list only allowed names, by right and domain.
 
-    The tokens of the graph name them; they count only if sros lists exactly these key expressions
-    for them.  A name of ROS for each key expression alone would match more: ``$*b$*/**`` has the b
-    in the first part, and ``/*b*`` in any.
+    The names are in the rules for graph tokens.  They count only if sros would list exactly the key
+    expressions of the rules for them.  Without this step, each key expression would be read as a
+    ROS name by itself, which matches more: ``$*b$*/**`` has the b in the first part, but ``/*b*``
+    in any part.
     """
     keys: dict[tuple[str, int], set[str]] = {}
     denied = set()
@@ -551,15 +559,15 @@ def _differences_in(
 
 
 def _right_keys(rule: AclRule) -> Iterator[tuple[str, str]]:
-    """Yield pairs of a right and a key expression that a rule allows or denies."""
+    """Yield pairs of a right and a key expression to which a rule applies."""
     for (flow, message), right in _USE.items():
         if flow in rule.flows and message in rule.messages:
-            # Below @adv is the history of a topic, which belongs to the same right.
+            # Keys with @adv are for the history of a topic, and belong to the same right.
             yield from ((right, key) for key in rule.key_expressions if "/@adv" not in key)
 
 
 def ros_names(key: str) -> tuple[str, ...]:
-    """Return the ROS names and expressions that a key expression stands for, perhaps none.
+    """Return the ROS names, perhaps with wildcards, for a key expression; perhaps none.
 
     The first chunk is the ROS domain, and the last two are the type and its hash.
     """
@@ -571,7 +579,7 @@ def ros_names(key: str) -> tuple[str, ...]:
     names = [""]
     for chunk in chunks:
         if chunk == ANY_CHUNKS:
-            # It may stand for no chunk; a star of ROS before it includes what it stands for.
+            # "**" can match no chunk; a preceding ROS star already includes what "**" matches.
             names += [f"{name}/*" for name in names if not name.endswith("*")]
         else:
             names = [f"{name}/{chunk.replace(ANY_PART, '*')}" for name in names]
@@ -582,9 +590,9 @@ def ros_names(key: str) -> tuple[str, ...]:
 
 
 def _without_type(chunks: list[str]) -> list[str]:
-    """Return the chunks of the name, without the type and hash, which can be wildcards.
+    """Return the chunks of the name without type and hash, which can be wildcards.
 
-    In the canonical form, ``*`` stands before ``**``.
+    The expression is in canonical form, in which ``*`` stands before ``**``.
     """
     end = len(chunks)
     while end and chunks[end - 1] in _WILD:
@@ -604,13 +612,13 @@ _BELOW_KEYS = "@adv"
 _MOST_NAMES = 65536
 _EVERY_NAME = ("*", *_UNTYPED, ANY_CHUNKS)
 _DOMAIN = re.compile(r"\*|0|[1-9][0-9]{0,2}")
-"""Matches the first chunk of a key of rmw_zenoh: a ROS domain, or a wildcard."""
+"""Matches the first chunk of a key of rmw_zenoh: a ROS domain or a wildcard."""
 
 
 def name_of_key(key: str) -> tuple[str, str]:
     """Return the domain and the ROS name in a key or key expression of rmw_zenoh.
 
-    The name is "" for keys of the graph, and for keys of no topic or service.
+    The name is "" for keys of the graph, and for other keys without a topic or service.
     """
     domain, _, rest = key.partition("/")
     chunks = rest.partition(f"/{_BELOW_KEYS}")[0].split("/")
@@ -624,7 +632,7 @@ def name_of_key(key: str) -> tuple[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class _DecidingMessage:
-    """The message that decides whether a remote process has a right, and other needed messages."""
+    """The message that decides whether a remote process has a right, and others it needs."""
 
     flow: Flow
     message: Message
@@ -637,14 +645,14 @@ _DECIDING_MESSAGES = {
     "request": _DecidingMessage(_IN, _M.QUERY, ((_OUT, _M.REPLY),)),
     "reply": _DecidingMessage(_OUT, _M.QUERY, ((_IN, _M.DECLARE_QUERYABLE), (_IN, _M.REPLY))),
 }
-"""The deciding message of each right, from the view of the process that has the rules."""
+"""Maps a right to its deciding message, from the view of the process that has the rules."""
 
 
 @dataclass(frozen=True, slots=True)
 class StatedName:
     """A right to a ROS name, perhaps with wildcards.
 
-    ``lacks`` are messages that the right needs, too, and that are not allowed.
+    ``lacks`` are messages that the right needs as well, but that the rules do not allow.
     """
 
     right: str
@@ -654,12 +662,13 @@ class StatedName:
 
 
 @dataclass(frozen=True, slots=True)
-class RightsBehindRules:
+class RightsOfSubject:
     """The rights that rules give to the processes that match a subject.
 
-    ``names`` are the common names of their certificates, None for any.  If ``self_limiting``, they
-    are rights of the process that has the rules, which can ignore them.  ``unsaid`` are rights and
-    keys that no ROS name expresses exactly; ``denied`` are denied rights and keys.
+    ``names`` are the common names of the processes' certificates; None stands for any name.  With
+    ``self_limiting``, the rights are those of the process that has the rules, which can ignore
+    them.  ``unsaid`` are pairs of a right and a key that no ROS name expresses exactly; ``denied``
+    are pairs of a right and a denied key.
     """
 
     subject: str
@@ -670,8 +679,8 @@ class RightsBehindRules:
     denied: tuple[tuple[str, str], ...]
 
 
-def rights_behind(document: ConfigurationDocument) -> tuple[RightsBehindRules, ...]:
-    """Return the ROS rights that a configuration gives its subjects, in the order of the file.
+def rights_of_subjects(document: ConfigurationDocument) -> tuple[RightsOfSubject, ...]:
+    """Return the ROS rights that a configuration gives to its subjects, in the order of the file.
 
     Raises:
         DocumentError: there are too many wildcards to compare.
@@ -691,7 +700,7 @@ def rights_behind(document: ConfigurationDocument) -> tuple[RightsBehindRules, .
 
 
 def is_self_limiting(document: ConfigurationDocument) -> bool:
-    """Return whether a session's rules name no other process, so that it limits only itself."""
+    """Return whether the rules of a session identify no process, so that they limit only itself."""
     access = document.access
     used = [subject for subject in access.subjects if access.rules_of(subject.id)]
     return (
@@ -714,7 +723,7 @@ def _rights_of_subject(
     self_limiting: bool,
     rules: Sequence[AclRule],
     limit: ComparisonLimit,
-) -> RightsBehindRules:
+) -> RightsOfSubject:
     of_subject: list[StatedName] = []
     unsaid: list[tuple[str, str]] = []
     denied: list[tuple[str, str]] = []
@@ -732,8 +741,10 @@ def _rights_of_subject(
     for right, place in _DECIDING_MESSAGES.items():
         allowed = keys(place.flow, place.message)
         taken = keys(place.flow, place.message, allows=False)
-        needed = [(message, _ByPrefix(keys(flow, message), limit)) for flow, message in place.needs]
-        names_of = _Names(allowed, taken, limit)
+        needed = [
+            (message, _PrefixIndex(keys(flow, message), limit)) for flow, message in place.needs
+        ]
+        names_of = _AllowedNames(allowed, taken, limit)
         for domain, name in names_of.stated():
             lacks = tuple(
                 message.value
@@ -746,7 +757,7 @@ def _rights_of_subject(
     order = sorted(
         of_subject, key=lambda stated: (RIGHT_ORDER[stated.right], stated.name, stated.domain)
     )
-    return RightsBehindRules(
+    return RightsOfSubject(
         subject, names, self_limiting, tuple(order), tuple(unsaid), tuple(denied)
     )
 
@@ -762,20 +773,21 @@ def _keys_of(domain: str, name: str) -> tuple[str, ...]:
     return tuple(canonical((domain, *chunks, *_UNTYPED)) for chunks in chunks_of(name))
 
 
-class _ByPrefix:
+class _PrefixIndex:
     """An index of expressions by the text before the first wildcard."""
 
     def __init__(self, expressions: Iterable[str], limit: ComparisonLimit) -> None:
         self._limit = limit
         self._by_begin: dict[str, list[str]] = {}
         for expression in expressions:
-            # "/**" and "/*" may stand for nothing, or for a part without the slash.
+            # "/**" and "/*" can match nothing, and "$*" a part of a chunk, so the text before them
+            # ends earlier.
             self._by_begin.setdefault(expression.partition("*")[0].rstrip("$/"), []).append(
                 expression
             )
 
     def any(self, text: str, holds: Callable[[str, str], bool]) -> bool:
-        """Return whether ``holds(expression, text)`` for any expression that may match the text."""
+        """Return whether ``holds(expression, text)`` for an expression that may match the text."""
         for end in range(len(text) + 1):
             for expression in self._by_begin.get(text[:end], ()):
                 if holds(expression, text):
@@ -784,8 +796,8 @@ class _ByPrefix:
         return False
 
 
-class _Names:
-    """The ROS names in allowed key expressions, without denied names."""
+class _AllowedNames:
+    """The ROS names in the allowed key expressions, without denied names."""
 
     def __init__(
         self, allowed: Sequence[str], denied: Sequence[str], limit: ComparisonLimit
@@ -793,22 +805,22 @@ class _Names:
         self._allowed = allowed
         self._denied = denied
         self._limit = limit
-        self._including = _ByPrefix(allowed, limit)
-        self._said: list[str] = []
+        self._including = _PrefixIndex(allowed, limit)
+        self._stated_keys: list[str] = []
 
     def stated(self) -> list[tuple[str, str]]:
-        """Return pairs of domain and name, without names that others of the same domain cover."""
+        """Return pairs of domain and name, without names that others of the domain cover."""
         sound = dict.fromkeys(
             (domain, name)
             for key in self._allowed
             for domain, name in _candidates(key)
             if not expression_problem(name) and self._is_sound(domain, name)
         )
-        self._said = [key for domain, name in sound for key in _keys_of(domain, name)]
+        self._stated_keys = [key for domain, name in sound for key in _keys_of(domain, name)]
         names: dict[str, list[str]] = {}
         for domain, name in sound:
             names.setdefault(domain, []).extend([name] if "*" in name else [])
-        wild = {domain: _ByPrefix(of, self._limit) for domain, of in names.items()}
+        wild = {domain: _PrefixIndex(of, self._limit) for domain, of in names.items()}
         return [
             (domain, name)
             for domain, name in sound
@@ -825,36 +837,36 @@ class _Names:
         )
 
     def keys_without_name(self) -> list[str]:
-        """Return the key expressions that no name expresses completely."""
-        stated_names = _ByPrefix(dict.fromkeys(self._said), self._limit)
+        """Return the key expressions that the names do not express completely."""
+        stated_names = _PrefixIndex(dict.fromkeys(self._stated_keys), self._limit)
         return [
             key
             for key in self._allowed
-            if not all(stated_names.any(piece, includes) for piece in _pieces(key))
+            if not all(stated_names.any(piece, includes) for piece in _topic_keys(key))
         ]
 
 
 def _candidates(key: str) -> Iterator[tuple[str, str]]:
-    """Yield pairs of domain and name that may express a key expression, or a part of it."""
+    """Yield pairs of domain and name that may express a key expression or a part of it."""
     domain, *chunks = key.split("/")
     if domain == ANY_CHUNKS:
         domain, chunks = "*", [ANY_CHUNKS, *chunks]
     if not _DOMAIN.fullmatch(domain) or not chunks:
         return
     if chunks[-1] != ANY_CHUNKS:
-        yield from ((domain, name) for name in _texts(chunks[: -len(_UNTYPED)]))
+        yield from ((domain, name) for name in _ros_names_in(chunks[: -len(_UNTYPED)]))
         return
     body = chunks[:-1]
     for dropped in range(len(_UNTYPED) + 1):
         base = body[: len(body) - dropped]
         if dropped > len(body) or set(body[len(base) :]) - {"*"}:
             break
-        yield from ((domain, name) for name in _texts(base))
-        yield from ((domain, f"{name}/*") for name in _texts(base) or [""])
+        yield from ((domain, name) for name in _ros_names_in(base))
+        yield from ((domain, f"{name}/*") for name in _ros_names_in(base) or [""])
 
 
-def _texts(chunks: Sequence[str]) -> list[str]:
-    """Return the names that chunks stand for; several, because ``*`` of ROS also matches "/"."""
+def _ros_names_in(chunks: Sequence[str]) -> list[str]:
+    """Return the ROS names for chunks; several, because a ROS ``*`` also matches "/"."""
     if not chunks:
         return []
     text = "/".join(chunks)
@@ -864,8 +876,8 @@ def _texts(chunks: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(f"/{name}" for name in names))
 
 
-def _pieces(key: str) -> list[str]:
-    """Return expressions for exactly the keys of topics and services in ``key``."""
+def _topic_keys(key: str) -> list[str]:
+    """Return expressions for exactly the keys of topics and services that ``key`` includes."""
     domain, *chunks = key.split("/")
     if domain == ANY_CHUNKS:
         domain, chunks = "*", [ANY_CHUNKS, *chunks]
@@ -881,11 +893,11 @@ def _pieces(key: str) -> list[str]:
 # ── as a policy ────────────────────────────────────────────────────────────────────────────
 
 
-def enclave_of(rights: RightsBehindRules) -> tuple[str, ...]:
-    """Return the enclaves that a subject stands for, or ().
+def enclave_of(rights: RightsOfSubject) -> tuple[str, ...]:
+    """Return the enclaves for which a subject stands, or ().
 
-    For a session that limits itself, the name is the id of the subject: zenoh_security_tools writes
-    the node's name there, and uses the enclave of that name.
+    If a session limits itself, the enclave has the id of the subject as its name:
+    zenoh_security_tools writes the node's name there, and uses the enclave of the same name.
     """
     named = rights.names or ((f"/{rights.subject}",) if rights.self_limiting else ())
     return tuple(name for name in named if _is_enclave(name))
@@ -898,10 +910,10 @@ def _is_enclave(name: str) -> bool:
         return False
 
 
-def policy_of(subjects: Iterable[RightsBehindRules]) -> Policy:
-    """Return a policy with the rights of subjects that have names; it never gives more.
+def policy_of(subjects: Iterable[RightsOfSubject]) -> Policy:
+    """Return a policy that gives the enclaves of subjects their rights, and never more.
 
-    The node of each profile is the last part of the enclave's name, as rules name no nodes; all
+    Rules name no nodes, so the node of each profile is the last part of the enclave's name.  All
     names are absolute.
     """
     rights: dict[str, set[Right]] = {}

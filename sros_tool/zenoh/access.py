@@ -1,10 +1,10 @@
 """Zenoh access control: rules for remote processes, and what they decide.
 
-`AccessControl` is what sros writes: its subjects are certificates, and its default is to deny.  A
-denial inside a wider permission stops neither queries nor puts with a wildcard key (tested with
-1.10.2).  It does stop graph tokens, because nobody reads them as wildcards.  `Enforcement` is what
-any configuration may state. Sources: zenoh.io "Access Control"; zenoh 1.9, access_control.rs and
-authorization.rs; compared with the wheel 1.10.2.
+`AccessControl` is what sros writes: its subjects are certificates, and by default messages are
+denied.  A deny rule for a part of the keys that another rule allows does not stop queries and puts
+with a wildcard key (tested with 1.10.2).  It does stop graph tokens, because no process reads their
+keys as wildcards.  `Enforcement` is the access control in any configuration.  Sources: zenoh.io
+"Access Control"; zenoh 1.9, access_control.rs and authorization.rs; compared with the wheel 1.10.2.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from sros_tool.zenoh.subtraction import Difference, RuleKeys, keys_of
 
 
 class Message(StrEnum):
-    """The kinds of messages that a rule can name, in the order in which rules list them."""
+    """The kinds of messages that a rule can name, in the order of rules that sros writes."""
 
     PUT = "put"
     DELETE = "delete"
@@ -52,8 +52,8 @@ class Flow(StrEnum):
 class AccessRule(NamedTuple):
     """A rule that allows or denies messages in one direction, on keys in ``key_expressions``.
 
-    Only rules for graph tokens deny.  No process reads a token as a wildcard, so a denial inside a
-    wider permission works for tokens.
+    Only rules for graph tokens deny.  No process reads the key of a token as a wildcard, so for
+    tokens, Zenoh enforces a denial of a part of the allowed keys.
     """
 
     flow: Flow
@@ -62,37 +62,37 @@ class AccessRule(NamedTuple):
     allows: bool = True
 
     def mirrored(self) -> AccessRule:
-        """Return the rule that the remote process needs for the same messages."""
+        """Return the rule that the remote process needs to exchange the same messages."""
         return self._replace(flow=self.flow.opposite())
 
 
 @dataclass(frozen=True, slots=True)
 class RemoteRights:
-    """The rights of remote processes whose certificate has this common name.
+    """The rights of the remote processes whose certificate has this common name.
 
-    A denial can turn a key with wildcards into a list of keys.  ``made_of`` has the original keys
-    and what was subtracted from them, by the direction and message kinds of a rule.
+    A denial turns a key with wildcards into a list of keys.  ``differences`` keeps the original
+    keys and the keys that were subtracted, by the direction and the kinds of messages of a rule.
     """
 
     common_name: str
     rules: tuple[AccessRule, ...]
-    made_of: Mapping[_Use, tuple[Difference, ...]] = field(default_factory=dict, compare=False)
+    differences: Mapping[_Use, tuple[Difference, ...]] = field(default_factory=dict, compare=False)
 
     def mirrored(self, common_name: str) -> RemoteRights:
-        """Return the rights that the remote process must give to this process.
+        """Return the rights for the same messages that the remote process must give to this one.
 
         ``common_name`` is the common name of this process.
         """
         return RemoteRights(
             common_name,
             sorted_rules(rule.mirrored() for rule in self.rules),
-            {(flow.opposite(), messages): of for (flow, messages), of in self.made_of.items()},
+            {(flow.opposite(), messages): of for (flow, messages), of in self.differences.items()},
         )
 
     def keys_of(self, rule: AccessRule) -> RuleKeys:
         """Return the keys of a rule."""
-        made_of = self.made_of.get((rule.flow, rule.messages), ()) if rule.allows else ()
-        return keys_of(frozenset(rule.key_expressions), made_of)
+        differences = self.differences.get((rule.flow, rule.messages), ()) if rule.allows else ()
+        return keys_of(frozenset(rule.key_expressions), differences)
 
 
 _Use = tuple[Flow, tuple[Message, ...]]
@@ -101,10 +101,11 @@ _Use = tuple[Flow, tuple[Message, ...]]
 
 @dataclass(frozen=True)
 class AccessControl:
-    """The access control of a process: rules by common name; all other processes are denied.
+    """The access control of a process: rules by common name; other processes are denied.
 
-    Each common name occurs only once.  A second subject with the same name would add its rights to
-    the first; in Zenoh up to 1.5.1, a random one of the two subjects would decide.
+    Each common name occurs only once.  If a second subject had the same name, its rights would be
+    added to those of the first, and in Zenoh up to 1.5.1, a random one of the two subjects would
+    decide.
     """
 
     remotes: tuple[RemoteRights, ...]
@@ -113,7 +114,8 @@ class AccessControl:
         """Return whether a message to or from a remote process passes.
 
         ``key`` is the key or key expression of the message.  A rule applies only if it includes all
-        of ``key``: Zenoh drops a wider subscription, query or put, and does not narrow it.
+        of ``key``: Zenoh drops a subscription, query or put with a wider key, and does not narrow
+        the key.
         """
         rules = [
             rule.allows
@@ -123,15 +125,18 @@ class AccessControl:
         return bool(rules) and all(rules)
 
     def passing(self, common_name: str, flow: Flow, message: Message) -> KeyExpressions:
-        """Return the key expressions for which a message is allowed, to ask about many keys."""
+        """Return the key expressions of the rules that allow a message, for searching many keys."""
         return self._expressions(common_name, flow, message, allows=True)
 
     def denied(self, common_name: str, flow: Flow, message: Message) -> KeyExpressions:
-        """Return the key expressions for which a message is denied, even if a rule allows them."""
+        """Return the key expressions of the rules that deny a message.
+
+        Other rules may allow the same key expressions.
+        """
         return self._expressions(common_name, flow, message, allows=False)
 
     def keys(self, common_name: str, flow: Flow, message: Message) -> NameSet:
-        """Return the set of all keys with which a message passes."""
+        """Return the set of all keys on which a message passes."""
         of = (common_name, flow, message)
         return names_of(self.passing(*of).all) - names_of(self.denied(*of).all)
 
@@ -144,7 +149,7 @@ class AccessControl:
         )
 
     def decide(self, remote: Remote, flow: Flow, message: Message, key: str) -> AccessDecision:
-        """Return the decision that `Enforcement.decide` makes with the file of these rules."""
+        """Return the decision that `Enforcement.decide` makes for the file with these rules."""
         rights = None if remote.common_name is None else self._by_name.get(remote.common_name)
         if rights is None:
             stated = any(of_remote.rules for of_remote in self.remotes)
@@ -159,12 +164,12 @@ class AccessControl:
         return _decide_by_rules(applying, (rights.common_name,))
 
     def allowed_keys(self, common_name: str, flow: Flow, message: Message) -> tuple[str, ...]:
-        """Return the key expressions that rules allow; denials are not subtracted."""
+        """Return the key expressions that rules allow, without subtracting denied ones."""
         rules = self._rules(common_name, flow, message)
         return tuple(key for rule in rules if rule.allows for key in rule.key_expressions)
 
     def key_expressions_of(self, rule: str) -> tuple[str, ...]:
-        """Return the key expressions of a rule, given by an id in a decision."""
+        """Return the key expressions of a rule, by its id in a decision."""
         ids = ((id_, of) for remote in self.remotes for id_, of in self._with_ids(remote))
         return next(of.key_expressions for id_, of in ids if id_ == rule)
 
@@ -179,11 +184,11 @@ class AccessControl:
         )
 
     def names(self) -> frozenset[str]:
-        """Return the common names that rules are for."""
+        """Return the common names for which there are rules."""
         return frozenset(self._by_name)
 
     def rules_for(self, common_name: str) -> int:
-        """Return how many rules are for the remote process with this common name."""
+        """Return the number of rules for the remote process with this common name."""
         remote = self._by_name.get(common_name)
         return len(remote.rules) if remote else 0
 
@@ -201,9 +206,10 @@ class AccessControl:
 def rule_ids(
     rules: Sequence[Sequence[Hashable]], names: Sequence[str], *, once: bool = True
 ) -> list[list[str]]:
-    """Return the ids of rules in a file: a list for each remote process, in the order of ``names``.
+    """Return the ids of rules in a file: one list per remote process, in the order of ``names``.
 
-    With ``once``, a rule of several processes has one shared id; older files have one for each.
+    With ``once``, a rule that several processes have has one shared id.  In older files, it has an
+    id for each process.
     """
     uses = Counter(rule for of in rules for rule in of if once)
     number = count()
@@ -222,9 +228,9 @@ _NO_RULE_AT_ALL = "no rule is in force, and the default is DENY"
 def _decide_by_rules(
     applicable_rules: Sequence[tuple[bool, str]], subjects: tuple[str, ...]
 ) -> AccessDecision:
-    """Return the decision of the rules that apply to a message: if any rule denies, it is denied.
+    """Return the decision on a message by the rules that apply to it; a denial wins.
 
-    ``applicable_rules`` has, for each rule, whether it allows, and its id.
+    ``applicable_rules`` are pairs: whether the rule allows, and the rule's id.
     """
     if denied := tuple(rule for allows, rule in applicable_rules if not allows):
         return AccessDecision(False, denied, subjects, f"rule {denied[0]} denies it")
@@ -234,7 +240,7 @@ def _decide_by_rules(
 
 
 _FEW = 16
-"""Up to this number, key expressions are compared one by one, without an index."""
+"""Number of key expressions up to which they are compared one by one, without an index."""
 
 
 def _include(expressions: tuple[str, ...], key: str) -> bool:
@@ -249,10 +255,9 @@ def _search(expressions: tuple[str, ...]) -> KeyExpressions:
 
 
 def joined(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
-    """Return rules with the same meaning, sorted, with only one rule for each use.
+    """Return equivalent rules, sorted, with a single rule for each direction and list of messages.
 
-    Rules of the same direction and messages become one rule, without key expressions that others of
-    the rule include.
+    Key expressions are left out if another one of the same rule includes them.
     """
     keys_of_use: dict[tuple[Flow, tuple[Message, ...], bool], list[tuple[str, ...]]] = {}
     for flow, messages, keys, allows in rules:
@@ -269,35 +274,35 @@ def _joined_keys(keys: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
     return _needed_keys(frozenset(key for some_keys in keys for key in some_keys))
 
 
-@lru_cache(maxsize=16)  # several messages of a right have the same keys
+@lru_cache(maxsize=16)  # the rules for several messages have the same keys
 def _needed_keys(keys: frozenset[str]) -> tuple[str, ...]:
     return tuple(KeyExpressions(keys).needed())
 
 
 def sorted_rules(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
-    """Return rules of different directions and messages in the order of `joined`."""
+    """Return rules in the order that `joined` uses, without joining them."""
     return tuple(
-        sorted(rules, key=lambda rule: (*_place(rule.flow, rule.messages), not rule.allows))
+        sorted(rules, key=lambda rule: (*_rule_order(rule.flow, rule.messages), not rule.allows))
     )
 
 
 def joined_rights(name: str, rights: Iterable[RemoteRights]) -> RemoteRights:
-    """Return the rights of all enclaves together, as the rights of a process named ``name``."""
+    """Return the rights of all processes together, as those of a process named ``name``."""
     of_all = list(rights)
-    made_of: dict[_Use, dict[Difference, None]] = {}
-    for use, of in (item for rights in of_all for item in rights.made_of.items()):
-        made_of.setdefault(use, {}).update(dict.fromkeys(of))
+    differences: dict[_Use, dict[Difference, None]] = {}
+    for use, of in (item for rights in of_all for item in rights.differences.items()):
+        differences.setdefault(use, {}).update(dict.fromkeys(of))
     return RemoteRights(
         name,
         joined(rule for rights in of_all for rule in rights.rules),
-        {use: tuple(of) for use, of in made_of.items()},
+        {use: tuple(of) for use, of in differences.items()},
     )
 
 
 class RightsBetween:
     """The messages that processes of two enclaves may exchange directly, by the rights of both.
 
-    So a process that obeys its own rules never sends or receives more than its rights permit,
+    Therefore a process that enforces its rules sends and receives nothing that its rights deny,
     whatever the other process does.
     """
 
@@ -315,23 +320,23 @@ class RightsBetween:
         }
 
     def rights_for_others(self, own_name: str) -> Iterator[RemoteRights]:
-        """Yield the rights that a process of the enclave ``own_name`` gives to every other enclave.
+        """Yield the rights that a process of the enclave ``own_name`` gives to each other enclave.
 
         Raises:
-            TooManyExpressions: the shared rights need too many key expressions.
+            TooManyExpressions: the rights that two enclaves share need too many key expressions.
         """
         mine = self._mirrored[own_name]
         denied = [rule_of_peer for rule_of_peer in mine if not rule_of_peer.rule.allows]
-        meeting: dict[_Place, list[tuple[tuple[Message, ...], RuleKeys]]] = {}
+        meeting: dict[_RuleKind, list[tuple[tuple[Message, ...], RuleKeys]]] = {}
         for remote, theirs in self._rules.items():
-            shared: dict[_Place, tuple[str, ...]] = {}
+            shared: dict[_RuleKind, tuple[str, ...]] = {}
             are_apart = self._plain[own_name].isdisjoint(self._plain[remote])
             for place, _, keys in theirs:
                 if place not in meeting:
                     meeting[place] = [
                         (messages, rule_of_peer.keys)
                         for rule_of_peer in mine
-                        if (messages := _shared(place, rule_of_peer.place))
+                        if (messages := _shared_messages(place, rule_of_peer.place))
                     ]
                 for messages, other_keys in meeting[place]:
                     if are_apart and keys.is_plain and other_keys.is_plain:
@@ -351,12 +356,12 @@ class RightsBetween:
             yield RemoteRights(remote, sorted_rules(rules))
 
 
-_Place = tuple[Flow, tuple[Message, ...], bool]
-"""Direction and messages of a rule, and whether the rule allows them."""
+_RuleKind = tuple[Flow, tuple[Message, ...], bool]
+"""The direction and messages of a rule, and whether the rule allows the messages."""
 
 
 class _RuleOfPeer(NamedTuple):
-    place: _Place
+    place: _RuleKind
     rule: AccessRule
     keys: RuleKeys
 
@@ -368,8 +373,8 @@ class _RuleOfPeer(NamedTuple):
         ]
 
 
-def _shared(first: _Place, second: _Place) -> tuple[Message, ...]:
-    """Return the messages that two rules allow in the same direction."""
+def _shared_messages(first: _RuleKind, second: _RuleKind) -> tuple[Message, ...]:
+    """Return the messages that both rules allow in the same direction."""
     if first[0] is not second[0] or not (first[2] and second[2]):
         return ()
     return tuple(message for message in first[1] if message in second[1])
@@ -380,10 +385,10 @@ def _added_keys(first_keys: tuple[str, ...], second_keys: tuple[str, ...]) -> tu
 
 
 def narrowed_rights(rights: RemoteRights, most: Iterable[AccessRule], kept: str) -> RemoteRights:
-    """Return the part of some rights that the rules ``most`` allow as well.
+    """Return the part of ``rights`` that the rules in ``most`` allow, too.
 
-    Keys that begin with ``kept`` are not narrowed: in keys of the graph, names of nodes and topics
-    are parts.
+    Rules for keys that begin with ``kept`` are not narrowed.  These are keys of graph tokens, in
+    which the names of nodes and topics are only parts of a key.
 
     Raises:
         TooManyExpressions: the result needs too many key expressions.
@@ -391,13 +396,13 @@ def narrowed_rights(rights: RemoteRights, most: Iterable[AccessRule], kept: str)
     graph = [rule for rule in rights.rules if rule.key_expressions[0].startswith(kept)]
     other_rules = tuple(rule for rule in rights.rules if rule not in graph)
     limit = RemoteRights("", tuple(rule.mirrored() for rule in most))
-    other_rights = RemoteRights(rights.common_name, other_rules, rights.made_of)
+    other_rights = RemoteRights(rights.common_name, other_rules, rights.differences)
     common_rights, _ = RightsBetween((other_rights, limit)).rights_for_others("")
     return RemoteRights(rights.common_name, sorted_rules((*graph, *common_rights.rules)))
 
 
 def is_within(remote: RemoteRights, own_rights: RemoteRights) -> bool:
-    """Return whether rights of a remote process allow nothing beyond ``own_rights``."""
+    """Return whether the rights of a remote process allow nothing beyond ``own_rights``."""
     mine, theirs = AccessControl((own_rights,)), AccessControl((remote,))
     return all(
         mine.allows(own_rights.common_name, rule.flow.opposite(), message, key)
@@ -417,17 +422,18 @@ def is_within(remote: RemoteRights, own_rights: RemoteRights) -> bool:
 _ORDER = {message: number for number, message in enumerate(Message)}
 
 
-@lru_cache(maxsize=64)  # the rules of all enclaves have the same few
-def _place(flow: Flow, messages: tuple[Message, ...]) -> tuple[bool, list[int]]:
+@lru_cache(maxsize=64)  # the rules of all enclaves have the same few directions and messages
+def _rule_order(flow: Flow, messages: tuple[Message, ...]) -> tuple[bool, list[int]]:
     return flow is Flow.EGRESS, [_ORDER[message] for message in messages]
 
 
 @dataclass(frozen=True, slots=True)
 class Remote:
-    """A remote process as access control sees it; None for a property that it does not have.
+    """A remote process as access control sees it; None stands for a property that it lacks.
 
-    ``common_name`` is the first one of its certificate, ``link_protocol`` such as "tls", and
-    ``interfaces`` are the network interfaces of this host that the connection uses.
+    ``common_name`` is the first common name in the process's certificate.  ``link_protocol`` is a
+    protocol such as "tls".  ``interfaces`` are the network interfaces of this host that the
+    connection uses.
     """
 
     common_name: str | None = None
@@ -441,7 +447,8 @@ class Remote:
 class AclRule:
     """A rule that allows or denies messages in some directions, on some keys.
 
-    ``key_expressions`` include the keys; ``line`` is the line of the rule in the file.
+    ``key_expressions`` are the keys, perhaps with wildcards.  ``line`` is the line of the rule in
+    the file.
     """
 
     id: str
@@ -454,9 +461,9 @@ class AclRule:
 
 @dataclass(frozen=True, slots=True)
 class AclSubject:
-    """Remote processes that have, for each property, one of the listed values.
+    """The remote processes that have one of the listed values for each property.
 
-    None stands for any value of a property.
+    None in place of a list stands for any value.
     """
 
     id: str
@@ -468,13 +475,14 @@ class AclSubject:
     line: int = field(default=0, compare=False)
 
     def is_named(self) -> bool:
-        """Return whether the subject states who a process is, and not only how it connects."""
+        """Return whether the subject restricts who a process is, not only how it connects."""
         return self.cert_common_names is not None or self.usernames is not None
 
     def overlaps(self, other: AclSubject) -> bool:
-        """Return whether a process can match both subjects, and so has their rights together.
+        """Return whether one process can match both subjects, and so has the rights of both.
 
-        Two subjects with the same properties do not count: Zenoh joins their common values to one.
+        The result is False for subjects that restrict the same properties, because Zenoh joins such
+        subjects for the values that they share.
         """
         pairs = [(getattr(self, name), getattr(other, name)) for name in PROPERTIES]
         return any((first is None) is not (second is None) for first, second in pairs) and all(
@@ -491,7 +499,7 @@ PROPERTIES = tuple(
 
 @dataclass(frozen=True, slots=True)
 class AclPolicy:
-    """An entry of Zenoh's ``policies``: which rules apply to which subjects, by their ids."""
+    """An entry of Zenoh's ``policies``: the ids of rules and of the subjects they apply to."""
 
     rules: tuple[str, ...]
     subjects: tuple[str, ...]
@@ -501,8 +509,9 @@ class AclPolicy:
 class AccessDecision:
     """Whether a message passes, and why.
 
-    ``rules`` are the ids of the deciding rules, empty if the default decides; ``subjects`` are the
-    ids of all subjects that match the remote process; ``why`` is the reason, as a clause.
+    ``rules`` are the ids of the deciding rules; there are none if the default decides.
+    ``subjects`` are the ids of all subjects that match the remote process.  ``why`` is the reason,
+    as a clause.
     """
 
     allowed: bool
@@ -512,7 +521,7 @@ class AccessDecision:
 
 
 class MessageFilter(Protocol):
-    """An object that decides which messages a process receives and sends."""
+    """A decider on the messages of a process: `AccessControl` or `Enforcement`."""
 
     def decide(self, remote: Remote, flow: Flow, message: Message, key: str) -> AccessDecision:
         """Return whether a message from or to a remote process passes."""
@@ -521,13 +530,13 @@ class MessageFilter(Protocol):
         """Return the key expressions of a rule, by its id."""
 
     def allowed_keys(self, common_name: str, flow: Flow, message: Message) -> tuple[str, ...]:
-        """Return the key expressions that rules allow; denials are not subtracted."""
+        """Return the key expressions that rules allow, without subtracting denied ones."""
 
     def rules_for(self, common_name: str) -> int:
-        """Return how many rules are for the remote process with this common name."""
+        """Return the number of rules for the remote process with this common name."""
 
     def names(self) -> frozenset[str]:
-        """Return the common names that rules are for."""
+        """Return the common names for which there are rules."""
 
 
 _OF_HISTORY = (Message.PUT, Message.QUERY)
@@ -538,10 +547,7 @@ _Combination = tuple[str | None, ...]
 
 @dataclass(frozen=True)
 class Enforcement:
-    """The access control of a process, as any configuration may state it.
-
-    It has the default, the rules, the subjects and the policies.
-    """
+    """The access control of a process, as any configuration can state it."""
 
     enabled: bool = False
     allows_by_default: bool = False
@@ -588,14 +594,14 @@ class Enforcement:
         return ""
 
     def _history_only_key(self, subject: str) -> str:
-        """Return a key of which a subject gets the history (``@adv``) but no messages, or ""."""
+        """Return a key on which a subject gets only the history (``@adv``), or ""."""
         keys: dict[Flow, list[str]] = {flow: [] for flow in Flow}
         history: dict[Flow, set[str]] = {flow: set() for flow in Flow}
         for rule in self.rules_of(subject):
             for flow, message in product(rule.flows, rule.messages):
                 if message not in _OF_HISTORY:
                     continue
-                # Who asks for a history gets what the other flow lets pass.
+                # A process that asks for a history gets what the other direction lets pass.
                 other = Flow.EGRESS if flow is Flow.INGRESS else Flow.INGRESS
                 for key in rule.key_expressions:
                     begin, of_history, _ = key.partition("/@adv")
@@ -614,9 +620,10 @@ class Enforcement:
         """Return whether a message from or to a remote process passes.
 
         ``key`` is the key or key expression of the message: a rule applies if one of its key
-        expressions includes the whole ``key``.  Subjects with the same values count as one, in
-        which DENY wins. Of different subjects that match, one that allows is enough; with the
-        default ALLOW, a subject allows if none of its rules denies.
+        expressions includes the whole ``key``.  Subjects with the same values count as one subject,
+        in which DENY wins.  If different subjects match, it is enough that one of them allows the
+        message.  With the default ALLOW, a subject allows the message unless one of its rules
+        denies it.
         """
         if not self.enabled:
             return AccessDecision(True, (), (), "access control is off")
@@ -674,10 +681,10 @@ class Enforcement:
     def passing(
         self, remote: Remote, flow: Flow, message: Message, of: Callable[[Iterable[str]], NameSet]
     ) -> NameSet:
-        """Return the keys without wildcards with which `decide` lets a message pass.
+        """Return the keys, without wildcards, on which `decide` lets a message pass.
 
-        ``of`` returns the set of names that key expressions include.  These names are the keys, or
-        other names that stand for keys.
+        ``of`` maps key expressions to the set of names that they include: the keys themselves, or
+        names that stand for keys.
         """
         all_names = ~NameSet()
         if not self.enabled:
@@ -698,7 +705,7 @@ class Enforcement:
 
     @cached_property
     def _combinations(self) -> Mapping[_Combination, tuple[str, ...]]:
-        """The ids of the subjects that have a combination of property values."""
+        """Maps combinations of property values to the ids of the subjects that list them."""
         ids_of: dict[_Combination, list[str]] = {}
         for subject in self.subjects:
             values = (getattr(subject, name) or (None,) for name in PROPERTIES)

@@ -1,9 +1,10 @@
-"""Zenoh configurations of processes, as rmw_zenoh reads them, without paths and without keys.
+"""Zenoh configurations of single processes, as rmw_zenoh reads them, without paths and keys.
 
 `ZenohNetwork` has the settings for all processes of a keystore.
 
-A file replaces the whole default configuration of rmw_zenoh.  So it repeats the values that ROS
-needs and that differ from Zenoh's defaults (rmw_zenoh_cpp/config/DEFAULT_RMW_ZENOH_*_CONFIG.json5).
+A configuration file replaces the whole default configuration of rmw_zenoh.  So the file repeats the
+values that ROS needs and that differ from Zenoh's defaults
+(rmw_zenoh_cpp/config/DEFAULT_RMW_ZENOH_*_CONFIG.json5).
 """
 
 from __future__ import annotations
@@ -48,8 +49,8 @@ class ZenohRouter:
     ``name`` is the router's enclave.  Sessions and other routers connect to ``endpoints``
     (``HOST:PORT``).  The router listens at ``listen``, or at the ports of ``endpoints`` on all its
     addresses.  ``enclaves`` are names of enclaves, in which ``*`` stands for any characters.
-    ``crossing`` are the topics and services that may pass between this router and others; if empty,
-    ``crossing`` of the network decides.
+    ``crossing`` are the topics and services that may pass between this router and others.  If it is
+    empty, the ``crossing`` of the network applies.
     """
 
     name: str
@@ -74,10 +75,10 @@ class ZenohRouter:
 class ZenohNetwork:
     """The Zenoh network of the enclaves of a keystore.
 
-    ``router`` is the enclave of the router.  Sessions connect to ``endpoints`` (``HOST:PORT``), and
-    the router listens at ``listen``, such as ``[::]:7447``, or else at ``endpoints``. ``mode`` is
-    the mode of the sessions, client or peer.  ``domains`` are ROS domains; if empty, the domains of
-    the keystore's governance.
+    ``router`` is the enclave of the router.  Sessions connect to ``endpoints`` (``HOST:PORT``).
+    The router listens at ``listen``, such as ``[::]:7447``, or at ``endpoints`` if ``listen`` is
+    empty.  ``mode`` is the mode of the sessions, client or peer.  ``domains`` are ROS domains; if
+    empty, the domains of the keystore's governance.
 
     ``routers`` are further routers.  All routers connect to each other, and the sessions of an
     enclave connect to the first router in ``routers`` that names the enclave.  ``crossing`` are the
@@ -98,7 +99,7 @@ class ZenohNetwork:
         return self.listen or self.endpoints
 
     def every_router(self) -> tuple[ZenohRouter, ...]:
-        """Return all routers; the first router has the enclaves that no other router names."""
+        """Return all routers; the first one has the enclaves that no other router names."""
         return (ZenohRouter(self.router, self.endpoints, self.listening(), ("*",)), *self.routers)
 
     def router_names(self) -> tuple[str, ...]:
@@ -113,12 +114,12 @@ class ZenohNetwork:
         return self.every_router()[0]
 
     def connects(self) -> Mapping[str, tuple[str, ...]]:
-        """Map each router to the endpoints of other routers that it connects to.
+        """Map each router to the endpoints of the routers to which it connects.
 
-        Of two routers, only one connects to the other.
+        In each pair of routers, only one connects to the other.
 
         Raises:
-            UsageError: neither of two routers can reach the other.
+            UsageError: in a pair of routers, neither can reach the other.
         """
         connections: dict[str, tuple[str, ...]] = {
             router.name: () for router in self.every_router()
@@ -140,7 +141,7 @@ class ZenohNetwork:
 
 _REVOKED = "last_revocation"
 _QUERY_MILLISECONDS = 600_000
-"""How long rmw_zenoh waits for a reply; Zenoh's own default of 10 s would end long calls."""
+"""How long rmw_zenoh waits for a reply; Zenoh's default of 10 s would end long calls."""
 _MICROSECONDS_UNTIL_CLOSED = 60_000_000
 """How long a session of rmw_zenoh waits for a stuck receiver before it closes the connection."""
 
@@ -148,27 +149,28 @@ _MICROSECONDS_UNTIL_CLOSED = 60_000_000
 class SettingsEdition(Enum):
     """The edition of a configuration file that sros wrote.
 
-    Editions differ in settings without effect on security, and in how rules are listed.
+    Editions differ in settings that do not affect security, and in how often a rule is written.
     """
 
     FEW = "few"
-    """The few settings of the first files: a session ends instead of waiting for its router."""
+    """Few settings, as in the first files; a session ends if its router is not there."""
     OF_RMW_ZENOH = "of rmw_zenoh"
     """All settings of rmw_zenoh that differ from Zenoh's defaults; a session waits for its router.
 
     The settings are the same in rmw_zenoh 0.1.9, 0.2.10, 0.6.7 and 0.10.5.
     """
     RULES_ONCE = "rules once"
-    """The settings of `OF_RMW_ZENOH`; a rule of several enclaves is written only once."""
+    """The settings of `OF_RMW_ZENOH`; a rule that several enclaves have is written only once."""
 
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """The configuration of one Zenoh process: where it listens and connects, and what it enforces.
+    """The configuration of one Zenoh process: its endpoints and its access control.
 
-    Endpoints have the form ``tls/HOST:PORT``.  ``revoked`` is the time of the last revocation, in
-    UTC, which shows that a file is older; "" if no enclave was revoked, or if it does not matter.
-    ``settings`` is the edition of the settings in the file that was read.
+    The process listens at ``listen`` and connects to ``connect``, in the form ``tls/HOST:PORT``.
+    ``revoked`` is the time of the last revocation in UTC, which shows that a file is older; "" if
+    no enclave was revoked, or if the age of the file does not matter.  ``settings`` is the edition
+    of a file that was read.
     """
 
     mode: Mode
@@ -179,7 +181,7 @@ class Configuration:
     settings: SettingsEdition = field(default=SettingsEdition.RULES_ONCE, compare=False)
 
     def render(self, settings: SettingsEdition = SettingsEdition.RULES_ONCE) -> bytes:
-        """Return the file: JSON, the same for equal configurations.
+        """Return the file as JSON; equal configurations have equal files.
 
         The file does not name the files of TLS; $ZENOH_CONFIG_OVERRIDE has to name them.
         """
@@ -190,7 +192,7 @@ class Configuration:
 
 
 class RenderedRights(NamedTuple):
-    """The rules for one remote enclave as they are written to a file, without ids."""
+    """The rules for one remote enclave as written to a file, without their ids."""
 
     name: str
     rules: tuple[str, ...]
@@ -204,7 +206,7 @@ def render_configuration(
     revoked: str = "",
     settings: SettingsEdition = SettingsEdition.RULES_ONCE,
 ) -> bytes:
-    """Return what `Configuration.render` does, from the rendered rights of all remote enclaves."""
+    """Return the file of `Configuration.render`, from the rendered rights of remote enclaves."""
     control = _control([*rights], once=settings is SettingsEdition.RULES_ONCE)
     without_control = _text_without_control(mode, listen, connect, revoked, settings)
     return f"{without_control}{_CONTROL}{control}".encode()
@@ -214,10 +216,10 @@ _CONTROL = ',\n "access_control": {\n'
 
 
 def _control(rendered_rights: Sequence[RenderedRights], *, once: bool) -> str:
-    """Return the text of the access control of a file.
+    """Return the text of a file's access control.
 
-    With ``once``, a rule that several enclaves have is written once, otherwise once for each
-    enclave.
+    With ``once``, a rule that several enclaves have is written once; otherwise it is written for
+    each of them.
     """
     rules: dict[str, str] = {}
     lines: dict[str, list[str]] = {"rules": [], "subjects": [], "policies": []}
@@ -247,13 +249,13 @@ def _text_without_control(
     revoked: str,
     settings: SettingsEdition,
 ) -> str:
-    """Return the text of a configuration without access control and without the last brace."""
+    """Return the text of a configuration without access control and the closing brace."""
     document: dict[str, Any] = {
         "mode": mode.value,
         "connect": {"endpoints": list(connect)},
         "listen": {"endpoints": list(listen)},
         "scouting": {
-            # A multicast group would be neither encrypted nor filtered.
+            # Multicast groups are neither encrypted nor filtered.
             "multicast": {"enabled": False},
             "gossip": {
                 "enabled": mode is not Mode.CLIENT,
@@ -265,17 +267,18 @@ def _text_without_control(
         "queries_default_timeout": _QUERY_MILLISECONDS,
         "transport": {
             "link": {
-                # Without the list, an endpoint tcp/... would be open next to tls/... .
+                # Without this list, the process could also open an endpoint tcp/... in addition to
+                # tls/... .
                 "protocols": ["tls"],
                 "tls": {
                     "enable_mtls": True,
-                    # Certificates of enclaves name an enclave, not a host: the rules ask for
-                    # that name, and no subject is without one.
+                    # The certificate of an enclave names the enclave, not a host.  Rules check this
+                    # name, and every subject has a name.
                     "verify_name_on_connect": False,
                     "close_link_on_expiration": True,
                 },
             },
-            # Shared memory between processes of a host would not be encrypted.
+            # Shared memory between processes of a host is not encrypted.
             "shared_memory": {"enabled": False},
         },
         "adminspace": {"enabled": False},
@@ -289,7 +292,8 @@ def _text_without_control(
 
 def _add_settings_of_rmw_zenoh(document: dict[str, Any], mode: Mode) -> None:
     transport = document["transport"]
-    # Hundreds of nodes that start together all get their connection, although each takes a while.
+    # These limits let hundreds of nodes that start together connect, although each connection takes
+    # a while.
     transport["unicast"] = {
         "open_timeout": 60_000,
         "accept_timeout": 60_000,
@@ -302,11 +306,12 @@ def _add_settings_of_rmw_zenoh(document: dict[str, Any], mode: Mode) -> None:
     if mode is Mode.ROUTER:
         document["routing"] = {"router": {"peers_failover_brokering": False}}
     else:
-        # A number of microseconds, although all others are in milliseconds.
+        # In microseconds, unlike all other times, which are in milliseconds.
         block = {"wait_before_close": _MICROSECONDS_UNTIL_CLOSED}
         sending["queue"] = {"congestion_control": {"block": block}}
     if mode is Mode.CLIENT:
-        # A client of Zenoh ends if its router is not there yet; rmw_zenoh waits for the router.
+        # Zenoh's default ends a client whose router is not there yet; with this value it waits, as
+        # in rmw_zenoh.
         document["connect"]["timeout_ms"] = -1
     else:
         document["scouting"]["gossip"]["autoconnect_strategy"] = {mode.value: strategy}
@@ -316,7 +321,7 @@ _PERMISSIONS = {True: "allow", False: "deny"}
 
 
 def render_rights(remote: RemoteRights) -> RenderedRights:
-    """Return the rules of a remote enclave as the files have them."""
+    """Return the rules of a remote enclave as they are written to files."""
     return RenderedRights(
         remote.common_name, tuple([_rendered_rule(rule) for rule in remote.rules])
     )
@@ -329,13 +334,13 @@ def _rendered_rule(rule: AccessRule) -> str:
     )
 
 
-@lru_cache(maxsize=4096)  # several rules have the same, and in peer mode many files
+@lru_cache(maxsize=4096)  # several rules have the same list, and in peer mode many files have it
 def _listed(texts: tuple[str, ...]) -> str:
     return _list(texts)
 
 
 def _list(texts: Iterable[str]) -> str:
-    """Return texts as a JSON list: much faster than `json.dumps` if they are short."""
+    """Return texts as a JSON list; for short texts, this is much faster than `json.dumps`."""
     return f"[{', '.join(map(encode_basestring_ascii, texts))}]"
 
 
@@ -366,7 +371,7 @@ _SECTIONS = re.compile(
 class RenderedReader:
     """A reader of many configurations that `Configuration.render` wrote.
 
-    Equal files, and equal rules of several files, are read only once.
+    Equal files are read only once, as are equal rules in several files.
     """
 
     def __init__(self) -> None:
@@ -376,7 +381,7 @@ class RenderedReader:
         self._rules: dict[str, AccessRule] = {}
 
     def read(self, data: bytes) -> Configuration | None:
-        """Return a configuration, or None if it is not exactly as sros writes it."""
+        """Return a configuration, or None if the file is not exactly as sros writes it."""
         digest = sha256(data).digest()
         if digest not in self._read:
             self._read[digest] = self._read_in_full(data)
@@ -404,7 +409,7 @@ class RenderedReader:
             return None
 
     def _parse_without_rules(self, text: str) -> Configuration:
-        """Return mode and endpoints of a configuration.
+        """Return the mode and the endpoints of a configuration.
 
         Raises:
             ValueError, KeyError: sros did not write the file.
@@ -438,7 +443,7 @@ class RenderedReader:
         return rights
 
     def _policy(self, line: str) -> tuple[str, list[str]]:
-        """Return the enclave that a policy is for, and the ids of the policy's rules."""
+        """Return the enclave to which a policy applies, and the ids of the policy's rules."""
         if line not in self._policies:
             policy = json.loads(line)
             self._policies[line] = policy["subjects"][0], policy["rules"]
@@ -469,7 +474,7 @@ _MOST_PORT = 65535
 
 
 def is_endpoint(text: str) -> bool:
-    """Return whether ``text`` is ``HOST:PORT``, with a name or an address and a port from 1."""
+    """Return whether ``text`` is ``HOST:PORT``, with a name or an address and a port above 0."""
     endpoint = _ENDPOINT.match(text)
     return bool(endpoint and 0 < int(endpoint[1]) <= _MOST_PORT)
 
@@ -477,8 +482,8 @@ def is_endpoint(text: str) -> bool:
 def check_network(network: ZenohNetwork) -> None:
     """Raise `UsageError` for a network in which processes cannot communicate.
 
-    Hosts are compared by name, although two names may mean the same host: only names such as
-    localhost certainly mean this host.
+    Hosts are compared by name, and only names such as localhost count as this host, although
+    another name may mean the same host.
     """
     if network.routers:
         _check_routers(network)
@@ -521,7 +526,7 @@ def check_network(network: ZenohNetwork) -> None:
 
 
 def _check_routers(network: ZenohNetwork) -> None:
-    """Raise `UsageError` if several routers do not fit together."""
+    """Raise `UsageError` if the routers of a network cannot work together."""
     if network.mode is Mode.PEER:
         raise UsageError(
             "several routers need client mode",
@@ -530,12 +535,12 @@ def _check_routers(network: ZenohNetwork) -> None:
         )
     network.connects()
     for router in network.routers:
-        # What is said of one router holds for each of them.
+        # The rules for the first router apply to each router.
         check_network(ZenohNetwork(router.name, router.endpoints, router.listening(), network.mode))
 
 
 def _endpoints_for_others(router: ZenohRouter) -> tuple[str, ...]:
-    """Return the endpoints at which processes of other hosts reach a router."""
+    """Return the endpoints at which processes on other hosts can reach a router."""
     listens = {_host_and_port(endpoint)[0] for endpoint in router.listening()}
     far = tuple(
         endpoint for endpoint in router.endpoints if _host_and_port(endpoint)[0] != _LOOPBACK

@@ -1,9 +1,9 @@
-"""Deliveries between Zenoh processes: which messages have to pass on each link.
+"""Deliveries between Zenoh processes: which messages must pass on each link.
 
-On a link, both processes enforce their rules: the sender by egress rules, the receiver by ingress
-rules.  A process drops a denied message without an error.  Which messages a delivery needs, and on
-which links, was tested with zenoh 1.10.2, by denying one message after another.  A test compares
-the result on random rules (``tests/integration/test_zenoh_deliveries.py``).
+On a link, both processes enforce their rules: the sender with egress rules, the receiver with
+ingress rules.  A process drops a denied message without an error.  Tests with zenoh 1.10.2, which
+denied one message after another, showed which messages a delivery needs on which links.  A test
+compares the result on random rules (``tests/integration/test_zenoh_deliveries.py``).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sros_tool.zenoh.configuration import Mode
 
 @dataclass(frozen=True, slots=True)
 class ZenohProcess:
-    """A Zenoh process that uses TLS: the common name of its certificate, and what it enforces."""
+    """A Zenoh process that uses TLS: the common name of its certificate, and its access control."""
 
     name: str
     mode: Mode
@@ -36,11 +36,11 @@ class Check:
     remote: str
     """The enclave at the other end."""
     flow: Flow
-    """From (`ingress`) or to (`egress`) the other end."""
+    """The direction: from (`ingress`) or to (`egress`) the other end."""
     message: Message
-    """The kind of message, as Zenoh's rules name it."""
+    """The kind of message, as in Zenoh's rules."""
     key: str
-    """The key of the message; `any::type/hash` stands for every type."""
+    """The key of the message; `any::type/hash` stands for any type."""
     decision: AccessDecision
 
     @property
@@ -50,7 +50,10 @@ class Check:
 
     @property
     def rules(self) -> tuple[str, ...]:
-        """The ids of the rules that decide whether the message passes."""
+        """The ids of the rules that decide whether the message passes.
+
+        There are none if the default decides.
+        """
         return self.decision.rules
 
     @property
@@ -66,9 +69,10 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """The checks that a message has to pass until it arrives, in order.
+    """The checks that a message must pass on its way, in order.
 
-    ``replies`` are the checks on the reply to a call; the call is executed even if they fail.
+    ``replies`` are the checks on the reply to a call; the call is executed even if the reply is
+    denied.
     """
 
     checks: tuple[Check, ...]
@@ -76,19 +80,19 @@ class Delivery:
 
     @property
     def arrives(self) -> bool:
-        """Whether the message arrives: a sample, a request or a token."""
+        """Whether the message (a sample, a request or a token) arrives."""
         return all(check.allowed for check in self.checks)
 
     @property
     def answered(self) -> bool:
-        """Whether the reply arrives, too."""
+        """Whether the message and the reply to it arrive."""
         return self.arrives and all(check.allowed for check in self.replies)
 
 
 Route = tuple[ZenohProcess, ...]
-"""The two to four processes that a message passes, from the sender to the receiver.
+"""The two to four processes through which a message passes, from the sender to the receiver.
 
-A route between a session and its router is the part for which the rights of one enclave decide.
+If a route has only a session and its router, only the rights of the session's enclave decide.
 """
 
 
@@ -107,14 +111,15 @@ def route(
     return source, router, target
 
 
-def deliver_sample(route: Route, key: str, subscribed_key: str = "") -> Delivery:
+def sample_delivery(route: Route, key: str, subscribed_key: str = "") -> Delivery:
     """Return the delivery of a published sample along ``route``.
 
-    ``key`` is the key of the sample, perhaps with wildcards; ``subscribed_key`` is the key of the
-    subscription ("": the same key).
+    ``key`` is the key of the sample, perhaps with wildcards.  ``subscribed_key`` is the key of the
+    subscription; "" stands for the same key.
     """
     back = route[::-1]
-    # Nothing is sent that nobody wants to hear, but what has wildcards goes to the router anyway.
+    # Only samples with a declared subscription are sent, except that samples with wildcards always
+    # go to the router.
     wanted = back[:-1] if "*" in key and route[1].mode is Mode.ROUTER else back
     return Delivery(
         (
@@ -124,14 +129,14 @@ def deliver_sample(route: Route, key: str, subscribed_key: str = "") -> Delivery
     )
 
 
-def deliver_query(route: Route, key: str, served_key: str = "", reply_key: str = "") -> Delivery:
+def query_delivery(route: Route, key: str, served_key: str = "", reply_key: str = "") -> Delivery:
     """Return the delivery of a query along ``route``, and of the reply.
 
-    ``key`` is the key of the query; ``served_key`` is the key of the queryable, and ``reply_key``
-    the key of the reply ("": the same key).
+    ``key`` is the key of the query.  ``served_key`` is the key of the queryable, and ``reply_key``
+    the key of the reply; "" stands for the same key.
     """
     back = route[::-1]
-    # Queries go to the router in any case, and to another peer only if it offers to reply.
+    # Queries always go to the router, but to another peer only if it declares a queryable.
     offered = back[:-1] if route[1].mode is Mode.ROUTER else back
     return Delivery(
         (
@@ -142,13 +147,13 @@ def deliver_query(route: Route, key: str, served_key: str = "", reply_key: str =
     )
 
 
-def deliver_token(
+def token_delivery(
     route: Route, key: str, asked_key: str, message: Message = Message.DECLARE_LIVELINESS_SUBSCRIBER
 ) -> Delivery:
-    """Return the delivery of a liveliness token along ``route``, to a watching process.
+    """Return the delivery of a liveliness token along ``route`` to a process that watches tokens.
 
-    ``asked_key`` is the key that this process asks for, by a ``message``.  A router answers it;
-    peers send each other all tokens without being asked.
+    ``asked_key`` is the key of the ``message`` by which this process asks for tokens.  A router
+    sends tokens only when asked; peers send each other all tokens without being asked.
     """
     asking = route[:-3:-1] if route[-2].mode is Mode.ROUTER else ()
     return Delivery(
@@ -160,7 +165,7 @@ def deliver_token(
 
 
 def _checks_on_route(way: Sequence[ZenohProcess], message: Message, key: str) -> Iterator[Check]:
-    """Yield the checks that a message has to pass on all links of a route."""
+    """Yield the checks that a message must pass on all links of a route."""
     for sender, receiver in pairwise(way):
         for enforcer, remote, flow in (
             (sender, receiver.name, Flow.EGRESS),

@@ -1,11 +1,11 @@
-"""Read Zenoh configurations, whoever wrote them: JSON5, or YAML in JSON syntax.
+"""A reader of Zenoh configurations by any author: JSON5, or YAML in JSON syntax.
 
-Zenoh chooses the language by the file name's ending, and reads no file with another ending.
+Zenoh chooses the language by the ending of the file name, and reads no files with other endings.
 
-Only settings that security depends on become values.  `ConfigurationDocument.unknown` names
-settings that no version up to 1.10 has.  A file that Zenoh does not accept is an error, because a
-process with it does not start. Source: commons/zenoh-config of zenoh 1.9; compared with the wheel
-1.10.2.
+Only settings that matter for security become values.  `ConfigurationDocument.unknown` names
+settings that do not exist in any version up to 1.10.  A file that Zenoh refuses is an error,
+because no process starts with it.  Source: commons/zenoh-config of zenoh 1.9; compared with the
+wheel 1.10.2.
 """
 
 from __future__ import annotations
@@ -57,16 +57,16 @@ _LISTEN: Mapping[Mode, tuple[str, ...]] = {
     Mode.PEER: ("tcp/[::]:0",),
     Mode.CLIENT: (),
 }
-"""Where a process listens if its configuration does not say."""
+"""Where a process listens, by mode, if its configuration names no endpoint."""
 ENCRYPTED = frozenset({"tls", "quic"})
-"""The protocols that encrypt, and authenticate by certificates."""
+"""The protocols that encrypt messages, and authenticate processes by certificates."""
 _LINK_PROTOCOLS = frozenset(
     {"tcp", "udp", "tls", "quic", "serial", "unixpipe", "unixsock-stream", "vsock", "ws"}
 )
 _AS_YAML = (".yaml", ".yml")
 _AS_TOML = (".toml",)
 ENDINGS = (".json5", ".json", *_AS_YAML, *_AS_TOML)
-"""Endings of the file names that Zenoh reads (1.10.2, tested)."""
+"""Endings of file names that Zenoh reads (tested with 1.10.2)."""
 _OTHER_IN_YAML = re.compile(r"\\u|[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028\u2029\ufeff]")
 """Characters and escapes that YAML reads differently from JSON, or refuses."""
 _MOST_MEANT = 1_000_000
@@ -76,7 +76,7 @@ _ZID = re.compile(r"[1-9a-f][0-9a-f]{0,31}", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class ZenohEndpoint:
-    """An address at which a process listens or connects: ``PROTOCOL/ADDRESS?METADATA#OPTIONS``."""
+    """An address to listen at or to connect to: ``PROTOCOL/ADDRESS?METADATA#OPTIONS``."""
 
     text: str
 
@@ -87,7 +87,7 @@ class ZenohEndpoint:
 
     @property
     def address(self) -> str:
-        """Its address without metadata and options, such as "localhost:7447"."""
+        """The address without metadata and options, such as "localhost:7447"."""
         return self.text.partition("/")[2].partition("#")[0].partition("?")[0]
 
     def is_encrypted(self) -> bool:
@@ -96,13 +96,13 @@ class ZenohEndpoint:
 
     @property
     def options(self) -> Mapping[str, str]:
-        """The options of the endpoint, which override the section ``tls``."""
+        """The options of the endpoint, which override the ``tls`` section of the configuration."""
         stated = self.text.partition("#")[2].split(";")
         pairs = (option.partition("=") for option in stated if option)
         return {name: value for name, _, value in pairs}
 
     def option(self, name: str, otherwise: bool) -> bool:
-        """Return a yes-or-no option of TLS, or ``otherwise`` if the endpoint does not state it."""
+        """Return a boolean TLS option, or ``otherwise`` if the endpoint does not state it."""
         option_value = self.options.get(name)
         return otherwise if option_value is None else option_value == "true"
 
@@ -113,8 +113,8 @@ class TlsOptions:
 
     ``mutual``: a connecting process must show a certificate.  ``verifies_name``: the certificate of
     a listening process must have the host of the endpoint.  ``closes_on_expiration``: a connection
-    ends when the certificate of the other side expires.  ``named`` are the settings for
-    certificates and keys in the file, such as "root_ca_certificate".
+    ends when the certificate of the other side expires.  ``named`` are the names of the settings
+    for certificates and keys in the file, such as "root_ca_certificate".
     """
 
     mutual: bool = False
@@ -127,10 +127,10 @@ class TlsOptions:
 class ConfigurationDocument:
     """The configuration of a Zenoh process: settings for security, with Zenoh's defaults.
 
-    ``protocols`` are the protocols that endpoints may have, None for all.  ``namespace`` is put
+    ``protocols`` are the protocols that endpoints may have; None allows all.  ``namespace`` is put
     before every key of the process.  ``lines`` maps paths of settings, such as "transport/link", to
-    their lines; ``unknown`` are paths that no version of Zenoh up to 1.10 accepts.  ``settings``
-    are all settings of the file except access control, as JSON.
+    their lines; ``unknown`` are paths that no version of Zenoh up to 1.10 knows.  ``settings`` are
+    all settings of the file, as JSON, except access control.
     """
 
     name: str
@@ -155,7 +155,7 @@ class ConfigurationDocument:
         """Return where a process without a certificate can connect, as a clause; "" if nowhere."""
         for endpoint in (*self.listen, *self.connect):
             if self.protocols is not None and endpoint.protocol not in self.protocols:
-                continue  # it is refused
+                continue  # Zenoh refuses this endpoint
             if not endpoint.is_encrypted():
                 return f"it has the endpoint {endpoint.text[:80]!r} without TLS"
         for endpoint in self.listen:
@@ -164,14 +164,14 @@ class ConfigurationDocument:
         return ""
 
     def line_of(self, path: str) -> int:
-        """Return the line of a setting, else of the smallest section around it, else 1."""
+        """Return the line of a setting, or else of the smallest section around it, or else 1."""
         while path and path not in self.lines:
             path = path.rpartition("/")[0]
         return self.lines.get(path, 1)
 
 
 class UnreadConfigurationError(DocumentError):
-    """A configuration that Zenoh may read but sros does not, so that its rules are unknown."""
+    """A configuration that sros cannot read but Zenoh may, so that its rules are unknown."""
 
 
 def parse_configuration(
@@ -179,13 +179,13 @@ def parse_configuration(
 ) -> ConfigurationDocument:
     """Return the configuration that a file states; ``name`` is the file's name in errors.
 
-    ``overrides`` are paths of settings and their values in JSON5, which replace settings of the
-    file, like the pairs of ZENOH_CONFIG_OVERRIDE.  Without ``lines``, every line is 1, and large
-    files are read faster.
+    ``overrides`` are pairs of a path of a setting and a JSON5 value that replaces the value in the
+    file, as in ZENOH_CONFIG_OVERRIDE.  Without ``lines``, every line number is 1, and large files
+    are read faster.
 
     Raises:
-        UnreadConfigurationError: Zenoh may read it, and sros does not: the file has more than
-            16 MiB, is TOML or YAML that is not JSON, too, or has lists in place of objects, whose
+        UnreadConfigurationError: sros cannot read the file, but Zenoh may: the file has more than
+            16 MiB, is TOML, is YAML that is not also JSON, or has lists in place of objects, whose
             meaning depends on the version.
         DocumentError: the file is not JSON5, or Zenoh would not accept it.
     """
@@ -196,7 +196,11 @@ def parse_configuration(
 
 
 def _override(root: _Section, path: str, value: str) -> None:
-    """Replace a setting; a value that Zenoh does not accept is an error."""
+    """Replace a setting.
+
+    Raises:
+        DocumentError: Zenoh refuses the path or the value.
+    """
     *parents, last = (part for part in path.split("/") if part) if path.strip("/") else [""]
     inner = root.value
     try:
@@ -253,10 +257,10 @@ def _has_ending(name: str, endings: tuple[str, ...] = (*_AS_YAML, *_AS_TOML)) ->
 
 
 def _parse_yaml(text: str, name: str) -> object:
-    """Return the value of YAML that is also valid JSON with the same meaning.
+    """Return the value of a YAML text that is also JSON with the same meaning.
 
     Raises:
-        UnreadConfigurationError: the text is not such YAML, or it is TOML.
+        UnreadConfigurationError: the text is other YAML, or TOML.
     """
     value: object = None
     if not _has_ending(name, _AS_TOML) and not _OTHER_IN_YAML.search(text):
@@ -275,7 +279,7 @@ def _parse_yaml(text: str, name: str) -> object:
 def _json5_error_class(name: str) -> type[DocumentError]:
     """Return the error class for text that is not JSON5.
 
-    By some file names, Zenoh reads such text as YAML, so sros does not know its meaning.
+    If Zenoh reads a file of this ``name`` as another language, the text may still have a meaning.
     """
     return UnreadConfigurationError if _has_ending(name) else DocumentError
 
@@ -287,7 +291,7 @@ def _object_error_class(value: object) -> type[DocumentError]:
 
 @dataclass(frozen=True, slots=True)
 class _Section:
-    """An object in the file ``name``, at a path of settings; the path "" is the whole file."""
+    """An object in the file ``name``, at a path of settings; "" is the path of the whole file."""
 
     name: str
     path: str
@@ -426,7 +430,7 @@ def _configuration(root: _Section, name: str) -> ConfigurationDocument:
 def _read_endpoints(
     section: _Section, mode: Mode, default: tuple[str, ...]
 ) -> tuple[ZenohEndpoint, ...]:
-    """Return the endpoints of a section, which may state different endpoints for each mode."""
+    """Return the endpoints of a section, which may state endpoints for each mode separately."""
     if isinstance(section.value.get("endpoints"), Json5Object):
         section = section.section("endpoints")
         section.check_members([mode.value for mode in Mode])
@@ -538,7 +542,7 @@ def _check_ids(section: _Section, enforcement: Enforcement) -> None:
 def _check_size(section: _Section, enforcement: Enforcement) -> None:
     """Raise an error if access control would need many millions of decisions.
 
-    Even a small file can state that much.
+    Even a small file can state enough rules for that.
     """
     values = {
         subject.id: prod(len(getattr(subject, name) or (None,)) for name in PROPERTIES)

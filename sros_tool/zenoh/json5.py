@@ -1,7 +1,7 @@
 """Reading JSON5, the language of Zenoh's configurations, with the line of each member.
 
-Size and depth are limited, and the time is linear in the size: no recursion, no backtracking. Like
-Zenoh, it refuses an object that names a member twice, because readers differ in which value counts.
+Size and depth are limited, and the time is linear in the size: no recursion, no backtracking.  As
+in Zenoh, an object with a repeated member is refused, because readers differ in which value counts.
 Source: spec.json5.org 1.0; compared with what the wheel 1.10.2 accepts.
 """
 
@@ -17,14 +17,14 @@ MOST_BYTES = 16 * 1024 * 1024
 _MOST_DEPTH = 100
 _MOST_DIGITS = 400
 _MOST_TOKENS = 2_000_000
-"""Maximum number of tokens in a text; more would take many seconds.
+"""Maximum number of tokens in a text; more tokens would take many seconds.
 
-The router of a thousand enclaves has less than half of this number.
+The configuration of the router of a thousand enclaves has less than half as many.
 """
 _MOST_WITHOUT_LINES = 200_000
-"""Maximum number of tokens of JSON5 that is not plain JSON, if lines are not needed.
+"""Maximum number of tokens in JSON5 that is not plain JSON, if lines are not needed.
 
-The default Zenoh configuration has a fiftieth of this number.
+The default Zenoh configuration has a fiftieth as many.
 """
 
 
@@ -38,7 +38,7 @@ class Json5Error(ValueError):
 
 
 class Json5Object(dict[str, Any]):
-    """An object, with the line on which it begins and the line of each member."""
+    """An object with its first line and the line of each member."""
 
     def __init__(self, line: int) -> None:
         super().__init__()
@@ -60,7 +60,7 @@ _TOKEN = re.compile(
     re.VERBOSE | re.DOTALL,
 )
 _NOT_IN_JSON5 = re.compile(r"\\u|[\u2028\u2029]")
-"""Text in strings that JSON allows and JSON5 does not: half characters, and U+2028, U+2029."""
+"""Matches what strings can have in JSON but not in JSON5: Unicode escapes, U+2028, U+2029."""
 _LINE = re.compile(r"\r\n|[\n\r\u2028\u2029]")
 _ESCAPE = re.compile(r"\\(?:u([0-9a-fA-F]{4})|x([0-9a-fA-F]{2})|(\r\n|.))", re.DOTALL)
 _ESCAPED = {"b": "\b", "f": "\f", "n": "\n", "r": "\r", "t": "\t", "v": "\v", "0": "\0"}
@@ -77,15 +77,15 @@ class _Token(NamedTuple):
 def parse_json5(text: str, *, lines: bool = True) -> Any:
     """Return the value of a JSON5 text; each object is a `Json5Object`.
 
-    Without ``lines``, every line is 1.  Plain JSON is then read about twenty times as fast, and
-    other JSON5 has to be small.
+    Without ``lines``, every line number is 1; plain JSON is then read about twenty times as fast,
+    and other JSON5 has to be small.
 
     Raises:
-        Json5Error: the text is not JSON5, is too large, has more than 100 levels, or an object that
-            names a member twice.
+        Json5Error: the text is not JSON5, is too large, has more than 100 levels, or an object has
+            a repeated member.
     """
     if not lines and not _NOT_IN_JSON5.search(text):
-        with suppress(Json5Error):  # then the reader of JSON5 says what is wrong
+        with suppress(Json5Error):  # the JSON5 reader below reports the error
             return parse_json(text)
     return _Reader(text, _MOST_TOKENS if lines else _MOST_WITHOUT_LINES).document()
 
@@ -128,7 +128,7 @@ def _tokens(text: str, maximum: int) -> Iterator[_Token]:
     at, line, count = 0, 1, 0
     while at < len(text):
         count += 1
-        if count > 2 * maximum:  # every other one may be space
+        if count > 2 * maximum:  # up to half of the tokens may be space
             raise Json5Error(f"more than {maximum} tokens", line)
         match = _TOKEN.match(text, at)
         if match is None:
@@ -144,7 +144,7 @@ def _tokens(text: str, maximum: int) -> Iterator[_Token]:
 
 
 class _Reader:
-    """A reader of JSON5 values; ``_now`` is the next token."""
+    """A reader of JSON5 values; ``_now`` is the current token."""
 
     def __init__(self, text: str, maximum: int) -> None:
         self._tokens = _tokens(text, maximum)
@@ -233,7 +233,7 @@ def _unescaped(text: str, line: int) -> str:
     if "\\" not in text:
         return text
     text = _ESCAPE.sub(character, text)
-    try:  # two escapes may be the halves of one character
+    try:  # two escapes can be the two surrogates of one character
         return text.encode("utf-16", "surrogatepass").decode("utf-16")
     except UnicodeDecodeError:
         raise Json5Error("a text with half a character (a lone surrogate)", line) from None

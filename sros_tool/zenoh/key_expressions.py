@@ -1,8 +1,8 @@
-"""Key expressions of Zenoh: their canonical form, and whether they include or intersect others.
+"""Key expressions of Zenoh: their canonical form, inclusion and intersection.
 
-A key expression has chunks, with "/" between them.  ``*`` stands for one chunk, ``**`` for any
-number of them, ``$*`` for any part of a chunk.  No wildcard matches a chunk that begins with ``@``.
-Source: zenoh.io "Key Expressions"; tested with the wheel 1.10.2.
+A key expression consists of chunks with "/" between them.  ``*`` stands for one chunk, ``**`` for
+any number of chunks, ``$*`` for any part of a chunk.  No wildcard matches a chunk that begins with
+``@``.  Source: zenoh.io "Key Expressions"; tested with the wheel 1.10.2.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from sros_tool.names import has_parts
 ANY_PART, ANY_CHUNK, ANY_CHUNKS = "$*", "*", "**"
 _MANY = 65536
 _LITERAL = re.compile(r"(?<![^/])[^/*]+(?![^/])")
-"""A chunk without wildcards."""
+"""Matches a chunk without wildcards."""
 _MOST_COMPARED = 100_000
-"""Maximum number of comparisons to find expressions that others include (under a second)."""
+"""Maximum number of comparisons to find expressions that others include (takes under a second)."""
 
 
 def canonical(chunks: Iterable[str]) -> str:
-    """Return the key expression of some chunks in the only form that Zenoh accepts.
+    """Return the key expression of some chunks in canonical form, the only form that Zenoh accepts.
 
-    A chunk that is only ``$*`` becomes ``*``.  In a row of wildcards, each ``*`` comes before the
-    only ``**``.  With rules in another form, a session does not open.
+    A chunk that is only ``$*`` becomes ``*``.  In a run of wildcards, each ``*`` comes before the
+    single ``**``.  If a rule has a key in another form, the session does not open.
     """
     chunks = tuple(chunks)
     text = "/".join(chunks)
@@ -50,7 +50,7 @@ def canonical(chunks: Iterable[str]) -> str:
 
 
 def includes(wide: str, narrow: str) -> bool:
-    """Return whether ``wide`` includes every key that ``narrow`` stands for, as Zenoh decides."""
+    """Return whether ``wide`` includes every key that ``narrow`` includes, as Zenoh decides."""
     if wide == narrow:
         return True
     begin = _fixed_begin(wide)
@@ -58,14 +58,14 @@ def includes(wide: str, narrow: str) -> bool:
 
 
 class KeyExpressions:
-    """Key expressions, with a fast search for those that include another one."""
+    """A set of key expressions, with a fast search for those that include another expression."""
 
     def __init__(self, expressions: Iterable[str]) -> None:
         self.all = frozenset(expressions)
 
     @cached_property
     def _by_begin(self) -> Mapping[str, Mapping[str, Mapping[str, list[str]]]]:
-        """Wildcard expressions, by text before the wildcard, `_landmark` and `_wildcard_form`."""
+        """Wildcard expressions, by `_fixed_begin`, `_landmark` and `_wildcard_form`."""
         groups: dict[str, dict[str, dict[str, list[str]]]] = {}
         for expression in self.all:
             if (begin := _fixed_begin(expression)) != expression:
@@ -83,19 +83,22 @@ class KeyExpressions:
             return True
         return any(
             _includes(wide, narrow)
-            for by_form in self._beginning_as(narrow)
+            for by_form in self._candidates(narrow)
             for same_form in by_form.values()
             for wide in same_form
         )
 
     def needed(self) -> list[str]:
-        """Return the expressions that no other one includes, sorted; all if there are too many."""
+        """Return the expressions that no other one includes, sorted.
+
+        If there are too many to compare, all expressions are returned.
+        """
         forms = {expression: _wildcard_form(expression) for expression in self.all}
         if len(set(forms.values())) == 1:
             return sorted(self.all)
         wider, compared = {}, 0
         for expression in self.all:
-            wider[expression] = candidates = self._beginning_as(expression)
+            wider[expression] = candidates = self._candidates(expression)
             compared += sum(
                 len(expressions) for by_form in candidates for expressions in by_form.values()
             )
@@ -108,16 +111,16 @@ class KeyExpressions:
                 _includes(wide, expression)
                 for by_form in wider[expression]
                 for form, same_form in by_form.items()
-                # With the same wildcards at the same places, none includes another.
+                # Expressions with the same wildcards at the same places do not include each other.
                 if form != own_form
                 for wide in same_form
             )
         )
 
-    def _beginning_as(self, narrow: str) -> list[Mapping[str, list[str]]]:
-        """Return the expressions that may include ``narrow``, by their form.
+    def _candidates(self, narrow: str) -> list[Mapping[str, list[str]]]:
+        """Return the expressions with wildcards that may include ``narrow``, as groups by form.
 
-        These have wildcards, begin like ``narrow``, and have a landmark that is a chunk of it.
+        They begin like ``narrow``, and their landmark is "" or a chunk of ``narrow``.
         """
         by_begin, candidates = self._by_begin, []
         chunks = {*_chunks(narrow), ""}
@@ -131,7 +134,7 @@ class KeyExpressions:
 
 @lru_cache(maxsize=_MANY)
 def _wildcard_form(expression: str) -> str:
-    """Return the wildcards of an expression and their positions, as text."""
+    """Return the wildcards and slashes of an expression, without other text."""
     return _LITERAL.sub("", expression)
 
 
@@ -145,7 +148,7 @@ def _landmark(expression: str) -> str:
 def _without_wildcards(expression: str) -> str:
     """Return the text with which every key of an expression begins.
 
-    A slash before ``**`` is not part of it, because "/**" may stand for nothing.
+    A slash before ``**`` is left out, because "/**" can match nothing.
     """
     begin, wildcard, _ = expression.partition("*")
     return begin.rstrip("$/") if wildcard else expression
@@ -199,7 +202,7 @@ def sequence_includes(wide: Sequence[str], narrow: Sequence[str]) -> bool:
 
 
 def _with_skipped_wildcards(positions: set[int], wide: Sequence[str]) -> set[int]:
-    """Return positions in ``wide``, with the ones after each ``**``: it may stand for nothing."""
+    """Return the positions in ``wide``, and those after a ``**``, which can match nothing."""
     places = set(positions)
     for at in sorted(positions):
         while at < len(wide) and wide[at] == ANY_CHUNKS:
@@ -217,29 +220,29 @@ def _chunk_includes(wide: str, narrow: str) -> bool:
         return True
     if narrow == ANY_CHUNK:
         return False
-    # "\0" is no character of a key: what only a wildcard includes.
+    # "\0" is no character of a key, so only a wildcard matches it.
     return has_parts(narrow.replace(ANY_PART, "\0"), wide.split(ANY_PART))
 
 
 def widest_expression(expression: str) -> str:
-    """Return the expression in which ``**`` replaces all chunks but those that begin with ``@``."""
+    """Return an expression with ``**`` for all chunks, except those that begin with ``@``."""
     chunks = expression.split("/")
     return canonical(chunk if chunk.startswith("@") else ANY_CHUNKS for chunk in chunks)
 
 
 def intersects(first: str, second: str) -> bool:
-    """Return whether some key belongs to both expressions, as Zenoh decides."""
+    """Return whether some key matches both expressions, as Zenoh decides."""
     return sequences_intersect(_chunks(first), _chunks(second))
 
 
 @lru_cache(maxsize=_MANY)
 def sequences_intersect(first: tuple[str, ...], second: tuple[str, ...]) -> bool:
-    """Return whether some key belongs to both expressions, given as chunks."""
+    """Return whether some key matches both expressions, given as chunks."""
     return _sequences_intersect(first, second, ANY_CHUNKS, chunks_intersect)
 
 
 def chunks_intersect(first: str, second: str) -> bool:
-    """Return whether some key belongs to both of two chunks."""
+    """Return whether some chunk of a key matches both chunks."""
     if first == second:
         return True
     if ANY_CHUNKS in (first, second):
@@ -250,7 +253,7 @@ def chunks_intersect(first: str, second: str) -> bool:
         return True
     if "*" not in first and "*" not in second:
         return False
-    # "\0" is no character of a key: here it stands for any characters.
+    # "\0" is no character of a key; here it is the wildcard for any characters.
     left, right = (chunk.replace(ANY_PART, "\0") for chunk in (first, second))
     return _sequences_intersect(left, right, "\0", lambda a, b: "\0" in (a, b) or a == b)
 
@@ -258,9 +261,9 @@ def chunks_intersect(first: str, second: str) -> bool:
 def _sequences_intersect(
     first: Sequence[str], second: Sequence[str], many: str, meet: Callable[[str, str], bool]
 ) -> bool:
-    """Return whether two sequences can be equal; ``many`` stands for any number of members.
+    """Return whether two sequences can match the same; ``many`` matches any number of members.
 
-    ``meet`` returns whether two members can be equal.
+    ``meet`` returns whether two members can match the same.
     """
     reached = {0}
     for left in (*first, None):
@@ -286,18 +289,18 @@ def _sequences_intersect(
 # ── what two expressions have in common ────────────────────────────────────────────────────
 
 _MOST_COMMON = 4096
-"""Maximum number of key expressions that describe what two key expressions share."""
+"""Maximum number of key expressions that describe the intersection of two key expressions."""
 
 
 class TooManyExpressions(Exception):  # noqa: N818 - the caller makes an error of it
-    """Too many key expressions would be needed for the keys that two key expressions share."""
+    """The intersection of key expressions needs too many key expressions."""
 
 
 def common(first: str, second: str) -> list[str]:
-    """Return key expressions for exactly the keys that both expressions include.
+    """Return key expressions for the intersection: exactly the keys that both expressions include.
 
     Raises:
-        TooManyExpressions: there are too many.
+        TooManyExpressions: the result would have too many key expressions.
     """
     if includes(first, second):
         return [second]
@@ -310,12 +313,12 @@ def common(first: str, second: str) -> list[str]:
 
 
 _ANY_LETTERS = "\0"
-"""Stands for ``$*``; it cannot occur in a key."""
+"""Stands for ``$*``, and cannot occur in a key."""
 
 
 @lru_cache(maxsize=_MANY)
 def common_chunks(first: str, second: str) -> tuple[str, ...]:
-    """Return chunks that together match what both chunks match; ``**`` matches any chunk."""
+    """Return chunks for the intersection of two chunks, in which ``**`` matches any chunk."""
     if first == second:
         return (first,)
     if ANY_CHUNKS in (first, second):
@@ -345,9 +348,10 @@ def _common_parts(
     many: str,
     meet: Callable[[str, str], tuple[str, ...]],
 ) -> set[tuple[str, ...]]:
-    """Return what two sequences share; ``many`` stands for any number of members.
+    """Return the intersection of two sequences; ``many`` matches any number of members.
 
-    ``meet`` returns what two members share, even if one of them is ``many``.
+    ``meet`` returns the intersection of two members, even if one of them is ``many``.  The result
+    is a set of sequences.
     """
 
     @cache
@@ -359,7 +363,7 @@ def _common_parts(
         sequences: set[tuple[str, ...]] = set()
         first, second = (members[0] if members else "" for members in (left, right))
         if first == many == second:
-            # One of them stands for no more than the other, which goes on.
+            # Where both have ``many``, one of the two can end, while the other continues.
             tails = common_sequences_from(in_first + 1, in_second)
             for tail in tails | common_sequences_from(in_first, in_second + 1):
                 sequences.add(tail if tail[:1] == (many,) else (many, *tail))
@@ -395,7 +399,7 @@ _BEGINS_CHUNK = ~Letters.of("/@")
 
 @lru_cache(maxsize=_MANY)
 def _automaton(expression: str) -> Automaton | None:
-    """Return an automaton for the included keys; None if the expression is a single key."""
+    """Return an automaton for the keys that an expression includes; None if it is a single key."""
     if "*" not in expression:
         return None
     edges: list[tuple[int, Letters, int]] = []
@@ -414,7 +418,7 @@ def _automaton(expression: str) -> Automaton | None:
             between = [inside]
         else:
             between = [_chunk(chunk, begin, number, edges)]
-    # The edges begin as if there was a "/" before the key.
+    # The automaton begins as if a "/" preceded the key.
     first = {to for at, _, to in edges if at == 0}
     edges = [edge for edge in edges if edge[0]]
     edges += [(0, letters, to) for at, letters, to in edges if at in first]
@@ -424,14 +428,14 @@ def _automaton(expression: str) -> Automaton | None:
 def _chunk(
     chunk: str, begin: int, number: Iterator[int], edges: list[tuple[int, Letters, int]]
 ) -> int:
-    """Add edges for a chunk to ``edges``, and return the position after them.
+    """Add edges for a chunk to ``edges``, and return the position after the chunk.
 
-    A chunk with a wildcard includes no chunk that begins with "@".
+    A chunk that begins with a wildcard does not match a chunk that begins with "@".
     """
     parts = chunk.split(ANY_PART)
     at, wild = begin, len(parts) > 1
     for index, part in enumerate(parts):
-        if index and at == begin:  # "$*" at the beginning
+        if index and at == begin:  # "$*" at the beginning of the chunk
             gap = next(number)
             edges += [(begin, _BEGINS_CHUNK, gap), (gap, _IN_CHUNK, gap)]
             if part:
@@ -452,7 +456,7 @@ def _chunk(
 
 
 def names_of(expressions: Iterable[str]) -> NameSet:
-    """Return the keys that any of the expressions includes."""
+    """Return the keys that at least one of the expressions includes."""
     automata = {expression: _automaton(expression) for expression in expressions}
     return NameSet(
         (expression for expression, automaton in automata.items() if automaton is None),
@@ -464,7 +468,7 @@ def names_of(expressions: Iterable[str]) -> NameSet:
 def expression_problem(text: str) -> str:
     """Return why Zenoh does not accept a key expression, as a clause; "" if it does.
 
-    Wildcards stand as a chunk of their own or as ``$*``, and only in the canonical form.
+    A wildcard must be a chunk of its own or ``$*``, and the expression must be in canonical form.
     """
     chunks = text.split("/")
     if "" in chunks:

@@ -1,6 +1,6 @@
-"""The releases of rmw_zenoh in the supported ROS 2 distributions, and what they add.
+"""The releases of rmw_zenoh in the supported ROS 2 distributions, and their additional keys.
 
-The files that sros writes work with all of these releases. Source: ros2/rmw_zenoh, its changelogs,
+The files that sros writes work with all of these releases.  Source: ros2/rmw_zenoh, its changelogs,
 rmw_publisher_data.cpp and rmw_subscription_data.cpp.
 """
 
@@ -9,8 +9,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 _LEAST_ZENOH = "1.3"
-"""The first Zenoh that accepts all settings of the files; rmw_zenoh 0.2.3 has one from shortly
-before."""
+"""The first version of Zenoh that accepts all settings of the files.
+
+rmw_zenoh 0.2.3 has a version from shortly before.
+"""
 
 Version = tuple[int, int, int]
 
@@ -19,8 +21,8 @@ class RmwZenohRelease(NamedTuple):
     """The versions of rmw_zenoh_cpp in one ROS 2 distribution, from ``begin`` on.
 
     ``least`` is the first version that has `_LEAST_ZENOH` and reads ZENOH_CONFIG_OVERRIDE.
-    ``below_topics`` are key expressions below the key of a topic, on which a publisher also sends,
-    or only sends, to subscriptions whose graph tokens it sees.
+    ``below_topics`` are key expressions below the key of a topic.  To subscriptions whose graph
+    tokens a publisher sees, it also sends on these keys, or on these keys alone.
     """
 
     distribution: str
@@ -32,7 +34,8 @@ class RmwZenohRelease(NamedTuple):
 _BUFFERS = ("_buf_cpu", "_buf/*")
 """Keys for messages with an array of bytes (images, point clouds) between C++ nodes.
 
-All subscriptions in main memory share one key; each subscription on an accelerator has its own.
+All subscriptions in main memory share ``_buf_cpu``; each subscription on an accelerator has its own
+key.
 """
 
 RELEASES = (
@@ -41,17 +44,17 @@ RELEASES = (
     RmwZenohRelease("Kilted", (0, 3, 0), (0, 6, 0)),
     RmwZenohRelease("Lyrical", (0, 7, 0), (0, 7, 0), _BUFFERS),
 )
-"""All supported releases, earliest first; versions of Rolling belong to the next distribution."""
+"""All supported releases, earliest first; Rolling's versions count as the next distribution's."""
 
 
 def release_of(version: Version) -> RmwZenohRelease:
-    """Return the latest release whose ``begin`` is not later than a version."""
+    """Return the latest release that begins at or before a version."""
     begun = (release for release in reversed(RELEASES) if release.begin <= version)
     return next(begun, RELEASES[0])
 
 
 def too_old_because(version: Version) -> str:
-    """Return why a version cannot run with the files that sros writes, or "" if it can."""
+    """Return why the files of sros do not work with a version of rmw_zenoh, as a clause, or ""."""
     release = release_of(version)
     if version >= release.least:
         return ""
@@ -62,5 +65,5 @@ def too_old_because(version: Version) -> str:
 
 
 def version_text(version: Version) -> str:
-    """Return a version as people write it."""
+    """Return a version as text, such as "0.2.3"."""
     return ".".join(map(str, version))

@@ -1,9 +1,9 @@
 """The keys of access-control rules: allowed key expressions without the denied ones.
 
-Zenoh does not enforce a denial inside a wider permission, so rules may only allow.  All expressions
-are tuples of chunks.  A subtraction is exact for keys whose chunks are ROS names.  Because ROS
-names use few letters, ``*`` without ``ab`` can be listed: every chunk that contains a letter other
-than a and b, that begins with a letter other than a, and so on.
+Zenoh does not enforce a denial of a part of the allowed keys, so rules for topics and services only
+allow.  All expressions are tuples of chunks.  A subtraction is exact for keys whose chunks are ROS
+names.  Because ROS names use few letters, ``*`` without ``ab`` can be listed: every chunk that
+contains a letter other than a and b, that begins with a letter other than a, and so on.
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ from sros_tool.zenoh.key_expressions import (
 )
 
 Chunks = tuple[str, ...]
-"""A key expression, or a part of one."""
+"""A key expression or a part of it, as a tuple of chunks."""
 
 MOST_EXPRESSIONS = 24576
-"""Maximum number of key expressions of a difference.
+"""Maximum number of key expressions in a difference.
 
-A right to publish 16,384 of them takes 212 MB in a process with Zenoh 1.10.2.
+In a process with Zenoh 1.10.2, a right to publish with 16,384 key expressions takes 212 MB.
 """
 _LETTERS = "_" + digits + ascii_letters
 _MANY, _FEW = 65536, 1024
 _MOST_CHARACTERS = 1_000_000
-"""Maximum number of characters that are compared for one chunk: about one second."""
+"""Maximum number of characters that are compared for one chunk, which takes about one second."""
 
 
 class CannotSubtract(Exception):  # noqa: N818 - the caller makes an error of it
     """The difference cannot be expressed as key expressions, or takes too many of them.
 
-    ``denied`` is the expression that cannot be subtracted, or () if there are too many.
+    ``denied`` is the expression that cannot be subtracted; () if the result is too large.
     """
 
     def __init__(self, denied: Chunks = ()) -> None:
-        """Keep the expression that cannot be subtracted."""
+        """Keep the expression that cannot be subtracted, or () for too large a result."""
         super().__init__(denied)
         self.denied = denied
 
@@ -61,8 +61,8 @@ def subtract_all(allowed: frozenset[Chunks], denied: frozenset[Chunks]) -> froze
     """Return expressions for the keys that ``allowed`` includes and ``denied`` does not.
 
     Raises:
-        CannotSubtract: the result has more than `MOST_EXPRESSIONS`; or a denied expression has a
-            chunk or letters between two wildcards where an allowed expression has a wildcard.
+        CannotSubtract: the result has more than `MOST_EXPRESSIONS` expressions; or where an allowed
+            expression has a wildcard, a denied expression has text between two wildcards.
     """
     without = _uncovered(denied)
     left: set[Chunks] = set()
@@ -73,7 +73,7 @@ def subtract_all(allowed: frozenset[Chunks], denied: frozenset[Chunks]) -> froze
 
 
 def _uncovered(expressions: frozenset[Chunks]) -> list[Chunks]:
-    """Return the expressions that no other one covers; if there are many, perhaps more."""
+    """Return the expressions that no other one covers, and perhaps some more if there are many."""
     wide: list[Chunks] = []
     left: list[Chunks] = []
     for expression in sorted(
@@ -92,7 +92,7 @@ def _uncovered(expressions: frozenset[Chunks]) -> list[Chunks]:
 
 def _subtract(wide: Chunks, denied: Iterable[Chunks]) -> set[Chunks]:
     """Return expressions for the keys that ``wide`` includes and ``denied`` does not."""
-    without = frozenset(expression for expression in denied if _keys_meet(expression, wide))
+    without = frozenset(expression for expression in denied if _have_common_key(expression, wide))
     if not without:
         return {wide}
     if any(_covers(expression, wide) for expression in without):
@@ -100,14 +100,15 @@ def _subtract(wide: Chunks, denied: Iterable[Chunks]) -> set[Chunks]:
     left: set[Chunks] = set()
     for part in _parts(wide, without):
         left |= _remaining_keys(
-            part, frozenset(expression for expression in without if _keys_meet(expression, part))
+            part,
+            frozenset(expression for expression in without if _have_common_key(expression, part)),
         )
         _check_number(len(left))
     return _joined_expressions(left)
 
 
-def _keys_meet(first: Chunks, second: Chunks) -> bool:
-    """Return whether both expressions include a common key."""
+def _have_common_key(first: Chunks, second: Chunks) -> bool:
+    """Return whether the expressions have a key in common."""
     for end in (0, -1) if first and second else ():
         if first[end] != second[end] and "*" not in first[end] + second[end]:
             return False
@@ -115,13 +116,16 @@ def _keys_meet(first: Chunks, second: Chunks) -> bool:
 
 
 _MOST_STEPS = 2 * MOST_EXPRESSIONS
-"""Maximum number of expressions before some are joined."""
+"""Maximum number of expressions in a step, before some of them are joined."""
 _MOST_COMPARED = 64
-"""Maximum number of expressions that are compared with all others, to drop what they cover."""
+"""Maximum number of wildcard expressions that are compared with all others.
+
+The comparison finds expressions that others cover.
+"""
 _MOST_WILD = 32
 """Maximum number of denied chunks with wildcards at one position of an expression."""
 _MOST_KINDS = 1024
-"""Maximum number of kinds of chunks; the same denied chunks match all chunks of a kind."""
+"""Maximum number of kinds of chunks; chunks of one kind match the same denied chunks."""
 
 
 def _check_number(number: int, maximum: int = _MOST_STEPS) -> None:
@@ -130,7 +134,7 @@ def _check_number(number: int, maximum: int = _MOST_STEPS) -> None:
 
 
 def _covers(wide: Chunks, narrow: Chunks) -> bool:
-    """Return whether ``wide`` includes all keys of ``narrow``; only True is certain."""
+    """Return whether ``wide`` includes all keys of ``narrow``; False may be wrong."""
     if wide.count(ANY_CHUNKS) != 1:
         return sequence_includes(wide, narrow)
     before, after = _around_wildcards(wide)
@@ -159,8 +163,8 @@ def _around_wildcards(chunks: Chunks) -> tuple[Chunks, Chunks]:
 def _parts(wide: Chunks, denied: Iterable[Chunks]) -> Iterator[Chunks]:
     """Split ``wide`` so that its ``**`` overlaps no fixed start or end of a denied expression.
 
-    A denied expression can then be compared chunk by chunk, first from its start, then from its
-    end.
+    So each part can be compared with a denied expression chunk by chunk, first from the start, then
+    from the end.
     """
     if ANY_CHUNKS not in wide:
         yield wide
@@ -204,7 +208,7 @@ def _any_chunks(number: int) -> Chunks:
 
 
 def _to_last_named(chunks: Chunks) -> int:
-    """Return the number of chunks up to the last one that is not ``*``."""
+    """Return the number of chunks up to and including the last that is not ``*``."""
     return max((at + 1 for at, chunk in enumerate(chunks) if chunk != ANY_CHUNK), default=0)
 
 
@@ -212,7 +216,7 @@ def _to_last_named(chunks: Chunks) -> int:
 def _remaining_keys(wide: Chunks, denied: frozenset[Chunks]) -> frozenset[Chunks]:
     """Return expressions for the keys of ``wide`` without ``denied``.
 
-    Each denied expression shares keys with ``wide``.
+    Each denied expression has a key in common with ``wide``.
     """
     if not denied:
         return frozenset((wide,))
@@ -229,9 +233,13 @@ def _remaining_keys(wide: Chunks, denied: frozenset[Chunks]) -> frozenset[Chunks
 
 
 def _shorter_keys(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]:
-    """Return the keys of ``**`` that are shorter than all denied ones.
+    """Return expressions for the keys of ``wide``, which must be ``**``, without ``denied``.
 
-    The denied expressions consist only of wildcards.
+    The denied expressions must consist only of wildcards.  With ``**`` they deny all keys from some
+    length on, so the keys that remain are the shorter ones.
+
+    Raises:
+        CannotSubtract: ``wide`` or a denied expression has another form.
     """
     named = [expression for expression in denied if {*expression} - {ANY_CHUNK, ANY_CHUNKS}]
     if wide != (ANY_CHUNKS,) or named:
@@ -242,19 +250,19 @@ def _shorter_keys(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]:
 
 
 def _split_by_first_chunk(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]:
-    """Return expressions for the keys of ``wide`` without ``denied``, by the first chunk.
+    """Return expressions for the keys of ``wide`` without ``denied``, found by the first chunk.
 
-    The first chunk of ``wide`` is not ``**``.
+    The first chunk of ``wide`` must not be ``**``.
     """
     first, rest = wide[0], wide[1:]
     tails: dict[str, set[Chunks]] = {}
     for expression in denied:
         for chunk, tail in _first_chunks(expression):
-            if common_chunks(first, chunk) and _keys_meet(tail, rest):
+            if common_chunks(first, chunk) and _have_common_key(tail, rest):
                 tails.setdefault(chunk, set()).add(tail)
     always = {chunk for chunk in tails if _matches(chunk, first)}
     first_chunks = tuple(sorted(tails.keys() - always))
-    # The remainders behind the first chunk, with the kinds of first chunks that allow them.
+    # Maps what follows the first chunk to the kinds of first chunks after which it is allowed.
     kinds: dict[Chunks, set[frozenset[str]]] = {}
     for kind in _kinds(first, first_chunks):
         behind = frozenset(tail for chunk in kind | always for tail in tails[chunk])
@@ -268,7 +276,7 @@ def _split_by_first_chunk(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[C
 
 
 def _first_chunks(expression: Chunks) -> Iterator[tuple[str, Chunks]]:
-    """Yield each first chunk that an expression may have, with the chunks after it."""
+    """Yield each possible first chunk of an expression's keys, with the chunks after it."""
     if expression and expression[0] == ANY_CHUNKS:
         yield from _first_chunks(expression[1:])
         yield ANY_CHUNK, expression
@@ -278,9 +286,9 @@ def _first_chunks(expression: Chunks) -> Iterator[tuple[str, Chunks]]:
 
 @lru_cache(maxsize=_MANY)
 def _kinds(first: str, first_chunks: tuple[str, ...]) -> Mapping[frozenset[str], Chunks]:
-    """Return the kinds of chunks that ``first`` matches, as a map to expressions for them.
+    """Map the kinds of chunks that ``first`` matches to expressions for the chunks of this kind.
 
-    A kind is the set of chunks of ``first_chunks`` that match, too.
+    The kind of a chunk is the set of chunks in ``first_chunks`` that match it, too.
     """
     wild = [chunk for chunk in first_chunks if "*" in chunk]
     _check_number(len(wild), _MOST_WILD)
@@ -305,7 +313,7 @@ def _kinds(first: str, first_chunks: tuple[str, ...]) -> Mapping[frozenset[str],
 
 
 def _matches_any(chunk: str, wild: Iterable[str], excluded: frozenset[str]) -> bool:
-    """Return whether a chunk of ``wild`` that is not in ``excluded`` includes ``chunk``."""
+    """Return whether a chunk in ``wild``, except for those in ``excluded``, includes ``chunk``."""
     return any(_matches(wide, chunk) for wide in wild if wide not in excluded)
 
 
@@ -316,10 +324,10 @@ def _matches(wide: str, narrow: str) -> bool:
 
 @lru_cache(maxsize=_MANY)
 def _chunks(first: str, first_chunks: tuple[str, ...], kinds: frozenset[frozenset[str]]) -> Chunks:
-    """Return few chunks that match exactly the names of ``first`` whose kind is in ``kinds``.
+    """Return few chunks that together match exactly the names of some kinds that ``first`` matches.
 
-    The kind of a chunk is the set of the chunks in ``first_chunks`` that match it.  If a kind is
-    allowed, so is each kind that is a part of it.
+    The kind of a name is the set of chunks in ``first_chunks`` that match it.  If ``kinds`` has a
+    kind, it must also have each kind that is a subset of it.
     """
     kinds_of_first = _kinds(first, first_chunks)
 
@@ -354,25 +362,25 @@ def _chunks(first: str, first_chunks: tuple[str, ...], kinds: frozenset[frozense
 
 @lru_cache(maxsize=_MANY)
 def _chunks_less(wide: str, denied: frozenset[str]) -> Chunks:
-    """Return chunks for the names that ``wide`` matches and ``denied`` does not."""
+    """Return chunks for the names that ``wide`` matches but no chunk of ``denied``."""
     if not denied:
         return (wide,)
-    search = _Letters()
+    search = _LetterSearch()
     without = tuple(sorted(chunk.replace(ANY_PART, "*") for chunk in denied))
     try:
-        search.run(_Place("", wide.replace(ANY_PART, "*"), without, _LETTERS))
+        search.run(_SearchState("", wide.replace(ANY_PART, "*"), without, _LETTERS))
     except CannotSubtract as error:
-        if error.denied:  # what is left of it after some letters
+        if error.denied:  # a chunk that is left after some letters were read
             raise CannotSubtract((min(denied),)) from None
         raise
     return tuple(canonical((chunk.replace("*", ANY_PART),)) for chunk in search.kept)
 
 
-class _Place(NamedTuple):
-    """The names that begin with ``read`` and continue with text that ``wide`` matches.
+class _SearchState(NamedTuple):
+    """A state of the search: names that begin with ``read`` and go on as ``wide`` matches.
 
-    No chunk of ``denied`` matches that text.
-    ``letters`` are the letters that the rest may have: names with other letters are already kept.
+    ``denied`` are the denied chunks for the continuation.  ``letters`` are the letters that the
+    continuation may have; names with other letters are already kept.
     """
 
     read: str
@@ -382,30 +390,30 @@ class _Place(NamedTuple):
 
 
 @dataclass
-class _Letters:
-    """The search for chunks that denied chunks do not match.
+class _LetterSearch:
+    """The search for chunks that match a chunk's names without the denied names.
 
-    It reads names from their start until no denied chunk can match.  If all denied wildcards are
-    stars at the start, a second search reads backwards from the end.
+    The search reads names from the start until no denied chunk can match any more.  If all
+    wildcards in denied chunks are stars at the start, a second search reads backwards from the end.
     """
 
     backwards: bool = False
     kept: dict[str, None] = field(default_factory=dict)
     effort: int = _MOST_CHARACTERS
 
-    def run(self, start: _Place) -> None:
-        """Run the search to the end."""
+    def run(self, start: _SearchState) -> None:
+        """Search from the state ``start`` until nothing is left to read."""
         seen = set()
-        places = [start]
-        while places:
-            place = places.pop()
-            if place[:2] not in seen:
-                seen.add(place[:2])
-                places += self._following(place)
+        states = [start]
+        while states:
+            state = states.pop()
+            if state[:2] not in seen:
+                seen.add(state[:2])
+                states += self._following(state)
 
-    def _following(self, place: _Place) -> Iterable[_Place]:
-        """Return the parts of a place to search next; none if its names are decided all at once."""
-        read, wide, denied, _ = place
+    def _following(self, state: _SearchState) -> Iterable[_SearchState]:
+        """Return the states that follow a state; none if all its names are now kept or denied."""
+        read, wide, denied, _ = state
         self.effort -= sum(map(len, denied)) + len(denied) * len(wide) + len(read)
         if self.effort < 0:
             raise CannotSubtract
@@ -417,40 +425,43 @@ class _Letters:
             return ()
         if not wide.startswith("*"):
             return (
-                _Place(read + wide[0], wide[1:], _rest_after_letter(wide[0], denied), _LETTERS),
+                _SearchState(
+                    read + wide[0], wide[1:], _rest_after_letter(wide[0], denied), _LETTERS
+                ),
             )
         starred = [chunk for chunk in denied if chunk.startswith("*")]
         if starred and all(chunk in starred or "*" not in chunk for chunk in denied):
             self._keep_backwards(read, wide, denied)
             return ()
-        return self._split_by_next_letter(place._replace(denied=denied))
+        return self._split_by_next_letter(state._replace(denied=denied))
 
-    def _split_by_next_letter(self, place: _Place) -> Iterator[_Place]:
-        """Split a place by its next letter, and yield the parts; ``wide`` must begin with "*"."""
-        read, wide, denied, letters = place
+    def _split_by_next_letter(self, state: _SearchState) -> Iterator[_SearchState]:
+        """Yield the states that follow, one for each next letter; ``wide`` must begin with "*"."""
+        read, wide, denied, letters = state
         if wide == "*" and not any("*" in chunk for chunk in denied):
-            # A chunk with a letter that no denied one has is allowed, whatever its other letters.
+            # A chunk with a letter that no denied chunk has is allowed, whatever its other letters
+            # are.
             needed = {letter for chunk in denied for letter in chunk}
             for letter in letters:
                 if letter not in needed:
                     self._keep(f"{read}*{letter}*")
             letters = "".join(letter for letter in letters if letter in needed)
-        yield _Place(read, wide[1:], denied, letters)
+        yield _SearchState(read, wide[1:], denied, letters)
         begins = not self.backwards and not read
         for letter in letters:
             if not (begins and letter in digits):
-                yield _Place(read + letter, wide, _rest_after_letter(letter, denied), letters)
+                yield _SearchState(read + letter, wide, _rest_after_letter(letter, denied), letters)
 
     def _keep_backwards(self, read: str, wide: str, denied: tuple[str, ...]) -> None:
         if self.backwards:
             raise CannotSubtract((wide,))
-        ends = _Letters(backwards=True, effort=self.effort)
-        ends.run(_Place("", wide[::-1], tuple(chunk[::-1] for chunk in denied), _LETTERS))
+        ends = _LetterSearch(backwards=True, effort=self.effort)
+        ends.run(_SearchState("", wide[::-1], tuple(chunk[::-1] for chunk in denied), _LETTERS))
         for chunk in ends.kept:
             self._keep(read + chunk[::-1])
 
     def _keep(self, chunk: str) -> None:
-        if chunk or self.backwards:  # no chunk is empty, but the end of one may be
+        if chunk or self.backwards:  # a chunk cannot be empty, but the end of a chunk can
             self.kept[chunk] = None
         _check_number(len(self.kept))
 
@@ -464,7 +475,7 @@ def _overlap(first: str, second: str) -> bool:
 
 
 def _rest_after_letter(letter: str, chunks: Iterable[str]) -> tuple[str, ...]:
-    """Return the rest of each chunk after a letter was read."""
+    """Return the rest of each chunk after reading a letter, without chunks that do not match."""
     rests = []
     for chunk in chunks:
         if chunk.startswith("*"):
@@ -480,9 +491,9 @@ def _rest_after_letter(letter: str, chunks: Iterable[str]) -> tuple[str, ...]:
 
 
 def _joined_expressions(expressions: set[Chunks]) -> set[Chunks]:
-    """Return fewer expressions for the same keys: one with ``**`` replaces others.
+    """Return fewer expressions for the same keys.
 
-    It replaces those that differ from it only in their number of chunks.
+    An expression with ``**`` replaces those that differ from it only in the number of chunks.
     """
     joined = {
         tuple(canonical(expression).split("/")) if expression else expression
@@ -511,7 +522,7 @@ def _joined_expressions(expressions: set[Chunks]) -> set[Chunks]:
 
 
 class _Beginnings:
-    """An index of texts, to find the texts with which an expression begins."""
+    """An index of beginnings, to find those that match the beginning of an expression."""
 
     def __init__(self, beginnings: Iterable[Chunks]) -> None:
         self._by_first: dict[Chunks, list[Chunks]] = {}
@@ -530,7 +541,7 @@ class _Beginnings:
 
 
 def _one_shorter(chunks: Chunks) -> Chunks | None:
-    """Return ``a/b`` for ``a/*/**/b``, for keys that are one chunk shorter; None for others."""
+    """Return ``a/b`` for ``a/*/**/b``, the keys with one chunk less; None for other expressions."""
     at = chunks.index(ANY_CHUNKS) if chunks.count(ANY_CHUNKS) == 1 else 0
     return (*chunks[: at - 1], *chunks[at + 1 :]) if at and chunks[at - 1] == ANY_CHUNK else None
 
@@ -546,7 +557,8 @@ _MANY, _FEW = 65536, 1024
 class Difference(NamedTuple):
     """The keys of allowed names without the keys of denied names.
 
-    A key is the chunk ``begin``, the name, and ``end``: "", or "/" and further chunks.
+    A key consists of the chunk ``begin``, the name, and ``end``, which is "" or "/" with further
+    chunks.
     """
 
     begin: str
@@ -555,15 +567,15 @@ class Difference(NamedTuple):
     denied: frozenset[Chunks]
 
     def names(self) -> frozenset[Chunks]:
-        """Return key expressions for the names that are left.
+        """Return key expressions for the names that remain.
 
         Raises:
-            CannotSubtract: no or too many key expressions: see `subtract_all`.
+            CannotSubtract: as in `subtract_all`.
         """
         return subtract_all(self.allowed, self.denied)
 
     def keys_below(self, end: str) -> Difference:
-        """Return the keys with ``end`` behind each key of this difference."""
+        """Return the keys of this difference, with ``end`` added as further chunks."""
         return self._replace(end=f"{self.end}/{end}")
 
     def include(self, name: str) -> bool:
@@ -578,15 +590,15 @@ class Difference(NamedTuple):
             begin == self.begin
             and _common_end(end, self.end) == end
             and any(_covers(expression, name) for expression in self.allowed)
-            and not any(_keys_meet(expression, name) for expression in self.denied)
+            and not any(_have_common_key(expression, name) for expression in self.denied)
         )
 
     def common(self, other: Difference) -> list[str]:
         """Return key expressions for the keys that both differences have.
 
         Raises:
-            CannotSubtract: no or too many key expressions: see `subtract_all`.
-            TooManyExpressions: the shared allowed names take too many key expressions.
+            CannotSubtract: as in `subtract_all`.
+            TooManyExpressions: the names that both allow take too many key expressions.
         """
         end = _common_end(self.end, other.end)
         if self.begin != other.begin or end is None:
@@ -598,7 +610,7 @@ class Difference(NamedTuple):
 
 
 def _common_end(first: str, second: str) -> str | None:
-    """Return what two endings share, or None; "/**" in one includes the other."""
+    """Return the intersection of two endings, or None; one with "/**" includes one without."""
     end, longer = sorted((first, second), key=len)
     return end if longer in (end, f"{end}/{ANY_CHUNKS}") else None
 
@@ -612,7 +624,7 @@ def _search_index(expressions: frozenset[Chunks]) -> KeyExpressions:
 def _common_expressions(
     expressions: frozenset[Chunks], other_expressions: frozenset[Chunks]
 ) -> frozenset[Chunks]:
-    """Return expressions for what some expressions and others match."""
+    """Return expressions for the keys that match both some expressions and some others."""
     if expressions == other_expressions:
         return expressions
     return frozenset(
@@ -626,15 +638,16 @@ def _common_expressions(
 class RuleKeys:
     """The keys that the key expressions of a rule include.
 
-    ``plain`` are keys of a single name, with wildcards only in the type, in its hash and behind it.
-    ``tokens`` are graph tokens with wildcards; ``differences`` are all other keys.  ``is_plain``
-    says that there are only plain keys.
+    ``plain`` are key expressions for a single name, with wildcards only in the type, in its hash
+    and after the hash.  ``tokens`` are graph tokens with wildcards; ``differences`` are all other
+    keys.  ``is_plain`` says that all keys are plain.
     """
 
     def __init__(self, expressions: frozenset[str], differences: tuple[Difference, ...]) -> None:
         """Sort the key expressions by kind.
 
-        ``differences`` are the set differences that the expressions write out; () if unknown.
+        ``differences`` are the set differences from which the expressions were computed; () if they
+        are unknown.
         """
         wide = [expression for expression in expressions if "*" in _ENDS.sub("", expression)]
         self.plain = expressions.difference(wide)
@@ -646,16 +659,19 @@ class RuleKeys:
         self._has_plain_tokens = any(expression.startswith("@") for expression in self.plain)
 
     def include(self, key: str) -> bool:
-        """Return whether the differences of the rule have all keys of an expression."""
+        """Return whether the differences of the rule have all keys of an expression.
+
+        False may be wrong.
+        """
         begin, name, end = _expression_parts(key)
         chunks = tuple(name.split("/"))
         return any(difference.include_all(begin, chunks, end) for difference in self.differences)
 
     def common(self, other: RuleKeys) -> tuple[str, ...]:
-        """Return expressions that together include the keys of both, and no others, sorted.
+        """Return expressions for exactly the keys that both rules have, sorted.
 
         Raises:
-            TooManyExpressions: there are too many.
+            TooManyExpressions: the result would have too many key expressions.
         """
         shared = self.plain & other.plain
         if self.is_plain and other.is_plain:
@@ -683,24 +699,24 @@ def _in_order(expressions: frozenset[str]) -> tuple[str, ...]:
 
 @lru_cache(maxsize=_MANY)
 def keys_of(expressions: frozenset[str], differences: tuple[Difference, ...] = ()) -> RuleKeys:
-    """Return the keys that expressions include; equal arguments give the same object (a cache)."""
+    """Return the keys that expressions include; results are cached."""
     return RuleKeys(expressions, differences)
 
 
 _TYPE = "/$*::$*/*"
-"""Any type with its hash, which follow the name in a key."""
+"""Matches any type with its hash, the chunks after the name in a key."""
 _ENDS = re.compile(rf"{re.escape(_TYPE)}(?:/\*\*)?(?:/@adv/\*\*)?\Z")
 
 
 def _expression_parts(expression: str) -> tuple[str, str, str]:
-    """Return the parts of a key expression before, in and after the name."""
+    """Return three parts of a key expression: before the name, the name, and after it."""
     begin, _, rest = expression.partition("/")
     name, of_type, below = rest.partition(_TYPE)
     return begin, name, of_type + below
 
 
 def _differences(expressions: Iterable[str]) -> tuple[Difference, ...]:
-    """Return key expressions, except graph tokens, as differences that deny nothing."""
+    """Return key expressions, except graph tokens, as differences that subtract nothing."""
     names: dict[tuple[str, str], set[Chunks]] = {}
     for expression in expressions:
         if not expression.startswith("@"):
@@ -752,7 +768,7 @@ def _common_of_tokens(first: KeyExpressions, second: KeyExpressions) -> frozense
         if first.include(token):
             shared.add(token)
         else:
-            # Tokens of `one` that `other` includes are shared as they are.
+            # Tokens of one side that the other side includes are shared unchanged.
             overlapping = (wide for wide in not_included if intersects(token, wide))
             shared.update(*(common(token, wide) for wide in overlapping))
     return frozenset(KeyExpressions(shared).needed())

@@ -59,7 +59,7 @@ from sros_tool.policy.rights import policy_rights
 from sros_tool.prometheus import render_metrics
 from sros_tool.report.sources import read_source
 from sros_tool.translate import ros_rights
-from sros_tool.translate_zenoh.rights import policy_of, rights_behind
+from sros_tool.translate_zenoh.rights import policy_of, rights_of_subjects
 from sros_tool.validity import Window, iso
 from sros_tool.zenoh.document import parse_configuration
 from tests.fuzz.corpus import PASSPHRASE, Corpus
@@ -243,7 +243,7 @@ def _zenoh(data: bytes, place: Place) -> None:
     document = parse_configuration(data, "drawn", [("scouting/multicast", "{enabled:true}")])
     for each in document_findings(document):
         str(each)
-    policy_xml(policy_of(rights_behind(document)))
+    policy_xml(policy_of(rights_of_subjects(document)))
 
 
 def _rotation(data: bytes, place: Place) -> None:

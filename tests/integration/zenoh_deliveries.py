@@ -21,10 +21,10 @@ from sros_tool.zenoh.access import Enforcement, Flow, Message
 from sros_tool.zenoh.configuration import Mode
 from sros_tool.zenoh.delivery import (
     ZenohProcess,
-    deliver_query,
-    deliver_sample,
-    deliver_token,
+    query_delivery,
     route,
+    sample_delivery,
+    token_delivery,
 )
 from sros_tool.zenoh.document import parse_configuration
 from tests.integration.zenoh_world import PAUSE, drawn_rule, until, world
@@ -161,15 +161,15 @@ def predicted(
     back = there[::-1]
     said: dict[str, set[int]] = {kind: set() for kind in KINDS}
     for number, case in enumerate(cases):
-        asked = deliver_query(there, case.asked, case.declared, case.announced)
+        asked = query_delivery(there, case.asked, case.declared, case.announced)
         told = {
-            "publish": deliver_sample(there, case.asked, case.declared).arrives,
+            "publish": sample_delivery(there, case.asked, case.declared).arrives,
             "call": asked.arrives,
             "answer": asked.answered,
-            "ask the graph" if case.asks else "watch": deliver_token(
+            "ask the graph" if case.asks else "watch": token_delivery(
                 back, case.announced, case.watched, asking_with(case)
             ).arrives,
-            "history": deliver_query(back, f"{case.kept}/@adv/**", reply_key=case.kept).answered,
+            "history": query_delivery(back, f"{case.kept}/@adv/**", reply_key=case.kept).answered,
         }
         for kind, arrives in told.items():
             if arrives:
