@@ -12,6 +12,7 @@ from typing import Annotated, NamedTuple
 
 from sros_tool.checks.processes import newer_files, order_unknown, zenoh_findings
 from sros_tool.close.processes import (
+    ROUTER,
     ClosedProcess,
     ObservedProcesses,
     command_without_enclave,
@@ -49,6 +50,7 @@ _LOOK_SECONDS = 0.2
 
 TALK = "everything that talked can still talk"
 SILENCE = "an open listener finds nothing"
+_ACCEPTS_REVOKED = f"something was revoked ({CRL_FILE}), and is still accepted by"
 
 
 class SecuredProcess(NamedTuple):
@@ -170,7 +172,7 @@ class RunningRobot:
         if clock := order_unknown(process):
             return f"{warning}{clock}, and {newer} may have changed after the start of"
         if names == [CRL_FILE]:
-            return f"{warning}something was revoked ({CRL_FILE}), and is still accepted by"
+            return f"{warning}{_ACCEPTS_REVOKED}"
         return f"{warning}{newer} changed, or got another mode, after the start of"
 
     def with_later_processes(self, observed: ObservedProcesses) -> ObservedProcesses:
@@ -356,13 +358,22 @@ class CloseState(NamedTuple):
 
     @property
     def pending_by_hand(self) -> Mapping[str, Sequence[ClosedProcess]]:
-        """The commands to run by hand for the enclaves in ``pending``, with their processes."""
+        """The commands to run by hand for the enclaves in ``pending``, with their processes.
+
+        Processes that only need the revocation list come last: a new key comes before.
+        """
         by_hand = self.observed.commands_by_hand(self.folder.absolute())
-        return {
-            command: processes
+        due = [
+            (command, processes)
             for command, processes in by_hand.items()
             if any(process.enclave in self.pending for process in processes)
-        }
+        ]
+        return dict(sorted(due, key=lambda entry: all(map(self._may_be_last, entry[1]))))
+
+    def _may_be_last(self, process: ClosedProcess) -> bool:
+        """Return whether others with a new key or new rights are to be restarted before."""
+        why = self.outdated.get(process.enclave, "")
+        return why.endswith(_ACCEPTS_REVOKED) and process.enclave != ROUTER
 
 
 def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
@@ -392,7 +403,12 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
         steps=(),
         secured=secured,
         outdated={
-            name: why for name, (_, why) in sorted(running.not_current.items()) if name in secured
+            name: why
+            for name, (_, why) in sorted(
+                running.not_current.items(),
+                key=lambda entry: (entry[1][1].endswith(_ACCEPTS_REVOKED), entry[0]),
+            )
+            if name in secured
         },
         new=sorted(new),
         absent=sorted(absent - secured.keys()),

@@ -13,10 +13,12 @@ from sros_tool.automata import SearchLimit
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.names import READING_SERVICES, expression_problem, is_expression, moves_robot
 from sros_tool.policy.model import OTHER_SIDE, RIGHTS, Level, Source
+from sros_tool.policy.patterns import matches
 from sros_tool.policy.placeholders import Placeholder
 from sros_tool.policy.rights import Right
 from sros_tool.proof.decide import MOST_STEPS, Worlds, influencers
 from sros_tool.proof.requirements import (
+    EXCEPT,
     Apart,
     Nobody,
     Only,
@@ -33,6 +35,8 @@ _NOWHERE = Source("", 0)
 _OF_EVERY_NODE = frozenset({"/rosout", "/parameter_events"})
 _SENDING = ("publish", "call", "request")
 """The rights to send something first, in the order of the proposals."""
+_PEOPLE = "/operator/*"
+"""The enclaves of people, such as those that sros ships: `ros2 topic echo` needs wildcards."""
 _FEW = 3
 """Highest number of enclaves with a right to a name that are proposed as the only ones."""
 _MOST = 1000
@@ -128,7 +132,8 @@ class _Stated:
             if right.kind == "dds" or expression_problem(right.name):
                 continue  # permissions that others wrote may have any text
             if is_expression(right.name):
-                self.wild[right.right].add(right.name)
+                if not matches(_PEOPLE, right.enclave):
+                    self.wild[right.right].add(right.name)
             else:
                 self.users[right.right, right.name].add(right.enclave)
 
@@ -147,7 +152,7 @@ def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Req
             yield Protected(source=_NOWHERE, names=((kind, "/*"),), level=Level.ENCRYPT)
     for right in ("publish", "request", "call"):
         wild = tuple(sorted(stated_rights.wild[right]))
-        yield Widest(source=_NOWHERE, rights=((right, wild),), enclaves=("*",))
+        yield Widest(source=_NOWHERE, rights=((right, wild),), enclaves=("*", EXCEPT + _PEOPLE))
 
 
 def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
