@@ -913,7 +913,8 @@ def check_requirements(
             requirement.
         InvalidNameError: A namespace is not valid, or has a wildcard.
         UsageError: There is no such vendor or distribution, ``domain`` is not a domain id, or a
-            remapping is not valid, or changes no requirement.
+            remapping is not valid, or is for a name that neither the requirements nor the policy
+            have.
 
     Example:
         >>> for finding in sros_tool.check_requirements("robot.xml", "robot.requirements.toml"):
@@ -925,7 +926,11 @@ def check_requirements(
     from sros_tool.keystore.template import load_template
     from sros_tool.names import check_plain_namespace
     from sros_tool.policy.remapping import parse_remapping_of_names
-    from sros_tool.proof.findings import requirement_findings, robots_left_out
+    from sros_tool.proof.findings import (
+        remappings_unused,
+        requirement_findings,
+        robots_left_out,
+    )
     from sros_tool.proof.requirements import read_all_requirements
     from sros_tool.proof.system import WORLDS, load_system
 
@@ -939,6 +944,7 @@ def check_requirements(
         fleet=read_fleet(Path(fleet)) if fleet else None,
     )
     files = [requirements] if isinstance(requirements, str | PathLike) else requirements
+    paths = [Path(file) for file in files]
     system = load_system(
         [Path(path)] if isinstance(path, str | PathLike) else list(map(Path, path)),
         at,
@@ -946,8 +952,12 @@ def check_requirements(
     )
     places = [check_plain_namespace(namespace) for namespace in namespaces] or ["/"]
     rules = [parse_remapping_of_names(remap) for remap in remaps]
-    wanted = read_all_requirements(map(Path, files), system.fleet, places, rules)
-    findings = [*requirement_findings(wanted, system), *robots_left_out(system, places)]
+    wanted = read_all_requirements(paths, system.fleet, places, rules)
+    findings = [
+        *requirement_findings(wanted, system),
+        *robots_left_out(system, places),
+        *remappings_unused(paths, system, places, rules),
+    ]
     return tuple(
         finding for finding in findings if finding.severity > NOTE or finding.kind.prominent
     )

@@ -84,6 +84,16 @@ ROBOTS_LEFT_OUT = FindingKind(
     "these robots.",
     prominent=True,
 )
+REMAPPING_UNUSED = FindingKind(
+    "requirement.remapping-unused",
+    NOTE,
+    "a remapping that changes no requirement",
+    "The policy has the new name, or such a node, but no requirement has the old name. An old name "
+    "that is misspelled looks like this, and then requirements on it say nothing of the new name.",
+    "The requirements file.",
+    "Compare the old name with those in the requirements; ignore this if they do not name it.",
+    prominent=True,
+)
 NOT_ON_ZENOH = FindingKind(
     "requirement.not-on-zenoh",
     NOTE,

@@ -400,7 +400,11 @@ def _requirements(
         return None
     from sros_tool.names import check_plain_namespace
     from sros_tool.policy.remapping import parse_remapping_of_names
-    from sros_tool.proof.findings import requirement_findings, robots_left_out
+    from sros_tool.proof.findings import (
+        remappings_unused,
+        requirement_findings,
+        robots_left_out,
+    )
     from sros_tool.proof.requirements import (
         dropped_findings,
         read_all_requirements,
@@ -417,6 +421,7 @@ def _requirements(
             wanted = read_all_requirements(files, system.fleet, places, rules)
             findings += requirement_findings(wanted, system)
             findings += robots_left_out(system, places)
+            findings += remappings_unused(files, system, places, rules)
             if earlier:
                 before = [
                     requirement

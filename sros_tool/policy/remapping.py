@@ -57,7 +57,8 @@ class Remapping(NamedTuple):
 class UsedRule(NamedTuple):
     """A rule that changed a node (``kind`` is ""), or a name in one of the node's groups.
 
-    ``kind`` is that of the group; ``old`` and ``new`` are the name in full before and after.
+    ``kind`` is that of the group; ``old`` and ``new`` are the full name, of node or group, before
+    and after.
     """
 
     rule: Remapping
@@ -134,6 +135,23 @@ def remapped_name(name: str, ns: str, rules: Iterable[Remapping]) -> list[str]:
     return [*kept, *new_names.values()]
 
 
+def has_new_name(rule: Remapping, names: Iterable[str], namespaces: Iterable[str]) -> bool:
+    """Return whether ``names``, in full, have what a rule remaps to in one of some namespaces.
+
+    A node counts if a name is below that of the node.
+    """
+    of_node = rule.old == _NODE
+    new = {
+        expand("~" if of_node else rule.new, ns, rule.new if of_node else rule.node)
+        for ns in namespaces
+    }
+    return any(
+        name == there or (of_node and name.startswith(f"{there}/"))
+        for name in names
+        for there in new
+    )
+
+
 def remapped_policies(
     policies: Iterable[Policy], texts: Iterable[str], file: Policy = _EMPTY
 ) -> tuple[list[Policy], list[Note]]:
@@ -201,14 +219,16 @@ def _notes_on_requirements(
         }
         for side in (policies, [policy for policy, _ in remapped])
     )
-    gone = {name for _, name in before - after if name.rpartition("/")[2] not in NODE_SERVICES}
+    moved = {name for _, name in before - after}
+    gone = {name for name in moved if name.rpartition("/")[2] not in NODE_SERVICES}
     if gone:
         # As `parse_remapping_of_names` takes them, where no node keeps the name.
         options = {
             str(use.rule._replace(node=use.node if use.rule.is_of_node else ""))
             for _, uses in remapped
             for use in uses
-            if use.rule.old == _NODE or use.old in gone
+            if use.old in gone
+            or (not use.kind and any(name.startswith(f"{use.old}/") for name in moved))
         }
         text = (
             f"requirements that name {first_few(sorted(gone), _SHOWN)} do not apply to the new "
@@ -267,7 +287,8 @@ def remapped_policy(
         of_node = [rule for rule in rules if rule.old != _NODE and rule.node in ("", node)]
         moved = [rule for rule in of_node if rule.old == _NAMESPACE]
         ns = moved[0].new if moved else profile.ns
-        used.update(UsedRule(rule, profile.node) for rule in renamed[:1] + moved[:1])
+        own, new = expand("~", profile.ns, profile.node), expand("~", ns, node)
+        used.update(UsedRule(rule, profile.node, "", own, new) for rule in renamed[:1] + moved[:1])
         of_names = [rule for rule in of_node if rule.old != _NAMESPACE]
         groups = []
         for group in profile.groups:

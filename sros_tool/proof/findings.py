@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from sros_tool.automata import SearchLimit
 from sros_tool.checks.kind import Finding, RelatedPlace
@@ -12,12 +13,14 @@ from sros_tool.checks.requirements import (
     NOT_CROSSING,
     NOT_ON_ZENOH,
     OF_EXPORT,
+    REMAPPING_UNUSED,
     ROBOTS_LEFT_OUT,
     UNNAMED,
     VACUOUS,
     VIOLATED,
 )
 from sros_tool.dds.decision.vendors import joined_titles
+from sros_tool.errors import UsageError
 from sros_tool.faults import REFUSE_STRANGERS
 from sros_tool.keystore.template import DEFAULT_TEMPLATE
 from sros_tool.names import (
@@ -26,6 +29,7 @@ from sros_tool.names import (
     service_of,
 )
 from sros_tool.policy.model import ALLOW, Level, Source
+from sros_tool.policy.remapping import Remapping, has_new_name
 from sros_tool.policy.rights import KIND_OF, Right
 from sros_tool.proof.decide import MOST_STEPS, KeptUse, Use, Verdict, Witness, Worlds
 from sros_tool.proof.requirements import (
@@ -39,6 +43,7 @@ from sros_tool.proof.requirements import (
     Protected,
     Requirement,
     demand,
+    unused_remappings,
 )
 from sros_tool.proof.system import Place, System
 from sros_tool.proof.worlds import ANYBODY, World
@@ -247,6 +252,36 @@ def robots_left_out(system: System, namespaces: Sequence[str]) -> list[Finding]:
         return []
     text = f"in none of the namespaces that were named: {first_few(others, _SHOWN)}"
     return [ROBOTS_LEFT_OUT.found(system.file, text, system.file)]
+
+
+def remappings_unused(
+    files: Iterable[Path],
+    system: System,
+    namespaces: Sequence[str],
+    remaps: Sequence[Remapping],
+) -> list[Finding]:
+    """Return a finding for each rule that changes no requirement in ``files``.
+
+    Raises:
+        UsageError: ``system`` does not have the new name of such a rule, either.
+        SrosError: a file cannot be read.
+    """
+    unused = unused_remappings(files, system.fleet, namespaces, remaps) if remaps else []
+    names = {right.name for right in system.rights}
+    for rule in unused:
+        if not has_new_name(rule, names, namespaces or ("/",)):
+            raise UsageError(
+                f"--remap {rule}: no requirement names this, and '{system.file}' has no such new "
+                "name",
+                "",
+                "Write both names as the requirements and the policy do, or leave --remap out.",
+            )
+    return [
+        REMAPPING_UNUSED.found(
+            system.file, f"--remap {rule}: no requirement names this", system.file
+        )
+        for rule in unused
+    ]
 
 
 def _with_those_above(namespace: str) -> Iterator[str]:

@@ -34,7 +34,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from sros_tool.checks.kind import Finding, RelatedPlace
 from sros_tool.checks.requirements import DROPPED
-from sros_tool.errors import DocumentError, UsageError
+from sros_tool.errors import DocumentError
 from sros_tool.files import read_toml
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.names import expand, expression_problem, is_expression
@@ -319,26 +319,31 @@ def read_all_requirements(
 
     Raises:
         SrosError: as `read_requirements`.
-        UsageError: a rule of ``remaps`` changes no requirement.
     """
-    paths = tuple(paths)
+    return tuple(
+        requirement
+        for path in paths
+        for requirement in read_requirements(path, fleet, namespaces, remaps)
+    )
 
-    def read(rules: Sequence[Remapping]) -> tuple[Requirement, ...]:
-        return tuple(
-            requirement
-            for path in paths
-            for requirement in read_requirements(path, fleet, namespaces, rules)
-        )
 
-    requirements, rules = read(remaps), tuple(dict.fromkeys(remaps))
-    for rule in rules:
-        if read([other for other in rules if other != rule]) == requirements:
-            raise UsageError(
-                f"--remap {rule}: no requirement names this",
-                "",
-                "Write the name as the requirements do, or leave --remap out for these files.",
-            )
-    return requirements
+def unused_remappings(
+    paths: Iterable[Path],
+    fleet: FleetSource,
+    namespaces: Sequence[str],
+    remaps: Iterable[Remapping],
+) -> list[Remapping]:
+    """Return the rules without which the requirements in files are the same.
+
+    Raises:
+        SrosError: as `read_requirements`.
+    """
+    paths, rules = tuple(paths), tuple(dict.fromkeys(remaps))
+    read = partial(read_all_requirements, paths, fleet, namespaces)
+    requirements = read(rules)
+    return [
+        rule for rule in rules if read([other for other in rules if other != rule]) == requirements
+    ]
 
 
 def parse_requirements(

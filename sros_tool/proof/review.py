@@ -91,7 +91,11 @@ from sros_tool.proof.commit_files import (
     users_of,
 )
 from sros_tool.proof.decide import restricted_enclaves
-from sros_tool.proof.findings import requirement_findings, robots_left_out
+from sros_tool.proof.findings import (
+    remappings_unused,
+    requirement_findings,
+    robots_left_out,
+)
 from sros_tool.proof.growth import DroppedDenial, Growth, compare_access, undenied_name
 from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
 from sros_tool.proof.requirements import (
@@ -100,7 +104,6 @@ from sros_tool.proof.requirements import (
     Requirement,
     dropped_findings,
     dropped_requirements,
-    read_all_requirements,
     read_requirements,
 )
 from sros_tool.proof.sources import AccessSource, load_policies, load_side
@@ -1005,7 +1008,7 @@ class _Review:
                 policies, self._circumstances(fleet), self._template()
             )
         if not systems:
-            yield from self._read(files, lambda: fleet, self.request.remaps)
+            yield from self._read(files, lambda: fleet)
         for subject, load in systems.items():
             try:
                 system = load()
@@ -1013,7 +1016,7 @@ class _Review:
             except (SrosError, OSError) as error:
                 yield _undecided("requirements", subject, error)
                 continue
-            wanted = yield from self._read(files, system.fleet, self.request.remaps)
+            wanted = yield from self._read(files, system.fleet)
             self.is_relative |= any(requirement.is_relative for requirement in wanted)
             earlier = yield from self._read(
                 base_files, partial(_without_left_robots, before, system.fleet)
@@ -1027,19 +1030,16 @@ class _Review:
             yield from self._step_result(
                 "requirements",
                 subject,
-                partial(self._decided, wanted, system, rights, elsewhere),
+                partial(self._decided, files.values(), wanted, system, rights, elsewhere),
                 only_with_result=bool(files),
             )
             decide = partial(self._dropped_step, earlier, wanted, system, sources)
             yield from self._step_result("requirements-before", subject, decide)
 
     def _read(
-        self, files: Mapping[str, Path], fleet: FleetSource, used: Sequence[Remapping] = ()
+        self, files: Mapping[str, Path], fleet: FleetSource
     ) -> Generator[ReviewStep, None, list[Requirement]]:
-        """Return the requirements of files, by path; yield the steps that cannot read them.
-
-        The remappings ``used`` have to change a requirement.
-        """
+        """Return the requirements of files, by path; yield the steps that cannot read them."""
         read = yield from _read_each(
             "requirements",
             files,
@@ -1047,24 +1047,23 @@ class _Review:
                 files[path], fleet, self.request.namespaces, self.request.remaps
             ),
         )
-        if used and read.keys() == files.keys():
-            places = self.request.namespaces
-            all_of = partial(read_all_requirements, files.values(), fleet, places, used)
-            yield from _read_each("requirements", files, lambda _: all_of() and None)
         return [requirement for requirements in read.values() for requirement in requirements]
 
     def _decided(
         self,
+        files: Iterable[Path],
         requirements: Sequence[Requirement],
         system: System,
         before: Iterable[Right],
         elsewhere: Callable[[], Iterable[Finding]],
     ) -> tuple[int, ChosenFindings]:
         """Return the step on requirements, also on the robots that have another namespace."""
+        asked = self.request
         findings = [
             *requirement_findings(requirements, system, before),
-            *robots_left_out(system, self.request.namespaces),
+            *robots_left_out(system, asked.namespaces),
             *elsewhere(),
+            *remappings_unused(files, system, asked.namespaces, asked.remaps),
         ]
         chosen = FindingFilter().choose(findings)
         return _status(chosen), chosen

@@ -65,6 +65,7 @@ CASES = {
     "requirement.unnamed",
     "requirement.not-on-zenoh",
     "requirement.of-export",
+    "requirement.remapping-unused",
     "requirement.robots-left-out",
 }
 """The kinds of findings that tests here bring about."""
@@ -525,7 +526,7 @@ def test_requirements_are_remapped_as_the_policy(tmp_path: Path) -> None:
     assert ended.status == 1
     assert "/base: may request /g, but only /left/planner may request /g" in ended.out
     for words, problem in (
-        (("--remap", "close:=/g"), "--remap close:=/g: no requirement names this"),
+        (("--remap", "close:=/h"), "--remap close:=/h: no requirement names this"),
         (("--remap", "~/close:=/g"), "Write it as NODE:~/close:=/g."),
         (("--remap", "close:=~/g"), "Write it as NODE:close:=~/g."),
         (("--remap", "__node:=x"), "Write it as NODE:__node:=x."),
@@ -535,3 +536,28 @@ def test_requirements_are_remapped_as_the_policy(tmp_path: Path) -> None:
         ended = sros(*asked, *words, cwd=tmp_path)
         assert (ended.status, problem in ended.err) == (2, True), ended
     assert sros("check", "robot.xml", *rule, cwd=tmp_path).status == 2
+
+
+def test_what_merging_prints_runs_where_no_requirement_names_the_node(tmp_path: Path) -> None:
+    """A rule whose new name the policy does not have, either, is misspelled."""
+    nodes = policy_text(
+        {
+            "/a": '<topics publish="ALLOW"><topic>range</topic></topics>'
+            '<services reply="ALLOW"><service>~/reset</service></services>',
+        }
+    ).replace('node="n"', 'node="mapper"')
+    (tmp_path / "own.xml").write_text(policy_text({"/b": publish("/x")}))
+    (tmp_path / "mapper.xml").write_text(nodes)
+    (tmp_path / "r.toml").write_text('[[only]]\npublish = ["range"]\nenclaves = ["/a"]\n')
+    rules = ("--remap", "__node:=sonar_map", "--remap", "range:=distance")
+    merged = sros("merge_policy", "own.xml", "mapper.xml", *rules, "-o", "p.xml", cwd=tmp_path)
+    (printed,) = re.findall(r"`sros (check [^`]+)`", merged.ok().err)
+    command = printed.replace("POLICY", "p.xml").replace("FILE", "r.toml").split()
+    asked = (*command, "--include", "requirement.*")
+    ended = sros(*asked, cwd=tmp_path).ok()
+    assert "--remap mapper:__node:=sonar_map: no requirement names this" in ended.out
+    assert ended.out.count("remapping-unused") == 1, ended
+    for misspelled in ("mapper:__node:=sonar_mop", "mapper:~/reset:=~/rest", "rnge:=distanc"):
+        ended = sros(*asked, "--remap", misspelled, cwd=tmp_path)
+        said = f"--remap {misspelled}: no requirement names this, and 'p.xml' has no such new name"
+        assert (ended.status, said in ended.err) == (2, True), ended

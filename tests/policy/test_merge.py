@@ -186,7 +186,7 @@ def test_the_note_on_requirements_names_rules_that_they_take() -> None:
     driver = one(group("topics", "x ~/y z", publish="ALLOW"), node="driver")
     viewer = one(group("topics", "z", subscribe="ALLOW"), node="viewer")
     for texts, options in (
-        (["__node:=front"], ["driver:__node:=front", "viewer:__node:=front"]),
+        (["__node:=front"], ["driver:__node:=front"]),
         (["~/y:=/v", "driver:x:=/w"], ["driver:~/y:=/v", "x:=/w"]),
         (["x:=/w", "driver:z:=/u"], ["x:=/w"]),
     ):

@@ -1279,7 +1279,7 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(change: Change) ->
     assert "/b: may publish /l/x, but only /l/a may publish /l/x" in ended.out
     ended = change.review(*asked, "--namespace", "/l", "--remap", "x:=/x")
     assert "/a: may publish /x, but only /l/a may" in ended.out and "/l/x" not in ended.out, ended
-    ended = change.review(*asked, "--remap", "z:=/x")
+    ended = change.review(*asked, "--remap", "z:=/z")
     assert (ended.status, "no requirement names this" in ended.out) == (2, True), ended
 
 
