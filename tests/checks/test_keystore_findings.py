@@ -25,6 +25,7 @@ from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import key_pem, load_key
 from sros_tool.policy.document import read_policy
+from sros_tool.validity import iso
 from tests.checks.bench import SECRET, Bench, new_key
 from tests.checks.keystore_cases import CASES, STRANGER, also_trusted, give_away
 from tests.support.harness import copy_of, policy_text, publish, sros
@@ -105,17 +106,23 @@ def test_a_remedy_that_is_an_export_says_so_once() -> None:
     assert told.lower().count("export the enclave again") == 1
 
 
-def test_dates_that_expire_early_in_the_east_are_not_backdated(bench: Bench) -> None:
+def test_dates_that_are_not_valid_in_every_time_zone_have_a_remedy_that_helps(
+    bench: Bench,
+) -> None:
+    """Under a young CA, an earlier not_before is not possible; later, a new one does not help."""
     permissions = open_enclave(bench.path("enclaves/base"), now=bench.now).permissions
     assert permissions
-    end = permissions.grants[0].validity.not_after
-    options = {"now": end - timedelta(hours=13), **bench.options}
-    found = keystore_findings(OpenedKeystore(bench.checked), Circumstances(**options))
-    remedies = [each.remedy for each in found if each.id == TIME_WINDOW.id]
-    assert remedies
-    for remedy in remedies:
-        assert "not_before" not in remedy
-        assert "--set permissions.validity=2d --allow-looser`" in remedy, remedies
+    validity = permissions.grants[0].validity
+    wait = f"Wait: from {iso(validity.not_before + timedelta(hours=12))} on, they have begun"
+    for now, said in (
+        (validity.not_before + timedelta(hours=11), wait),
+        (validity.not_after - timedelta(hours=13), "--set permissions.validity=2d --allow-looser`"),
+    ):
+        options = {"now": now, **bench.options}
+        found = keystore_findings(OpenedKeystore(bench.checked), Circumstances(**options))
+        remedies = [each.remedy for each in found if each.id == TIME_WINDOW.id]
+        assert remedies and all(said in remedy for remedy in remedies), remedies
+        assert all(("not_before" in remedy) == (said == wait) for remedy in remedies)
 
 
 @pytest.mark.parametrize("expected", some([*CASES], 60))

@@ -223,7 +223,6 @@ _SUBJECT = re.compile(
     r"(?:,CN=/)?\Z"
 )
 _LAST_YEAR = 2262
-_BACKDATE = "Write a not_before at least 12 hours in the past, as sros does, and sign it again."
 _WEST, _EAST = timedelta(hours=12), timedelta(hours=14)
 _DIRECTIONS = ("publish", "subscribe")
 
@@ -340,8 +339,12 @@ def _validity_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iter
         is_early = now - _WEST < window.not_before
         accepted = "" if is_early else enclave.accepts_expiry
         text = f"{text}, and now it is {iso(now)}"
-        remedy = _BACKDATE if is_early else ""
-        yield TIME_WINDOW.found(enclave.name, text, file, remedy=remedy, accepted=accepted)
+        remedy = is_early and (
+            f"Wait: from {iso(window.not_before + _WEST)} on, they have begun in every time zone. "
+            "Until then, let the hosts run in UTC. Sign later ones with a not_before at least 12 "
+            "hours in the past, as sros does once the CA is that old."
+        )
+        yield TIME_WINDOW.found(enclave.name, text, file, remedy=remedy or "", accepted=accepted)
 
 
 def _utc(seconds: float) -> str:
