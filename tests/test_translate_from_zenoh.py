@@ -15,7 +15,7 @@ from sros_tool.files import policies_dir
 from sros_tool.policy.document import policy_xml, read_policy
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.patterns import matches
-from sros_tool.policy.rights import Rules, folded, policy_rights
+from sros_tool.policy.rights import Rules, join_actions, policy_rights
 from sros_tool.translate_zenoh.rights import (
     RightsOfSubject,
     name_of_key,
@@ -152,7 +152,7 @@ def test_the_shipped_policies_come_back(policy: Path, tmp_path: Path) -> None:
     assert all(whole.cover(each) for each in came)
     denied = {each.enclave for each in policy_rights(stated) if each.qualifier is not ALLOW}
     again = Rules(came)
-    missing = {each for each in folded(allowed) if not again.cover(each)}
+    missing = {each for each in join_actions(allowed) if not again.cover(each)}
     assert {each.enclave for each in missing} <= denied
 
 

@@ -62,7 +62,7 @@ from sros_tool.policy.document import COMMON, IncludedFile, Includer, read_polic
 from sros_tool.policy.model import (
     ALLOW,
     DENY,
-    OFFERING_SIDE,
+    OFFERING_RIGHT,
     RIGHTS,
     Enclave,
     Policy,
@@ -74,7 +74,7 @@ from sros_tool.policy.model import (
 from sros_tool.policy.node_basics import are_basic
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers, literal_prefix, matches
 from sros_tool.policy.placeholders import parts_of
-from sros_tool.policy.rights import WHOLE, Right, Rules, parts, placed_rights, policy_rights
+from sros_tool.policy.rights import ACTION_RIGHT, Right, Rules, parts, placed_rights, policy_rights
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
 from sros_tool.wording import counted, first_few
@@ -272,7 +272,7 @@ _DIGIT_FIRST = re.compile(r"/(?:[0-9]|\[[0-9-]+\])")
 _DDS_PREFIX = re.compile(r"/?(?:rt|rq|rr|rs)/")
 _ALL = re.compile(r"/?[*?]*\*[*?]*\Z")
 _SETTING = ("set_parameters", "set_parameters_atomically")
-_ASKING_SIDE = {offering: asking for asking, offering in OFFERING_SIDE.items()}
+_ASKING_SIDE = {offering: asking for asking, offering in OFFERING_RIGHT.items()}
 
 
 def _check_names(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
@@ -306,7 +306,7 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         if not statement.allows or is_expression(name) or name in GLOBAL_TOPICS:
             return False
         # The counterpart may be in a right to the whole action.
-        return not sides[other].meets(name) and not action_part(name)[1]
+        return not sides[other].overlaps(name) and not action_part(name)[1]
 
     alone = [
         statement
@@ -321,7 +321,7 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     near = NearNames(offered)
     spelled = cache(lambda side: NearNames(e for e in names[side] if not is_expression(e)))
     for statement in checked_policy.statements:
-        other = OFFERING_SIDE.get(statement.right.right)
+        other = OFFERING_RIGHT.get(statement.right.right)
         if not other or not is_alone(statement, other):
             continue
         if statement.right.kind != "topics" and statement.is_private:
@@ -366,10 +366,10 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
                 hint = f"; perhaps you mean {' or '.join(similar[:_NAMES_SHOWN])} ({other})"
             yield statement.found(NO_COUNTERPART, f"no enclave may {other} {statement.name}{hint}")
     for statement in checked_policy.statements:
-        other, name = OFFERING_SIDE.get(statement.right.right), statement.name
+        other, name = OFFERING_RIGHT.get(statement.right.right), statement.name
         if other not in ("publish", "reply") or not statement.allows or not is_expression(name):
             continue
-        if not sides[other].meets(name) and ACTION_SEPARATOR not in name:
+        if not sides[other].overlaps(name) and ACTION_SEPARATOR not in name:
             text = f"no enclave may {other} a name that {name} matches"
             yield statement.found(NO_COUNTERPART, text)
 
@@ -1039,7 +1039,7 @@ def portability_findings(
 ) -> Iterator[Finding]:
     """Yield findings about parts of permissions that are outside the portable profile."""
     for identity, fact in portability_problems(
-        permissions, signed_bytes, lambda names: Names(names).meets
+        permissions, signed_bytes, lambda names: Names(names).overlaps
     ):
         yield _OUTSIDE[identity].found(subject, fact, file, line)
 
@@ -1136,8 +1136,8 @@ def _statement_findings(statement: _Statement, rules: Rules) -> Iterator[Finding
         return
     enclave, _, right, name = statement.right
     action, separator, ending = name.rpartition(ACTION_SEPARATOR)
-    if separator and matches(ending, "send_goal") and right in WHOLE:
-        whole = WHOLE[right]
+    if separator and matches(ending, "send_goal") and right in ACTION_RIGHT:
+        whole = ACTION_RIGHT[right]
         if not rules.allow(enclave, whole, action):
             text = f"{name} is allowed, but not everything needed to {whole} {action}"
             yield statement.found(HALF_ACTION, text)

@@ -408,9 +408,11 @@ def unanswered_lines(difference: SourcesDifference, fleet: Fleet | None) -> Iter
     Lines that differ only in the robot are merged.
     """
     from sros_tool.fleet.robots import folded
-    from sros_tool.policy.rights import unanswered_text
+    from sros_tool.policy.rights import lost_counterpart_text
 
-    lines = [(right.enclave, f"! {unanswered_text(right)}") for right in difference.unanswered]
+    lines = [
+        (right.enclave, f"! {lost_counterpart_text(right)}") for right in difference.unanswered
+    ]
     yield from folded(fleet, lines)
 
 

@@ -43,7 +43,7 @@ from sros_tool.names import (
 )
 from sros_tool.policy.model import ALLOW, Policy
 from sros_tool.policy.patterns import covers
-from sros_tool.policy.rights import Right, Rules, of_whole_action, profile_rights
+from sros_tool.policy.rights import Right, Rules, action_right, profile_rights
 from sros_tool.runtime.vendor_log import (
     ENDPOINT_KINDS,
     REMOTE_ENDPOINT,
@@ -201,7 +201,7 @@ def _is_ros(topic: str) -> bool:
 
 def _right(denial: Denial) -> NodeRight:
     right, name = right_to_use(denial.topic, writes=denial.direction == PUBLISH)
-    return NodeRight(*of_whole_action(right, name))
+    return NodeRight(*action_right(right, name))
 
 
 def _without_parts(rights: set[NodeRight]) -> frozenset[NodeRight]:

@@ -49,7 +49,7 @@ from sros_tool.names import (
     nodes_served,
 )
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source
-from sros_tool.policy.rights import Right, of_whole_action, order, profile_rights
+from sros_tool.policy.rights import Right, action_right, order, profile_rights
 from sros_tool.terminal import log_step
 
 
@@ -249,7 +249,7 @@ def _smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | Non
         governance = enclave.plain_governance or parse_governance(enclave.governance)
     except SrosError:
         return None
-    wanted = Right(enclave.name, ALLOW, *of_whole_action(question.right, question.name))
+    wanted = Right(enclave.name, ALLOW, *action_right(question.right, question.name))
     present = _present_rights(enclave.policy, enclave.name, answer)
     add: list[Right] = []
     lift: list[Right] = []

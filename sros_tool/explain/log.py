@@ -55,7 +55,7 @@ from sros_tool.names import (
     right_to_use,
 )
 from sros_tool.pki.certificates import IDENTITY_DIGITS
-from sros_tool.policy.model import ALLOW, OTHER_SIDE, Enclave, Policy, policy_in_namespace
+from sros_tool.policy.model import ALLOW, PEER_RIGHT, Enclave, Policy, policy_in_namespace
 from sros_tool.policy.patterns import Names, covers
 from sros_tool.policy.rights import Right
 from sros_tool.runtime.log_texts import (
@@ -181,7 +181,7 @@ class SearchedKeystore:
         None if that is not known, as with unreadable permissions, or if an enclave has the right
         only by a wildcard. In an export, the enclave with the right may be missing (see `place`).
         """
-        exact, expressions = self._allowed_names[OTHER_SIDE[right.right]]
+        exact, expressions = self._allowed_names[PEER_RIGHT[right.right]]
         if right.name in exact:
             return True
         with suppress(SrosError):  # too many wildcards to compare
@@ -230,7 +230,7 @@ class SearchedKeystore:
     @cached_property
     def _allowed_names(self) -> Mapping[str, tuple[frozenset[str], Names]]:
         """Map each right to the exact names, and to the wildcards, that enclaves have."""
-        names: dict[str, set[str]] = {right: set() for right in OTHER_SIDE}
+        names: dict[str, set[str]] = {right: set() for right in PEER_RIGHT}
         for right in self._rights.rights if self._rights else ():
             if right.qualifier is ALLOW and right.right in names:
                 names[right.right].add(right.name)
@@ -968,7 +968,7 @@ class _Examiner:
         names = () if is_used else likely_names(asked)
         if not names and is_used is False and self._keystore:
             place = self._keystore.place
-            return [f"no enclave of the {place} may {OTHER_SIDE[denied.right]} {name}"], (
+            return [f"no enclave of the {place} may {PEER_RIGHT[denied.right]} {name}"], (
                 "If another name is meant, the node perhaps lacks a remapping: compare its command "
                 "with the one that the robot starts (after `sros close`: start/commands.txt). "
                 f"Otherwise, {remedy}"

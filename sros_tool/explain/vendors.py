@@ -52,7 +52,7 @@ from sros_tool.keystore.participant import (
 )
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.names import is_expression
-from sros_tool.policy.model import OFFERING_SIDE, OTHER_SIDE, Policy
+from sros_tool.policy.model import OFFERING_RIGHT, PEER_RIGHT, Policy
 from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.values import shows
 from sros_tool.wording import first_few
@@ -338,14 +338,14 @@ def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[N
     question = answer.question
     if answer.allowed or answer.problems or not question.right:
         return
-    needed = OTHER_SIDE[question.right]
+    needed = PEER_RIGHT[question.right]
     rights = asked_enclave.other_rights(question.name)
     if any((right.right, right.name) == (needed, question.name) for right in rights):
         return
     if names := likely_names(answer):
         text = f"the enclave may {question.word} {' and '.join(names)}: perhaps that is meant."
         yield Note("explain.likely-name", text)
-    elif question.right in OFFERING_SIDE and asked_enclave.has_peers:
+    elif question.right in OFFERING_RIGHT and asked_enclave.has_peers:
         text = f"no enclave that was read may {needed} {question.name} by its name: perhaps nobody "
         text += "offers it, and the node lacks a remapping, or a wildcard allows it."
         yield Note("explain.not-offered", text)

@@ -27,7 +27,7 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, Enclave, Group, Policy, Profile, Source, with_profiles
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.placeholders import Parts, fill, has_placeholder, parts_of, placeholders_of
-from sros_tool.policy.rights import Right, Rules, parts, policy_rights, unfolded
+from sros_tool.policy.rights import Right, Rules, parts, policy_rights, split_actions
 from sros_tool.wording import first_few
 
 if TYPE_CHECKING:
@@ -329,7 +329,7 @@ def with_placeholders(policy: FleetPolicy, observed: Iterable[Right]) -> frozens
     expanded: set[Right] = set()
     for path, rights in _rights_by_enclave(observed).items():
         if path in policy:
-            expanded.update(_as_stated(policy, path, unfolded(rights)))
+            expanded.update(_as_stated(policy, path, split_actions(rights)))
         else:
             expanded.update(rights)
     return frozenset(expanded)
@@ -370,7 +370,7 @@ def check_narrowed(policy: FleetPolicy, result: MinimizedPolicy, observed: Itera
         ]
         used = (
             e
-            for e in unfolded(observed_rights.get(path, ()))
+            for e in split_actions(observed_rights.get(path, ()))
             if before.allow(path, e.right, e.name)
         )
         wrong += (right for right in used if not now.cover(right))

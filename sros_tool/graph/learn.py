@@ -933,14 +933,14 @@ def _with_includes(
         if profile is None:
             continue
         if place in known:
-            text.put(element.inner, _put_in_front(profile, element, text))
+            text.insert(element.inner, _put_in_front(profile, element, text))
         elif all(rules.allow(profile.enclave, right.right, right.name) for right in profile.rights):
-            text.put(element.inner, _put_inside(profile, element, text), element.close)
+            text.insert(element.inner, _put_inside(profile, element, text), element.close)
         else:
             continue
         included.update(profile.includes)
     if included and _prefix(text) is None:
-        text.put(text.root.inner - len(">"), f' xmlns:xi="{_XINCLUDE}"')
+        text.insert(text.root.inner - len(">"), f' xmlns:xi="{_XINCLUDE}"')
     return text.document(), tuple(sorted(included))
 
 

@@ -59,7 +59,7 @@ from sros_tool.policy.rights import (
     Rules,
     compare,
     policy_rights,
-    unanswered_rights,
+    rights_without_counterpart,
 )
 from sros_tool.translate import grant_rights
 from sros_tool.values import Words, shows
@@ -676,7 +676,7 @@ def compare_sources(
     scope = compared_enclaves(*((side.kind, side.scope) for side in sides))
     difference = compare(first_source.rights, second_source.rights, scope)
     unanswered = (
-        unanswered_rights(first_source.rights, second_source.rights, difference)
+        rights_without_counterpart(first_source.rights, second_source.rights, difference)
         if all(side.scope is None for side in sides)
         else ()
     )

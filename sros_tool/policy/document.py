@@ -3,17 +3,17 @@
 Policies of version 0.1.0 (ROS 2 Crystal to Eloquent) are converted: they have one profile for each
 node and no enclaves.
 
-The grammar follows the schema of ros2/sros2.  In addition every name is checked: a name that ROS
-does not allow is an error, because its author relies on that right or denial.
+The grammar follows the schema of ros2/sros2.  In addition, every name is checked: a name that ROS
+does not allow is an error, because its author relies on the right or the denial of the name.
 
 Includes (``xi:include``) are read only from the folder of the policy and the folders below.  An
-include has the result that the XInclude of libxml2 gives, or is refused.  Nodes of included
-documents are never moved into another document: a moved lxml node can crash Python.
+include is resolved as by libxml2 (XInclude), or refused.  Nodes of included documents are never
+moved into another document: a moved lxml node can crash Python.
 
-A processing instruction behind a name states how its messages have to be protected:
-``<topic>scan<?sros protect="encrypt"?></topic>``.  The schema of ros2/sros2 allows no attribute and
-no element there, but processing instructions everywhere; its XSLT copies them without translating
-them.
+A processing instruction after a name states how the messages of the name must be protected:
+``<topic>scan<?sros protect="encrypt"?></topic>``.  The schema of ros2/sros2 allows neither
+attributes nor elements there, but it allows processing instructions everywhere, and the XSLT of
+ros2/sros2 ignores their meaning.
 """
 
 from __future__ import annotations
@@ -68,7 +68,8 @@ _NAMESPACES = ("http://www.w3.org/2001/XInclude", "http://www.w3.org/2003/XInclu
 INCLUDES = frozenset(f"{{{ns}}}include" for ns in _NAMESPACES)
 FALLBACKS = frozenset(f"{{{ns}}}fallback" for ns in _NAMESPACES)
 _XML_BASE = "{http://www.w3.org/XML/1998/namespace}base"
-# libxml2 evaluates any XPath, for minutes if it is made for that, and no signal ends it.
+# libxml2 evaluates any XPath, even one that is made to take minutes, during which no signal ends
+# it.
 _STEP = re.compile(
     r"/(?P<tag>\*|[A-Za-z_][\w.-]*)"
     r"(?:\[@(?P<attribute>[A-Za-z_][\w.-]*)(?:=(?P<value>'[^']*'|\"[^\"]*\"))?\])?",
@@ -80,7 +81,7 @@ NAME_THE_FLEET = (
     "place of the placeholder in a copy. `merge_policy` adds to no such file: write placeholders "
     "in the other policy, too, and name both files."
 )
-"""The remedy for a policy with placeholders that is read without a fleet."""
+"""The remedy for reading a policy with placeholders without a fleet."""
 _MAX_INCLUDES = 10_000
 _MAX_DEPTH = 32
 _MAX_ELEMENTS = 200_000
@@ -89,7 +90,7 @@ _MAX_LENGTH = 1000  # characters of a href or an xpointer
 
 
 class IncludedFile(NamedTuple):
-    """A policy file, and the includes that lead to it, as pairs of file and xpointer.
+    """A policy file with the includes that lead to it, as pairs of file and xpointer.
 
     ``linked`` says that the last include names the file by a symbolic link.
     """
@@ -100,13 +101,13 @@ class IncludedFile(NamedTuple):
 
 
 class MissingFileError(DocumentError):
-    """The file does not exist in the place from which policies are read."""
+    """The policy file does not exist where policies are read."""
 
 
 PolicyFiles = Callable[[Path], bytes]
-"""Function that returns the content of a policy file, given its path.
+"""A function that returns the content of a policy file, given the file's path.
 
-It raises `MissingFileError` if there is no such file, and `DocumentError` if it cannot tell.
+It raises `MissingFileError` if there is no such file, and `DocumentError` if this is not known.
 """
 
 
@@ -114,30 +115,33 @@ It raises `MissingFileError` if there is no such file, and `DocumentError` if it
 class Includer:
     """A reader of policy files in the folder ``root`` and below.
 
-    It reads each file once, but counts an included file each time, because a few small files could
+    Each file is read once, but counted each time it is included, because a few small files could
     expand to gigabytes.
     """
 
     root: Path
     read: PolicyFiles | None = None
-    """Function that returns a file's content; None reads from the file system."""
+    """A function that returns a file's content; None stands for the file system."""
     fallbacks: list[tuple[Source, str]] = field(default_factory=list)
-    """The includes whose fallback was used, each with the path of the missing file."""
+    """The includes that used their fallback, each with the path of the missing file."""
     _documents: dict[Path, etree._Element] = field(default_factory=dict)
     _sizes: dict[Path, int] = field(default_factory=dict)
     _real_paths: dict[tuple[Path, str], Path] = field(default_factory=dict)
-    """Where the includes of a folder lead; many profiles include the same file."""
+    """Maps a folder and the path in an include to the real path of the file.
+
+    Many profiles include the same file.
+    """
     _includes: int = 0
     _elements: int = 0
     _bytes: int = 0
     _digests: list[bytes] = field(default_factory=list)
 
     def digest(self) -> str:
-        """Return the SHA-256 (hexadecimal) of all files read so far, whatever their order."""
+        """Return the SHA-256 (hexadecimal) of all files read so far, in any order."""
         return hashlib.sha256(b"".join(sorted(self._digests))).hexdigest()
 
     def load(self, file: Path) -> etree._Element:
-        """Return the root element of a policy file, given by its real path."""
+        """Return the root element of a policy file; ``file`` is the file's real path."""
         if file not in self._documents:
             read = self.read or (lambda file: read_bytes(file, "policy file"))
             self.use_content(file, read(file))
@@ -147,7 +151,7 @@ class Includer:
         return self._documents[file]
 
     def use_content(self, file: Path, content: bytes) -> None:
-        """Use ``content`` in place of the file with this real path, even where it is included."""
+        """Use ``content`` for the file with this real path, even where it is included."""
         root = parse(content, f"the policy file '{file}'", instructions=True)
         _check_instructions(root, file)
         self._documents[file] = root
@@ -165,7 +169,7 @@ class Includer:
 
         Raises:
             PolicyError: the file is outside of the policy's folder, or other XInclude processors
-                would look for it elsewhere.
+                would search for it in another place.
         """
         where = _line(element, place)
         href = element.get("href", "")
@@ -283,7 +287,7 @@ class Includer:
     def _selected(
         self, roots: Iterator[tuple[etree._Element, IncludedFile]], pointer: str, where: str
     ) -> list[tuple[etree._Element, IncludedFile]]:
-        """Return the elements that an xpointer selects in a document with resolved includes."""
+        """Return the elements of a document, with resolved includes, that an xpointer selects."""
         path = pointer.removeprefix("xpointer(").removesuffix(")")
         steps = list(_STEP.finditer(path[:_MAX_LENGTH]))
         if f"xpointer({''.join(step[0] for step in steps)})" != pointer or not steps:
@@ -318,8 +322,9 @@ def _is_there(file: Path) -> bool:
 
 
 def _missing_remedy(file: Path) -> str:
-    """Return how to get a missing included file that ships with sros; "" for other files."""
-    from sros_tool.files import policies_dir  # what writes files is not needed to read policies
+    """Return a sentence on how to get an included file that ships with sros; "" for other files."""
+    # Reading policies must not import modules that write files.
+    from sros_tool.files import policies_dir
 
     tail = file.parts[file.parts.index(COMMON) :] if COMMON in file.parts else ()
     if not tail or not policies_dir().joinpath(*tail).is_file():
@@ -335,7 +340,7 @@ _PROTECT = re.compile(r"""protect\s*=\s*(?:"(?P<double>[^"]*)"|'(?P<single>[^']*
 
 
 def _check_instructions(root: etree._Element, file: Path) -> None:
-    """Raise `PolicyError` if a processing instruction for sros is outside of a name."""
+    """Raise `PolicyError` if a processing instruction for sros is not inside a name element."""
     outside = (*root.itersiblings(preceding=True), *root.itersiblings())
     for instruction in (*outside, *root.iter(etree.PI)):
         if not isinstance(instruction, etree._ProcessingInstruction):
@@ -385,7 +390,7 @@ _REQUIRED = {
     "ns": 'ns="/", or the namespace of the node',
     "node": 'node="NAME", with the name of the node',
 }
-"""Required attributes, and what to write where one is missing."""
+"""Maps a required attribute to the text that says what to write if it is missing."""
 _QUALIFIERS = {qualifier.value: qualifier for qualifier in Qualifier}
 
 
@@ -399,15 +404,15 @@ def read_policy(
 ) -> Policy:
     """Read a policy file with its includes, which must be in its folder or below.
 
-    The policies in a folder count as one policy.
+    For a folder, the policies in it are read as one policy.
 
     Args:
         path: the path of the file, or of a folder of policies.
-        content: the content of the file, which then need not exist.
-        placeholders: accept the placeholders of `sros_tool.policy.placeholders` in names; they are
-            not filled in, so only `sros_tool.fleet.expansion` can use the policy.
+        content: the content of the file, if it is not to be read from ``path``.
+        placeholders: accept placeholders (`sros_tool.policy.placeholders`) in names; they are not
+            filled in, so only `sros_tool.fleet.expansion` can use the policy.
         policy_files: returns the content of included files that are not in the file system.
-        may_be_empty: accept a file without any enclave, to which some are added.
+        may_be_empty: accept a file without enclaves, to which the caller adds some.
 
     Raises:
         PolicyError: (or another `DocumentError`, with file and line) the file violates the format,
@@ -427,7 +432,7 @@ def read_policy(
 
 
 def refuse_fallbacks(policy: Policy) -> None:
-    """Raise `PolicyError` if a policy uses a fallback because an included file is missing."""
+    """Raise `PolicyError` if an include of a policy used its fallback, as a file is missing."""
     for source, file in policy.fallbacks:
         raise PolicyError(
             f"{source}: the fallback of the include is used, because '{file}' is absent",
@@ -438,7 +443,7 @@ def refuse_fallbacks(policy: Policy) -> None:
 
 class _Reader:
     _other_roots: tuple[str, ...] = ()
-    """Root elements that are accepted besides <policy>."""
+    """Root elements that are accepted in addition to <policy>."""
     may_be_empty = False
 
     def __init__(
@@ -558,9 +563,9 @@ class _Reader:
         element: etree._Element,
         place: IncludedFile,
     ) -> PolicyError:
-        """Return the error for a name, as written, that is not valid with any placeholder's value.
+        """Return the error for a name that is not valid, whatever the values of placeholders are.
 
-        ``label`` is "enclave name" or "namespace".
+        ``written`` is the name as in the file.  ``label`` is "enclave name" or "namespace".
         """
         where = self._place_text(element, place)
         if not has_placeholder(written):
@@ -613,7 +618,7 @@ class _Reader:
     def _read_groups(
         self, element: etree._Element, place: IncludedFile, node: str
     ) -> Iterator[Group]:
-        """Yield the names of a group, split into groups with the same protection."""
+        """Yield groups for an XML group, with one for each protection level of its names."""
         kind = tag_of(element)
         if kind not in RIGHTS:
             raise PolicyError(
@@ -657,7 +662,7 @@ class _Reader:
                 "",
                 f"Remove the element, or name one: <{item}>NAME</{item}>.",
             )
-        # Names can be included one by one.
+        # The names of a group can come from different files by includes.
         is_one_file = all(at.file == place.file for _, at in items)
         for level, members in by_level.items():
             names, lines = tuple(name for name, _ in members), tuple(line for _, line in members)
@@ -665,7 +670,7 @@ class _Reader:
             yield Group(kind, tuple(rights), names, level, source, lines if is_one_file else ())
 
     def _read_protection(self, element: etree._Element, place: IncludedFile) -> Level | None:
-        """Return the protection level that the policy states for a name, or None."""
+        """Return the protection level stated for a name, or None."""
         if not len(element):
             return None
         where = self._place_text(element, place)
@@ -719,7 +724,7 @@ class _Reader:
         return name
 
     def _written_name(self, element: etree._Element) -> str:
-        """Return the text of an element with a name, as it is written."""
+        """Return the text of a name's element, as written."""
         return element.text or ""
 
     def _sample(
@@ -740,10 +745,10 @@ class _Reader:
         *,
         several: bool | None = None,
     ) -> Parts | None:
-        """Return the texts and placeholders that a name consists of; None if it has no placeholder.
+        """Return the texts and placeholders of a name; None if it has no placeholder.
 
-        ``several`` tells whether a placeholder may stand for the names of several robots; None if
-        the text is the path of an enclave.
+        ``several`` says whether a placeholder may stand for the names of several robots; None means
+        that the text is the path of an enclave.
         """
         if not has_placeholder(text):
             return None
@@ -830,17 +835,17 @@ class _Reader:
 
 
 def _meant_attribute(right: str, value: str) -> str:
-    """Return the attribute that a user meant who wrote an invalid ``value``, such as "allow"."""
+    """Return the attribute that was probably meant by an invalid ``value`` such as "allow"."""
     meant = value.strip().upper()
     words = [meant] if meant in _QUALIFIERS else list(_QUALIFIERS)
     return " or ".join(f'{right}="{word}"' for word in words)
 
 
 def _absolute(profile: Profile) -> tuple[Profile, ...]:
-    """Return profiles with the same meaning, whose namespaces begin with "/".
+    """Return equivalent profiles whose namespaces begin with "/".
 
-    Every ROS name begins with "/", so the first ``*`` of a namespace stands for nothing before a
-    "/", or for a text that begins with "/".
+    Every ROS name begins with "/".  So the first ``*`` of a namespace matches nothing before a "/",
+    or a text that begins with "/".
     """
     below = profile.ns.lstrip("*")
     if below == profile.ns:
@@ -856,8 +861,8 @@ def _absolute(profile: Profile) -> tuple[Profile, ...]:
 class ConvertedPolicy(NamedTuple):
     """A policy converted from an earlier format, with the same rights.
 
-    ``left_out`` are profiles for which no enclave is possible, each with the reason; without them,
-    the converted policy permits less than before.
+    ``left_out`` are profiles for which no enclave is possible, each with the reason.  Because they
+    are left out, the converted policy permits less than the original.
     """
 
     policy: Policy
@@ -874,7 +879,7 @@ class PrintedConversion(NamedTuple):
     enclaves: Sequence[str]
     """Paths of the enclaves in the converted policy."""
     left_out: Sequence[str]
-    """Profiles that cannot be converted, with the reason; if there are any, the status is 1."""
+    """Profiles that cannot be converted, with reasons; if there are any, the exit status is 1."""
     output: Path | None
     """Path of the file that was written, or null."""
     dry_run: DryRun
@@ -897,7 +902,7 @@ class ShippedPolicies(NamedTuple):
     """The policies that ship with sros."""
 
     policies: Sequence[PolicyFile]
-    """The policies that ship with sros, one entry for each file."""
+    """The policies that ship with sros, by file."""
 
 
 class CopiedPolicies(NamedTuple):
@@ -911,12 +916,13 @@ class CopiedPolicies(NamedTuple):
 
 
 def copy_policies(source: Path, target: Path, *, dry_run: bool = False) -> list[FileChange]:
-    """Copy a folder of policies, or only its common fragments; return the changed files.
+    """Copy a folder of policies, or of common fragments alone, and return the changed files.
 
     Existing files stay unchanged.
 
     Raises:
-        UsageError: ``target`` is not a folder, or one of its files differs; nothing is copied.
+        UsageError: ``target`` is not a folder, or a file in it differs from the copy; then nothing
+            is copied.
     """
     from sros_tool.files import new_files, write_new_folder
 
@@ -949,16 +955,16 @@ def copy_policies(source: Path, target: Path, *, dry_run: bool = False) -> list[
 
 
 def convert_policy(path: Path) -> ConvertedPolicy:
-    """Convert a policy file of version 0.1.0: every node gets an enclave.
+    """Convert a policy file of version 0.1.0, with one enclave for each node.
 
-    The enclave has the name of the node in its namespace, as its key had (ros2/sros2 0.6 to 0.8).
-    A private name is ``~/name`` since ROS 2 Eloquent; until then it was written ``~name``.  Files
-    that name version 0.1.0 and have ``<enclaves>``, and those with ``<contexts>`` (ros2/sros2 of
-    April 2020, never released), are converted too.
+    The path of an enclave is the node's namespace and name, like the folder of the node's keys in
+    ros2/sros2 0.6 to 0.8.  A private name is ``~/name`` since ROS 2 Eloquent, and ``~name`` in
+    earlier versions.  Files with version 0.1.0 and ``<enclaves>`` are converted, too, as are files
+    with ``<contexts>`` (ros2/sros2 of April 2020, never released).
 
     Raises:
         PolicyError: (or another `DocumentError`, with file and line) the file violates the format,
-            or is of version 0.2.0 already.
+            or already has version 0.2.0.
     """
     return _EarlierReader(path, None).converted()
 
@@ -970,9 +976,9 @@ _ONE_NODE = f"""<policy version="{VERSION}" xmlns:xi="http://www.w3.org/2001/XIn
 
 
 def with_node_rights(policy: Policy, folder: Path) -> Policy:
-    """Return the policy in which every profile has the rights that every node needs.
+    """Return the policy with the rights that every node needs added to every profile.
 
-    These rights are in ``common/node.xml`` of ``folder``.
+    ``common/node.xml`` in ``folder`` states these rights.
     """
     needed = read_policy(folder / "node.xml", _ONE_NODE.encode()).enclaves[0].all_profiles()[0]
 
@@ -1000,7 +1006,7 @@ def with_node_rights(policy: Policy, folder: Path) -> Policy:
 
 
 class _EarlierReader(_Reader):
-    """Reader of policies in an earlier format."""
+    """A reader of policies in an earlier format."""
 
     _other_roots = _EARLIER_ROOTS
 
@@ -1097,7 +1103,7 @@ def instruction_text(protect: Level | None) -> str:
 
 
 def policy_xml(policy: Policy) -> bytes:
-    """Return the policy as XML (UTF-8 bytes) that `read_policy` reads as an equal policy."""
+    """Return the policy as XML (UTF-8) that `read_policy` reads as an equal policy."""
     root = etree.Element("policy", version=policy.version)
     enclaves = etree.SubElement(root, "enclaves")
     metadata: list[tuple[etree._Element, str]] = []
@@ -1113,7 +1119,8 @@ def policy_xml(policy: Policy) -> bytes:
             if block.metadata:
                 metadata.append((profiles, block.metadata))
     etree.indent(root, space="  ")
-    # After the indentation, which would otherwise change texts and names.
+    # The instructions are added after the indentation, which would change texts and names with
+    # them.
     for item, level in protected:
         item.append(etree.PI(_INSTRUCTION, f'protect="{_WORDS[level]}"'))
     for profiles, text in metadata:
@@ -1126,13 +1133,13 @@ def policy_xml(policy: Policy) -> bytes:
 def checked_text(
     policy: Policy, output: Path | None, label: str, *, placeholders: bool = False
 ) -> bytes:
-    """Return the policy as XML, after a check that it reads back as an equal policy.
+    """Return the policy as XML, checked to be read as an equal policy.
 
     Args:
         policy: the policy.
-        output: the file that will be written, or None.
+        output: the file that the caller will write, or None.
         label: how the policy was made, such as "narrowed", for errors.
-        placeholders: whether names may have placeholders of a fleet.
+        placeholders: whether names may have the placeholders of a fleet.
 
     Raises:
         PolicyError: the XML would be read as a different policy.
@@ -1169,21 +1176,22 @@ def _write_profile(
 _MOST_LEVELS = 100
 _MOST_FILES = 10_000
 _MOST_SEARCHED = 256 * 1024
-"""Size in bytes of the largest file without the ending ``.xml`` that is searched for a policy."""
+"""Size in bytes of the largest file without the ending ``.xml`` in which a policy is looked for."""
 
 
 def join_policies(policies: Sequence[Policy]) -> Policy:
-    """Return one policy with the enclaves of several policies of a robot or a fleet.
+    """Return one policy with the enclaves of all ``policies``, of which there is at least one.
 
-    A policy may include the enclaves of another policy; ``policies`` has at least one policy.
+    Policies may share enclaves by including them from the same place.
 
     Raises:
-        PolicyError: two policies state the same enclave at different places.
+        PolicyError: two policies state the same enclave in different places.
     """
     enclaves: dict[str, Enclave] = {}
     for enclave in (enclave for policy in policies for enclave in policy.enclaves):
         earlier = enclaves.setdefault(enclave.path, enclave)
-        # Two enclaves can be in one line, and libxml2 counts only 65,535 lines.
+        # The line alone does not tell enclaves apart: it can have several, and libxml2 stops
+        # counting at 65,535.
         if earlier.source != enclave.source or earlier != enclave:
             raise PolicyError(
                 f"{enclave.source}: enclave {enclave.path} is in another policy, too",
@@ -1197,11 +1205,11 @@ def join_policies(policies: Sequence[Policy]) -> Policy:
 def files_of_policies(folder: Path) -> Iterator[Path]:
     """Yield the paths of the policies in a folder and below it, sorted; for a file, its own path.
 
-    Fragments that are only included are left out.
+    Fragments, which are only included by policies, are left out.
 
     Raises:
-        DocumentError: a file that may be a policy cannot be read, is no XML, or has a name that
-            does not end with ``.xml``; a link leads to a folder; or there are too many files.
+        DocumentError: a file that may be a policy cannot be read, is not XML, or has a name without
+            the ending ``.xml``; a link leads to a folder; or there are too many files.
     """
     if not folder.is_dir():
         yield folder
@@ -1218,15 +1226,16 @@ def files_of_policies(folder: Path) -> Iterator[Path]:
 def is_policy(name: str, content: bytes, shown: str) -> bool:
     """Return whether a file with this name and content is a policy.
 
-    ``shown`` is the file's name in errors.
+    ``shown`` is the name of the file in errors.
 
     Raises:
-        DocumentError: the file looks like a policy, but its name does not end with ``.xml``; or it
-            is not valid XML.
+        DocumentError: the file looks like a policy, but its name does not end with ``.xml``, or its
+            content is not valid XML.
     """
     if name.lower().endswith(".xml"):
         return parse(content, shown, instructions=True).tag == "policy"
-    begin = content[:_MOST_SEARCHED].replace(b"\0", b"")  # of UTF-16, too
+    # Without zero bytes, the text can be found in UTF-16, too.
+    begin = content[:_MOST_SEARCHED].replace(b"\0", b"")
     if begin.lstrip(b"\xef\xbb\xbf\xff\xfe \t\r\n").startswith(b"<") and b"<policy" in begin:
         raise DocumentError(
             f"{shown} looks like a policy, but its name does not end with .xml",
@@ -1237,7 +1246,7 @@ def is_policy(name: str, content: bytes, shown: str) -> bool:
 
 
 def _files_below(folder: Path) -> Iterator[Path]:
-    """Yield the regular files in a folder and below it, sorted.
+    """Yield the regular files in a folder and its subfolders, sorted.
 
     Raises:
         DocumentError: a folder cannot be read, or a link leads to a folder.
@@ -1253,7 +1262,7 @@ def _files_below(folder: Path) -> Iterator[Path]:
                 "",
                 "Name a policy in it.",
             )
-        folders[:] = sorted(name for name in folders if name != ".git")  # no file of a repository
+        folders[:] = sorted(name for name in folders if name != ".git")  # the files of git itself
         for subfolder in (Path(parent, name) for name in folders):
             if subfolder.is_symlink():
                 raise DocumentError(

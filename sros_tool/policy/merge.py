@@ -1,11 +1,11 @@
-"""Merging policies into a policy file: the missing rights, and the edits that add them in place.
+"""Merging policies into a policy file: which rights are missing, and the edits that add them.
 
-A merge never weakens a denial, and adds a right only for the requested direction.  All other text
-of the file stays unchanged byte for byte, with its comments and line ends.
+A merge never weakens a denial, and adds a right only in the requested direction.  All other text of
+the file, including comments and line ends, stays unchanged byte for byte.
 
-A name is added to a group with exactly its rights, in a profile with its namespace and node.  The
-group and the profile are added if the file itself lacks them; included files do not change.  The
-result is read again and proven to state exactly the old and the added rights.
+A name is added to a group with exactly the name's rights, in the profile of the name's namespace
+and node.  If the file lacks the group or the profile, it is added; included files do not change.
+The result is read again, to prove that it states exactly the old and the added rights.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ from sros_tool.policy.rights import (
     Right,
     Rules,
     compare,
-    folded,
     group_rights,
+    join_actions,
+    lost_counterpart_text,
     order,
     policy_rights,
     profile_rights,
-    unanswered_rights,
-    unanswered_text,
-    unfolded,
+    rights_without_counterpart,
+    split_actions,
 )
 from sros_tool.values import DryRun, FileChanges, Notes, shows
 from sros_tool.wording import first_few
@@ -62,8 +62,9 @@ _SHOWN = 3
 class Contradiction:
     """A right that the policy file allows and a merged policy denies, or the reverse.
 
-    It is also one if a merged policy allows the right to a node, and denies it to another node of
-    the same enclave.  The right may be denied in part.  The denial always decides.
+    Another case is a merged policy that allows the right to one node, and denies it to another node
+    of the same enclave.  The denial may concern only a part of the right.  The denial always
+    decides.
     """
 
     denied: Right
@@ -71,12 +72,12 @@ class Contradiction:
     allowed: Right
     """The rule that allows the right."""
     new: bool
-    """Whether the merge adds the denial to the policy file; otherwise the file already has it."""
+    """Whether the merge adds the denial to the policy file; if not, the file already had it."""
 
 
 @dataclass(frozen=True, slots=True)
 class AddedName:
-    """A name to add to a profile, as written there, with its rights and protection level."""
+    """A name to add to a profile, as written there, with its rights and its protection level."""
 
     kind: str
     name: str
@@ -95,7 +96,7 @@ class ProfileKey:
 
 @dataclass(frozen=True, slots=True)
 class MergePlan:
-    """The names to add to each profile, the rights added by them, and the contradictions."""
+    """The plan of a merge: names to add to each profile, the added rights, and contradictions."""
 
     entries: dict[ProfileKey, tuple[AddedName, ...]]
     added: tuple[Right, ...]
@@ -103,9 +104,9 @@ class MergePlan:
 
 
 def plan_merge(before: Policy, additions: Policy) -> MergePlan:
-    """Return the plan that adds the rights of ``additions`` that ``before`` lacks.
+    """Return the plan for adding those rights of ``additions`` that ``before`` lacks.
 
-    It leaves out rights that any profile or wildcard of the enclave already allows, and rights that
+    Left out are rights that any profile or wildcard of the enclave already allows, and rights that
     the enclave completely denies.
     """
     return _Planner(before, additions).plan()
@@ -120,7 +121,7 @@ class _Planner:
         self._contradictions: list[Contradiction] = []
 
     def plan(self) -> MergePlan:
-        names: dict[ProfileKey, dict[tuple[str, str], _Name]] = {}
+        names: dict[ProfileKey, dict[tuple[str, str], _NewName]] = {}
         for enclave in self._additions.enclaves:
             for profile in enclave.all_profiles():
                 place = ProfileKey(enclave.path, profile.ns, profile.node)
@@ -130,7 +131,7 @@ class _Planner:
                         fqn = expand(name, profile.ns, profile.node)
                         for right, qualifier in group.rights:
                             if self._is_wanted(Right(enclave.path, qualifier, right, fqn)):
-                                entry = here.setdefault((group.kind, fqn), _Name(name, {}))
+                                entry = here.setdefault((group.kind, fqn), _NewName(name, {}))
                                 entry.protect = entry.protect or group.protect
                                 entry.rights[right, qualifier] = None
             self._contradictions += self._between_nodes(enclave)
@@ -152,19 +153,21 @@ class _Planner:
         if right.qualifier is DENY:
             if self._file.cover(right):
                 return False
-            for allowed in folded(self._file.overlapping(right._replace(qualifier=ALLOW))):
+            for allowed in join_actions(self._file.overlapping(right._replace(qualifier=ALLOW))):
                 self._contradictions.append(Contradiction(right, allowed, True))
             return True
         denial = right._replace(qualifier=DENY)
-        for denied in folded(self._file.overlapping(denial)):
-            if not self._asked.cover(denied):  # otherwise both sides state this denial
+        for denied in join_actions(self._file.overlapping(denial)):
+            # A denial that both policies state is no contradiction.
+            if not self._asked.cover(denied):
                 self._contradictions.append(Contradiction(denied, right, False))
         return not (self._file.cover(right) or self._file.cover(denial))
 
     def _between_nodes(self, enclave: Enclave) -> Iterator[Contradiction]:
-        """Yield the rights of nodes of an enclave that another of its nodes denies to all.
+        """Yield contradictions between nodes of an enclave, as a denial applies to all of them.
 
-        A node may except names from its own rights, and so may several nodes alike.
+        It is no contradiction if each node with the right states the same denial, as an exception
+        from its own right.
         """
         of_nodes = defaultdict[tuple[str, str], set[Right]](set)
         for profile in enclave.all_profiles():
@@ -176,7 +179,7 @@ class _Planner:
         stating = defaultdict[Right, list[Rules]](list)
         for rights in of_nodes.values():
             rules = Rules(rights)
-            for part in unfolded(rights):
+            for part in split_actions(rights):
                 stating[part].append(rules)
         for denied in denials:
             overridden = {
@@ -184,12 +187,12 @@ class _Planner:
                 for allowed in self._asked.overlapping(denied._replace(qualifier=ALLOW))
                 if not all(rules.cover(denied) for rules in stating[allowed])
             }
-            for allowed in folded(overridden):
+            for allowed in join_actions(overridden):
                 yield Contradiction(denied, allowed, self._is_wanted(denied))
 
 
 @dataclass(slots=True)
-class _Name:
+class _NewName:
     """A name to add, as first written, with the rights to add and the protection level."""
 
     written: str
@@ -197,7 +200,7 @@ class _Name:
     protect: Level | None = None
 
 
-def _entries(names: dict[tuple[str, str], _Name]) -> Iterable[AddedName]:
+def _entries(names: dict[tuple[str, str], _NewName]) -> Iterable[AddedName]:
     for (kind, _), name in names.items():
         for qualifiers in group_rights(name.rights):
             yield AddedName(kind, name.written, qualifiers, name.protect)
@@ -235,15 +238,16 @@ def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
 
 
 def counterpart_notes(policies: Iterable[Policy], merged: Collection[Right]) -> Iterator[Note]:
-    """Yield a note on the ``merged`` rights whose counterpart only one of the ``policies`` has.
+    """Yield a note on ``merged`` rights whose counterpart in one of ``policies`` is gone.
 
-    A DENY of another policy, or another name, took the counterpart away.
+    The counterpart of a right to subscribe is a right to publish, for instance.  A DENY of another
+    policy, or another name there, took it away.
     """
     lost: set[Right] = set()
     for rights in map(policy_rights, policies):
-        lost.update(unanswered_rights(rights, merged, compare(rights, merged)))
+        lost.update(rights_without_counterpart(rights, merged, compare(rights, merged)))
     if lost:
-        text = first_few(list(map(unanswered_text, sorted(lost))), _SHOWN, "; ", ", and ")
+        text = first_few(list(map(lost_counterpart_text, sorted(lost))), _SHOWN, "; ", ", and ")
         yield Note("merge.no-counterpart", f"{text}.")
 
 
@@ -260,8 +264,8 @@ _COMMENTS_OF_THE_LINE = re.compile(r"(?>[ \t]*<!--.*?-->)++(?=[ \t]*(?:\r?\n|\Z)
 class PlacedElement:
     """An XML element with its offsets in the text, in characters from the start of the document.
 
-    ``inner`` is the start of its content, ``close`` the start of its end tag.  An element without
-    end tag (``<a/>``) has ``inner == close == end``.
+    ``inner`` is the start of the element's content, ``close`` the start of its end tag.  In an
+    element without an end tag (``<a/>``), both are equal to ``end``.
     """
 
     xml: etree._Element
@@ -281,12 +285,12 @@ class PlacedElement:
         return self.xml.get(attribute, "")
 
     def named(self, tag: str) -> Iterator[PlacedElement]:
-        """Yield the child elements with this tag, without included elements."""
+        """Yield the child elements with this tag, except those from includes."""
         return (child for child in self.children if child.tag == tag)
 
 
 class EditedText:
-    """The text of a policy file; edits are collected, and applied by `document`."""
+    """The text of a policy file with collected edits, which `document` applies."""
 
     def __init__(self, data: bytes, name: str) -> None:
         self._name = name
@@ -314,7 +318,7 @@ class EditedText:
         )
 
     def _elements(self, root: etree._Element) -> PlacedElement:
-        """Return the tree of elements with their positions, which lxml does not know."""
+        """Return the tree of elements with their positions, which lxml does not provide."""
         nodes = root.iter()
         top: PlacedElement | None = None
         stack: list[PlacedElement] = []
@@ -342,7 +346,7 @@ class EditedText:
     # ── layout of the text ────────────────────────────────────────────────────────────────
 
     def indent_of(self, element: PlacedElement) -> str | None:
-        """Return the white space before an element if it begins a line, else None."""
+        """Return the white space before an element that begins a line; None for other elements."""
         line = max(self.text.rfind("\n", 0, element.start), self.text.rfind("\r", 0, element.start))
         before = self.text[line + 1 : element.start].removeprefix("\ufeff")
         if before.strip(" \t") or (line < 0 and element is not self.root):
@@ -362,8 +366,8 @@ class EditedText:
             stack += parent.children[:1]
         return "  "
 
-    def after(self, element: PlacedElement) -> int:
-        """Return the position after an element and the comments on its last line."""
+    def position_after(self, element: PlacedElement) -> int:
+        """Return the position after an element and after comments that follow on its last line."""
         comments = _COMMENTS_OF_THE_LINE.match(self.text, element.end)
         if comments and self.indent_of(element) is not None:
             return comments.end()
@@ -371,8 +375,8 @@ class EditedText:
 
     # ── edits ───────────────────────────────────────────────────────────────────────────
 
-    def put(self, place: int, text: str, until: int | None = None) -> None:
-        """Insert ``text`` at offset ``place``; with ``until``, replace the text up to there."""
+    def insert(self, place: int, text: str, until: int | None = None) -> None:
+        """Insert ``text`` at the offset ``place``; with ``until``, replace the text up to there."""
         self._edits.append((place, place if until is None else until, text))
 
     def document(self) -> bytes:
@@ -385,7 +389,7 @@ class EditedText:
 
 
 def _encoding(data: bytes, root: etree._Element) -> str:
-    """Return the encoding of a document; decoding keeps a byte order mark as a character."""
+    """Return the encoding with which decoding a document keeps a byte order mark as a character."""
     declared = root.getroottree().docinfo.encoding or "utf-8"
     if data.startswith(codecs.BOM_UTF16_LE):
         return "utf-16-le"
@@ -398,9 +402,9 @@ def _encoding(data: bytes, root: etree._Element) -> str:
 class Merged:
     """A policy file after a merge: its new content, the added rights, and the contradictions.
 
-    Without additions ``document`` is the unchanged content of the file.  ``rights`` are all rights
-    after the merge.  ``notes`` are on denials that win, and on enclaves that several nodes, or one
-    in several namespaces, share only since the merge.
+    If no right is added, ``document`` is the unchanged content of the file.  ``rights`` are all
+    rights after the merge.  ``notes`` are about denials that win, and about enclaves that several
+    nodes, or one node in several namespaces, share since the merge.
     """
 
     document: bytes
@@ -419,7 +423,7 @@ class MergedPolicy(NamedTuple):
     added: Sequence[Right]
     """Rights that were added to the policy."""
     contradictions: Sequence[Contradiction]
-    """Rights that one policy allows and the other denies; the DENY wins."""
+    """Rights that one of the policies allows and another denies; the DENY wins."""
     output: Path | None
     """Path of the file that was written, or null."""
     document: str | None
@@ -430,18 +434,18 @@ class MergedPolicy(NamedTuple):
 
 
 def merge_into(path: Path, additions: Policy) -> Merged:
-    """Merge the rights of ``additions`` into the policy file at ``path``; write nothing.
+    """Return the policy file at ``path`` with the rights of ``additions`` merged; write nothing.
 
     Raises:
         PolicyError: (or another `DocumentError`) the file is not a policy, or a right cannot be
-            added: its enclave is in an included file, or the changed part is also included
-            elsewhere, where it would add rights that were not requested.
+            added: its enclave is in an included file, or the part to change is also included
+            elsewhere, and would there add rights that nobody requested.
     """
     return merge_all(path, (additions,))
 
 
 def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
-    """Merge several policies, one after the other, into the file at ``path``; write nothing."""
+    """Return the file at ``path`` with several policies merged in order; write nothing."""
     document, policies = read_bytes(path, "policy file"), tuple(policies)
     first = before = read_policy(path, document, may_be_empty=True)
     added: list[Right] = []
@@ -472,9 +476,10 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
 
 
 def _shared_enclaves(before: Policy, policies: Iterable[Policy], after: Policy) -> Iterator[str]:
-    """Yield a text on each enclave that gets new nodes from policies without its present nodes.
+    """Yield a text on each enclave that gets new nodes from policies that lack its present nodes.
 
-    Nodes of the same name in other namespaces are instances, of which there is another note.
+    Nodes that have the same name in other namespaces are instances of a node, for which there is
+    another note.
     """
     asked: dict[str, set[str]] = {}
     for additions in policies:
@@ -500,7 +505,11 @@ def _nodes_text(nodes: Sequence[str]) -> str:
 
 
 def _checked_policy(path: Path, document: bytes, before: Policy, added: Sequence[Right]) -> Policy:
-    """Return the policy in ``document``; raise unless its rights are ``before`` plus ``added``."""
+    """Return the policy in ``document``.
+
+    Raises:
+        PolicyError: its rights are not exactly those of ``before`` and the ``added`` ones.
+    """
     try:
         after = read_policy(path, document)
     except DocumentError as error:
@@ -524,8 +533,8 @@ def _checked_policy(path: Path, document: bytes, before: Policy, added: Sequence
 def _check_protection(path: Path, merged: Policy, additions: Policy) -> None:
     """Raise `PolicyError` unless ``merged`` protects names as ``additions`` require.
 
-    If the file already has a name, the merge does not change it: the author decides at which of the
-    name's places the protection is stated.
+    A name that the file already has may lack the protection, because a merge does not change such a
+    name: the author decides at which occurrence of the name to state the protection.
     """
     present = {(e.kind, e.name): e for e in stated_protections(merged.enclaves)}
     for protection in stated_protections(additions.enclaves):
@@ -544,33 +553,33 @@ def _check_protection(path: Path, merged: Policy, additions: Policy) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class _New:
-    """An XML element to write: its start tag without brackets, and its content."""
+class _NewElement:
+    """An XML element to write: the start tag without brackets, and the content."""
 
     start: str
     content: str = ""
-    children: list[_New] = field(default_factory=list)
+    children: list[_NewElement] = field(default_factory=list)
 
 
-def _item(entry: AddedName) -> _New:
-    return _New(entry.kind.removesuffix("s"), entry.name + instruction_text(entry.protect))
+def _item(entry: AddedName) -> _NewElement:
+    return _NewElement(entry.kind.removesuffix("s"), entry.name + instruction_text(entry.protect))
 
 
-def _group(kind: str, rights: GroupRights, entries: Iterable[AddedName]) -> _New:
+def _group(kind: str, rights: GroupRights, entries: Iterable[AddedName]) -> _NewElement:
     attributes = "".join(f' {right}="{qualifier.value}"' for right, qualifier in rights)
-    return _New(kind + attributes, children=[_item(entry) for entry in entries])
+    return _NewElement(kind + attributes, children=[_item(entry) for entry in entries])
 
 
-def _groups(entries: Sequence[AddedName]) -> list[_New]:
-    """Group names that are sorted by kind and rights."""
+def _groups(entries: Sequence[AddedName]) -> list[_NewElement]:
+    """Return groups for names, which must be sorted by kind and rights."""
     return [
         _group(kind, rights, names)
         for (kind, rights), names in groupby(entries, key=lambda entry: (entry.kind, entry.rights))
     ]
 
 
-def _profile(place: ProfileKey, entries: Sequence[AddedName]) -> _New:
-    return _New(f'profile ns="{place.ns}" node="{place.node}"', children=_groups(entries))
+def _profile(place: ProfileKey, entries: Sequence[AddedName]) -> _NewElement:
+    return _NewElement(f'profile ns="{place.ns}" node="{place.node}"', children=_groups(entries))
 
 
 # ── positions ──────────────────────────────────────────────────────────────────────────────
@@ -603,8 +612,10 @@ class _Editor:
                     else "Its <enclaves> are included from another file.",
                     "Merge into the file that contains this part.",
                 )
-            profiles = _New("profiles", children=[_profile(*profile) for profile in places.items()])
-            new.append(_New(f'enclave path="{path}"', children=[profiles]))
+            profiles = _NewElement(
+                "profiles", children=[_profile(*profile) for profile in places.items()]
+            )
+            new.append(_NewElement(f'enclave path="{path}"', children=[profiles]))
         if new:
             self._append(blocks[0], new)
         return self._text.document()
@@ -627,7 +638,7 @@ class _Editor:
         if new and blocks:
             self._append(blocks[0], new)
         elif new:
-            self._append(enclave, [_New("profiles", children=new)])
+            self._append(enclave, [_NewElement("profiles", children=new)])
 
     def _add_to_profiles(self, profiles: list[PlacedElement], entries: Sequence[AddedName]) -> None:
         groups: dict[tuple[str, GroupRights], PlacedElement] = {}
@@ -643,7 +654,7 @@ class _Editor:
                 self._add_names(group, kind, list(names))
 
     def _add_names(self, group: PlacedElement, kind: str, entries: Sequence[AddedName]) -> None:
-        """Insert names into a group: sorted if the group is sorted, otherwise at its end."""
+        """Insert names into a group: in order if the group is sorted, otherwise at its end."""
         present = [child.xml.text or "" for child in group.named(kind.removesuffix("s"))]
         is_sorted = len(present) == len(group.children) and present == sorted(present)
         for entry in entries:
@@ -658,8 +669,8 @@ class _Editor:
 
     # ── writing elements ───────────────────────────────────────────────────────────────────
 
-    def _append(self, parent: PlacedElement, new: Sequence[_New]) -> None:
-        """Insert elements after the last child of ``parent``, but before its metadata."""
+    def _append(self, parent: PlacedElement, new: Sequence[_NewElement]) -> None:
+        """Insert elements after the last child of ``parent`` that is not metadata."""
         last = next((child for child in reversed(parent.children) if child.tag != "metadata"), None)
         if last:
             for element in new:
@@ -667,35 +678,36 @@ class _Editor:
         else:
             self._put_into_empty(parent, new)
 
-    def _put_after(self, sibling: PlacedElement, new: _New) -> None:
+    def _put_after(self, sibling: PlacedElement, new: _NewElement) -> None:
         indent = self._text.indent_of(sibling)
-        self._text.put(self._text.after(sibling), self._rendered(new, indent))
+        self._text.insert(self._text.position_after(sibling), self._rendered(new, indent))
 
-    def _put_first(self, parent: PlacedElement, new: _New) -> None:
-        """Insert an element as first child, or after a comment that is the first child."""
+    def _put_first(self, parent: PlacedElement, new: _NewElement) -> None:
+        """Insert an element as the first child, but after text or a comment at the beginning."""
         text, first = self._text, parent.children[0]
         if text.text[parent.inner : first.start].strip():
             self._put_after(first, new)
         else:
-            text.put(parent.inner, self._rendered(new, text.indent_of(first)))
+            text.insert(parent.inner, self._rendered(new, text.indent_of(first)))
 
-    def _put_into_empty(self, parent: PlacedElement, new: Iterable[_New]) -> None:
+    def _put_into_empty(self, parent: PlacedElement, new: Iterable[_NewElement]) -> None:
         text, outer = self._text, self._text.indent_of(parent)
         indent = None if outer is None else outer + text.unit
         rendered = "".join(self._rendered(element, indent) for element in new)
-        if parent.close == parent.inner == parent.end:  # <profile .../>
+        # An element without end tag, such as <profile .../>.
+        if parent.close == parent.inner == parent.end:
             ending = "" if outer is None else text.newline + outer
             tag = text.text[parent.start : parent.end].rstrip("/>").rstrip()
-            text.put(parent.start, f"{tag}>{rendered}{ending}</{parent.tag}>", parent.end)
+            text.insert(parent.start, f"{tag}>{rendered}{ending}</{parent.tag}>", parent.end)
             return
         content = text.text[parent.inner : parent.close]
         place = parent.inner + len(content.rstrip())
         if outer is not None and "\n" not in text.text[place : parent.close]:
             rendered += text.newline + outer
-        text.put(place, rendered)
+        text.insert(place, rendered)
 
-    def _rendered(self, new: _New, indent: str | None) -> str:
-        """Return the XML of an element, on separate lines if its siblings are."""
+    def _rendered(self, new: _NewElement, indent: str | None) -> str:
+        """Return the XML of an element: with one line for each child if ``indent`` is given."""
         tag = new.start.split(" ", 1)[0]
         before = "" if indent is None else self._text.newline + indent
         if not new.children:

@@ -1,11 +1,11 @@
 """Minimizing a policy to the observed rights, and wildcards that make a large policy smaller.
 
-The over-privilege of an enclave is its number of allowed pairs (right, name), divided by the number
-of observed pairs.  A pair is one of publish, subscribe, request, reply, call, execute with an exact
-name.  A wildcard counts as the known names that it matches: the exact names of that kind (topics,
-services or actions) in the policy, in the observations of all enclaves, and among the names that
-every node needs.  Pairs that a DENY removes do not count.  Observed pairs that are not
-allowed do not count either: they cannot have worked.
+The over-privilege of an enclave is the number of allowed pairs (right, name), divided by the number
+of observed pairs.  The right of a pair is publish, subscribe, request, reply, call or execute, and
+the name is exact.  A wildcard counts as the known names that it matches: the exact names of its
+kind (topics, services or actions) in the policy, in the observations of all enclaves, and among the
+names that every node needs.  Pairs that a DENY removes do not count.  Observed pairs that are not
+allowed do not count either, because they cannot have worked.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from sros_tool.policy.rights import (
     GroupRights,
     Right,
     Rules,
-    folded,
     group_rights,
+    join_actions,
     order,
     parts,
     policy_rights,
-    unfolded,
+    split_actions,
 )
 from sros_tool.values import shows
 
@@ -52,14 +52,14 @@ _Pair = tuple[str, str]
 def enclaves_of_nodes(
     observed: Iterable[str], nodes: Mapping[str, Iterable[str]]
 ) -> dict[str, str]:
-    """Return the enclaves of nodes that were observed in enclaves named as the nodes.
+    """Map observed enclaves that are named like nodes to the enclaves of these nodes in a policy.
 
-    ``generate_policy --enclave-per-node`` writes such names.
+    ``generate_policy --enclave-per-node`` names enclaves like nodes.
 
     Args:
         observed: the enclaves that were observed.
-        nodes: the full names of the nodes in each enclave of the policy.  A node in several
-            enclaves, and an observed enclave that the policy has, are left out.
+        nodes: the full names of the nodes in each enclave of the policy.  The result has no nodes
+            that are in several enclaves, and no observed enclave that is in the policy itself.
     """
     homes = defaultdict(list)
     for enclave, names in nodes.items():
@@ -80,7 +80,7 @@ class WideRule(NamedTuple):
     used: tuple[Right, ...]
     """Observed rights that the wildcard allows."""
     replacement: tuple[Right, ...]
-    """Exact rights that replace the wildcard and that no other rule of the enclave states."""
+    """Exact rights that replace the wildcard, if no other rule of the enclave states them."""
 
 
 @shows(
@@ -89,14 +89,14 @@ class WideRule(NamedTuple):
 )
 @dataclass(frozen=True, slots=True)
 class EnclaveUse:
-    """Comparison of an enclave's rights with its observed rights."""
+    """The comparison of an enclave's rights with its observed rights."""
 
     enclave: str
     """Path of the enclave."""
     observed_at_all: bool
-    """Whether the enclave was observed; an enclave that was not observed is not changed."""
+    """Whether the enclave was observed; otherwise it is not changed."""
     never_observed: tuple[Right, ...]
-    """Rights that were never observed, and are removed."""
+    """Rights that were never observed and are therefore removed."""
     kept_for_every_node: tuple[Right, ...]
     """Rights that were not observed, but stay because every node needs them."""
     wildcards: tuple[WideRule, ...]
@@ -127,12 +127,12 @@ class MinimizedPolicy:
 def minimize(
     policy: Policy, observed: Iterable[Right], common: Sequence[Group] = ()
 ) -> MinimizedPolicy:
-    """Narrow ``policy`` to the ALLOW rights in ``observed``, and return the result.
+    """Return ``policy``, narrowed to the ALLOW rights in ``observed``.
 
-    Every DENY stays.  ``common`` are the rights that every node needs.  They stay, observed or not,
-    if the policy allows them to a node with a profile.
+    Every DENY stays.  ``common`` are the rights that every node needs.  If the policy allows them
+    to a node with a profile, they stay even if they were not observed.
     """
-    used = folded(right for right in observed if right.qualifier is ALLOW)
+    used = join_actions(right for right in observed if right.qualifier is ALLOW)
     by_enclave: dict[str, set[Right]] = defaultdict(set)
     for right in used:
         by_enclave[right.enclave].add(right)
@@ -152,10 +152,10 @@ def minimize(
 
 
 def _protected_as_before(before: Policy, after: Policy) -> Policy:
-    """Return ``after`` with the protection levels that only removed names stated.
+    """Return ``after`` with the protection levels that were only stated for removed names.
 
-    The statement of one enclave applies to all, so enclaves that keep a right to the name need it,
-    too.
+    A level that one enclave states applies to all enclaves.  So other enclaves that keep a right to
+    the name now have to state it.
     """
     known = {(e.kind, e.name, e.level) for e in stated_protections(after.enclaves)}
     gone = {(e.kind, e.name, e.level) for e in stated_protections(before.enclaves)} - known
@@ -168,7 +168,7 @@ def _protected_as_before(before: Policy, after: Policy) -> Policy:
     levels: dict[tuple[str, str], Level] = {}
     for kind, name, level in sorted(gone):
         met = list(names[kind].overlapping(name)) if kind in names else []
-        # A wildcard of others gets it only if nobody has the right to the name itself.
+        # A wildcard gets the level only if no right to the name itself is left.
         for kept in [e for e in met if covers(name, e)] or met:
             levels[kind, kept] = max(level, levels.get((kind, kept), level), key=list(Level).index)
 
@@ -185,12 +185,12 @@ def _protected_as_before(before: Policy, after: Policy) -> Policy:
 
 
 class _KnownNames:
-    """All exact names in policies and observations: by kind, sorted."""
+    """All exact names in policies and observations, by kind and sorted."""
 
     def __init__(self, all_rights: Iterable[Iterable[Right]]) -> None:
         by_kind: dict[str, set[str]] = defaultdict(set)
         for rights in all_rights:
-            for right in folded(rights):
+            for right in join_actions(rights):
                 if not is_expression(right.name):
                     by_kind[right.kind].add(right.name)
         self._names = {kind: sorted(names) for kind, names in by_kind.items()}
@@ -226,9 +226,9 @@ class _Narrowing:
         self._denied = [right for right in stated if right.qualifier is DENY]
         self._rules = Rules(stated)
         self._observed = sorted(observed, key=order)
-        observed_parts = unfolded(observed)
+        observed_parts = split_actions(observed)
         self._in_use = frozenset(part for part in observed_parts if self._is_usable(part))
-        self._refused = folded(observed_parts - self._in_use)
+        self._refused = join_actions(observed_parts - self._in_use)
         self._use = Rules(self._in_use)
         self._common = {
             right
@@ -240,7 +240,7 @@ class _Narrowing:
         return self._rules.cover(part) and not self._rules.cover(part._replace(qualifier=DENY))
 
     def _is_usable(self, part: Right) -> bool:
-        """Return whether the enclave allows a right, or a part of the right's wildcard."""
+        """Return whether the enclave allows a right, or a part of a right with a wildcard."""
         if self._is_allowed(part):
             return True
         return is_expression(part.name) and self._rules.overlaps(part)
@@ -279,7 +279,7 @@ class _Narrowing:
     # ── rules that stay, and replacements of wildcards ─────────────────────────────────────
 
     def _is_unchanged(self, rule: Right) -> bool:
-        """Return whether a rule stays unchanged: it is common, or was observed as written."""
+        """Return whether a rule stays: every node needs it, or it was observed as written."""
         if rule in self._common:
             return True
         if not is_expression(rule.name):
@@ -292,7 +292,7 @@ class _Narrowing:
         )
 
     def _narrowed(self, kept_rights: set[Right]) -> tuple[WideRule, ...]:
-        """Map each wildcard to replace to the rights that replace the wildcard."""
+        """Return the wildcards to replace, each with the rights that replace it."""
         wide = [
             rule for rule in self._stated if is_expression(rule.name) and rule not in kept_rights
         ]
@@ -307,13 +307,15 @@ class _Narrowing:
             return sorted(dict.fromkeys(met), key=lambda rule: rule.right != right.right)
 
         used: dict[Right, list[Right]] = defaultdict(list)
-        for right in folded(self._in_use):
+        for right in join_actions(self._in_use):
             for rule in rules_that_state(right):
                 used[rule].append(right)
         kept_rules = Rules(kept_rights)
-        needed = unfolded((*self._in_use, *self._common))
+        needed = split_actions((*self._in_use, *self._common))
         replacement: dict[Right, list[Right]] = defaultdict(list)
-        for right in folded(p for p in needed if self._is_allowed(p) and not kept_rules.cover(p)):
+        for right in join_actions(
+            p for p in needed if self._is_allowed(p) and not kept_rules.cover(p)
+        ):
             replacement[rules_that_state(right)[0]].append(right)
         return tuple(
             WideRule(
@@ -341,7 +343,7 @@ class _Narrowing:
 
     def _pairs(self, rights: Iterable[Right]) -> set[_Pair]:
         """Return the pairs (right, known name) that ``rights`` allow and no rule denies."""
-        rights = folded(rights)
+        rights = join_actions(rights)
         pairs: set[_Pair] = set()
         wild = False
         for right in rights:
@@ -352,7 +354,8 @@ class _Narrowing:
             else:
                 pairs.add((right.right, right.name))
         if wild:
-            # Wildcards of services and topics can match all parts of an action, or missing parts.
+            # Wildcards of services and topics can match all parts of an action, or the parts that
+            # are missing.
             pairs = self._with_actions(pairs, Rules(rights))
         if not self._denied:
             return pairs
@@ -363,7 +366,7 @@ class _Narrowing:
         }
 
     def _with_actions(self, found_pairs: set[_Pair], rules: Rules) -> set[_Pair]:
-        """Return the pairs; an action that ``rules`` allow completely counts as one pair."""
+        """Return the pairs, with one pair for each action that ``rules`` allow completely."""
         pairs = set(found_pairs)
         for action in ("call", "execute"):
             for name in self._names.of(KIND_OF[action]):
@@ -390,10 +393,10 @@ def _common_rights_of_nodes(enclave: Enclave, common: Sequence[Group]) -> Iterat
 def _narrowed_enclave(
     enclave: Enclave, kept_rights: Set[Right], replacements: Mapping[Right, Sequence[Right]]
 ) -> Enclave:
-    """Return ``enclave`` with its denials, ``kept_rights``, and exact names for wildcards.
+    """Return ``enclave`` with its denials, ``kept_rights``, and exact names in place of wildcards.
 
-    The names that replace a wildcard are written once, where it occurs first, and in its form:
-    relative, private or absolute.  Profiles without a rule stay.
+    The names that replace a wildcard are written once, where the wildcard occurs first, and in its
+    form: relative, private or absolute.  Profiles that have no rule left stay.
     """
     pending = dict(replacements)
     return enclave.with_profiles(
@@ -406,7 +409,8 @@ def _profile(
 ) -> Profile:
     """Return the profile with its denials, ``kept_rights`` and the replacements of other rights.
 
-    ``pending`` maps rights to their replacements.  Those of this profile are removed from it.
+    ``pending`` maps rights to their replacements.  The replacements that this profile gets are
+    removed from ``pending``.
     """
     statements: dict[tuple[str, str, Level | None], dict[tuple[str, Qualifier], None]] = {}
     for group in profile.groups:
@@ -434,7 +438,7 @@ def _profile(
 
 
 def _name_written_like(fqn: str, like: str, profile: Profile) -> str:
-    """Return an absolute name written like ``like`` (relative or private) if possible."""
+    """Return an absolute name in the form of ``like`` (relative or private), if possible."""
     if like.startswith("/"):
         return fqn
     prefix = expand("~/" if like.startswith("~") else "", profile.ns, profile.node)
@@ -447,7 +451,7 @@ def _name_written_like(fqn: str, like: str, profile: Profile) -> str:
 # ── wildcards in place of names ────────────────────────────────────────────────────────────
 
 _DIGITS = re.compile(r"\d+")
-_FEWEST = 3  # names that a wildcard must replace
+_FEWEST = 3  # minimum number of names that a wildcard must replace
 
 
 class WildcardProposal(NamedTuple):
@@ -456,11 +460,11 @@ class WildcardProposal(NamedTuple):
     rule: Right
     """The rule with the wildcard."""
     replaces: tuple[Right, ...]
-    """Rights that the wildcard replaces."""
+    """Rights that the wildcard makes redundant."""
     adds: tuple[Right, ...]
-    """Known names, used by other enclaves, that the wildcard additionally allows."""
+    """Known names of other enclaves that the wildcard newly allows."""
     saves: int
-    """Bytes saved in the permissions document."""
+    """Number of bytes by which the permissions document becomes smaller."""
 
 
 def propose_wildcards(
@@ -471,22 +475,23 @@ def propose_wildcards(
     needed: int,
     size: Callable[[Right], int],
 ) -> tuple[WildcardProposal, ...]:
-    """Propose wildcards that make an enclave's document ``needed`` bytes smaller.
+    """Return wildcards that make an enclave's permissions ``needed`` bytes smaller.
 
-    ``rights`` are the rights of this enclave, ``known_rights`` the rights of all enclaves; ``size``
-    returns the size of a right in bytes.  The largest savings come first; wildcards that newly
-    allow a known name are used only if the safe ones do not suffice.
+    ``rights`` are the rights of this enclave, ``known_rights`` the rights of all enclaves.
+    ``size`` returns the size of a right in bytes.  Wildcards that newly allow a known name come
+    last, and are used only if the others do not suffice; otherwise the largest savings come first.
     """
     allowed = [right for right in rights if right.enclave == enclave and right.qualifier is ALLOW]
     rules = Rules(allowed)
     foreign = _names_without_right(enclave, rules, known_rights)
     present = Rules(right for right in allowed if is_expression(right.name))
-    # A large document does not list the names that its wildcards match, so these save nothing.
+    # Large permissions leave out names that a wildcard matches, so replacing these names saves
+    # nothing.
     listed = (right for right in allowed if not present.cover(right))
     candidates: dict[frozenset[Right], WildcardProposal] = {}
     for rule, listed_rights in _candidates(listed).items():
         other = candidates.get(frozenset(listed_rights))
-        # Of wildcards for the same names, the longest one allows least.
+        # Of wildcards for the same names, the longest one allows the least.
         if other is None or len(rule.name) > len(other.rule.name):
             adds = tuple(sorted(_rights_matching(rule, foreign), key=order))
             saves = sum(map(size, listed_rights)) - size(rule)
@@ -512,7 +517,7 @@ def propose_wildcards(
 
 
 def _candidates(rights: Iterable[Right]) -> dict[Right, list[Right]]:
-    """Map candidate wildcards to the rights that they can replace, at least `_FEWEST` each."""
+    """Map possible wildcards to the rights that they replace, at least `_FEWEST` for each one."""
     rights_by_wildcard: dict[Right, list[Right]] = defaultdict(list)
     for right in rights:
         if right.name.startswith("/") and not is_expression(right.name):
@@ -522,7 +527,7 @@ def _candidates(rights: Iterable[Right]) -> dict[Right, list[Right]]:
 
 
 def _wider_names(name: str) -> Iterator[str]:
-    """Yield wildcards that match a name: ``*`` after a namespace (not "/"), or for numbers."""
+    """Yield wildcards for a name, with ``*`` after a namespace (not "/") or for its numbers."""
     tokens = name.split("/")[1:-1]
     for depth in range(1, len(tokens) + 1):
         yield "/" + "/".join((*tokens[:depth], "*"))
@@ -536,9 +541,9 @@ def _wider_names(name: str) -> Iterator[str]:
 def _names_without_right(
     enclave: str, own_rules: Rules, known_rights: Iterable[Right]
 ) -> dict[str, list[str]]:
-    """Map rights to the known names for which the enclave lacks the right; actions are split."""
+    """Map rights to the known names for which the enclave lacks them; actions count as parts."""
     by_service: dict[bool, set[str]] = {True: set(), False: set()}
-    for part in unfolded(known_rights):
+    for part in split_actions(known_rights):
         if not is_expression(part.name):
             by_service[part.right in ("request", "reply")].add(part.name)
     return {
@@ -552,7 +557,7 @@ def _names_without_right(
 
 
 def _rights_matching(rule: Right, names_by_right: dict[str, list[str]]) -> Iterator[Right]:
-    """Yield the rights to the names that a rule with a wildcard matches."""
+    """Yield the rights to names that a rule with a wildcard matches."""
     for part in parts(rule):
         match = compiled(part.name).match
         for name in names_by_right[part.right]:

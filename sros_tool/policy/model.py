@@ -1,7 +1,7 @@
 """The policy language of ROS: who may publish, subscribe, request, reply, call and execute.
 
-Names follow SROS2 policy XML 0.2.0.  Values are equal if they state the same; the file and line
-(`Source`) that they were read from do not matter.
+Names follow SROS2 policy XML 0.2.0.  Values are equal if they state the same, even if they were
+read from different files and lines (`Source`).
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ RIGHTS: dict[str, tuple[str, str]] = {
     "services": ("request", "reply"),
     "actions": ("call", "execute"),
 }
-"""The two rights that a group of each kind (topics, services, actions) allows or denies."""
-OTHER_SIDE = {one: other for pair in RIGHTS.values() for one, other in (pair, pair[::-1])}
+"""Maps a kind of names (topics, services, actions) to its two rights."""
+PEER_RIGHT = {one: other for pair in RIGHTS.values() for one, other in (pair, pair[::-1])}
 """Maps a right to the right that the peer needs, such as publish to subscribe."""
-OFFERING_SIDE = {"subscribe": "publish", "request": "reply", "call": "execute"}
-"""Maps a right to use a name to the right to offer it."""
+OFFERING_RIGHT = {"subscribe": "publish", "request": "reply", "call": "execute"}
+"""Maps a right to use a name to the right to offer the name."""
 
 
 class Qualifier(StrEnum):
@@ -40,7 +40,7 @@ DENY = Qualifier.DENY
 
 
 class Source(NamedTuple):
-    """The file and line that a value was read from; the line counts from 1, 0 means no line."""
+    """The file and line from which a value was read."""
 
     file: str
     """Path of the file."""
@@ -58,10 +58,10 @@ _NOWHERE = Source("", 0)
 class Group:
     """Names of one kind (topics, services or actions) that share the same rights and protection.
 
-    ``rights`` are pairs of a right and its qualifier, in the order of `RIGHTS`; ``names`` are as
-    written: relative, private or absolute, perhaps with wildcards.  ``protect`` is how messages of
-    these names have to be protected at least, or None if the policy does not say how.  ``lines``
-    are the lines of the names in the file of ``source``, if read from one.
+    ``rights`` are pairs of a right and its qualifier, in the order of `RIGHTS`.  ``names`` are as
+    written: relative, private or absolute, perhaps with wildcards.  ``protect`` is the least
+    protection of messages with these names, or None if the policy states none.  ``lines`` are the
+    lines of the names in the file of ``source``; () if the names were not read from one file.
     """
 
     kind: str
@@ -89,7 +89,7 @@ class Profile:
 
 
 class Profiles(NamedTuple):
-    """A set of profiles with its ``type`` attribute and its ``metadata`` (XML text, or "")."""
+    """A set of profiles with its ``type`` attribute and its ``metadata`` (XML text or "")."""
 
     profiles: tuple[Profile, ...]
     type: str = ""
@@ -100,7 +100,7 @@ class Profiles(NamedTuple):
 class Enclave:
     """The rights of the processes of one enclave.
 
-    ``digest`` is the SHA-256 of the policy file that it was read from, with its includes.
+    ``digest`` is the SHA-256 of the policy file with its includes, from which the enclave was read.
     """
 
     path: str
@@ -123,7 +123,7 @@ class Enclave:
 def policy_in_namespace(policy: Policy, namespace: str) -> Policy:
     """Return a policy with its enclaves and nodes below a namespace, such as ``/left``.
 
-    Names that are written with a ``/`` at their beginning stay.
+    Names that are written with a ``/`` at the beginning do not change.
     """
 
     enclaves = (
@@ -139,12 +139,12 @@ def policy_in_namespace(policy: Policy, namespace: str) -> Policy:
 
 
 def below_namespace(path: str, namespace: str) -> str:
-    """Return the path of an enclave, or a namespace, below another namespace."""
+    """Return the path of an enclave, or a namespace, with another namespace before it."""
     return f"{namespace.rstrip('/')}/{path.lstrip('/')}".rstrip("/") or "/"
 
 
 def policy_in_enclave(policy: Policy, path: str) -> Policy:
-    """Return a policy with all profiles in one enclave, of a process that composes the nodes."""
+    """Return a policy with all profiles in the enclave ``path`` of a process with all nodes."""
     blocks = tuple(block for enclave in policy.enclaves for block in enclave.profiles)
     enclaves = [replace(enclave, path=path, profiles=blocks) for enclave in policy.enclaves[:1]]
     return replace(policy, enclaves=tuple(enclaves))
@@ -153,7 +153,7 @@ def policy_in_enclave(policy: Policy, path: str) -> Policy:
 def policy_of_nodes(policy: Policy, nodes: Collection[str]) -> Policy:
     """Return a policy with only the rights of the named nodes, in the enclaves that have one.
 
-    What the enclaves deny to other nodes stays: it applies to all nodes of an enclave.
+    Denials for other nodes stay, because a denial applies to all nodes of an enclave.
     """
 
     def denials(profile: Profile) -> Profile:
@@ -180,9 +180,9 @@ def policy_of_nodes(policy: Policy, nodes: Collection[str]) -> Policy:
 def nodes_in_several_namespaces(
     enclaves: Iterable[Enclave],
 ) -> dict[tuple[str, str], tuple[Profile, ...]]:
-    """Map each enclave and node that has several namespaces to its profiles, one of each namespace.
+    """Map each enclave and node with several namespaces to profiles, one for each namespace.
 
-    Nodes whose names have wildcards are left out.  An enclave may occur several times.
+    Nodes whose names have wildcards are left out.  ``enclaves`` may have an enclave several times.
     """
     profiles_by_node: dict[tuple[str, str], dict[str, Profile]] = {}
     for enclave in enclaves:
@@ -196,7 +196,7 @@ def nodes_in_several_namespaces(
 class Policy:
     """A policy with its includes resolved; each enclave path occurs once.
 
-    ``fallbacks`` are the includes whose fallback was used, with the file that is absent.
+    ``fallbacks`` are the includes that used their fallback, each with the path of the missing file.
     """
 
     enclaves: tuple[Enclave, ...]
@@ -209,7 +209,7 @@ class Policy:
         return next((enclave for enclave in self.enclaves if enclave.path == path), None)
 
     def nodes(self) -> dict[str, tuple[str, ...]]:
-        """Return the full names of the nodes of each enclave, sorted."""
+        """Map each enclave to the full names of its nodes, sorted."""
         return {
             enclave.path: tuple(
                 sorted({f"{p.ns.rstrip('/')}/{p.node}" for p in enclave.all_profiles()})
@@ -251,7 +251,7 @@ def with_groups(policy: Policy, change: Callable[[Group, Profile], Iterable[Grou
 
 
 class Level(StrEnum):
-    """Protection level of messages; the long forms also authenticate the writer of a message."""
+    """The protection level of messages; with ``..._WITH_ORIGIN_AUTHENTICATION`` also of writers."""
 
     NONE = "NONE"
     SIGN = "SIGN"
@@ -261,7 +261,7 @@ class Level(StrEnum):
 
 
 PROTECT: dict[str, Level] = {"sign": Level.SIGN, "encrypt": Level.ENCRYPT}
-"""Maps the words that a policy uses for protection levels to the levels."""
+"""Maps the words for protection levels in a policy to the levels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,7 +290,7 @@ class NamedProtection(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class DomainProtection:
-    """The protection of a domain and of names in the domain; ``default`` applies to other names."""
+    """The protection of a domain and of the names in it; ``default`` applies to other names."""
 
     rtps: Level = Level.SIGN
     discovery: Level = Level.ENCRYPT
@@ -307,9 +307,10 @@ class DomainProtection:
 @shows("enclave", "kind", "name", "level")
 @dataclass(frozen=True, slots=True)
 class StatedProtection:
-    """The least protection that a policy requires for matching names of one ``kind``.
+    """The least protection that a policy requires for the matching names of one ``kind``.
 
-    ``name`` is absolute; ``enclave`` and ``source`` are where a policy says it.
+    ``name`` is absolute; ``enclave`` and ``source`` are the place in a policy that states the
+    protection.
     """
 
     enclave: str
@@ -335,7 +336,7 @@ class StatedProtection:
 def stated_protections(enclaves: Iterable[Enclave]) -> tuple[StatedProtection, ...]:
     """Return the protection levels that enclaves require for names, in order, without duplicates.
 
-    A level that an enclave states several times is returned once, with the first place.
+    A level that an enclave states repeatedly for a name is returned once, with its first place.
     """
     protections: dict[StatedProtection, None] = {}
     for enclave in enclaves:

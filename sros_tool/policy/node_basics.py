@@ -11,10 +11,10 @@ from sros_tool.names import NODE_SERVICES, PARAMETER_SERVICES, is_expression
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, Policy
 from sros_tool.policy.patterns import Names
-from sros_tool.policy.rights import Right, Rules, policy_rights, unfolded
+from sros_tool.policy.rights import Right, Rules, policy_rights, split_actions
 
 _ANY_NODE = "/*"
-"""The nodes of an enclave without a policy."""
+"""The name, in the rights of an enclave without a policy, that stands for every node."""
 _WITHOUT_PARAMETERS = {"get_type_description"}
 """The service of a node without parameters."""
 
@@ -33,15 +33,16 @@ def _basics() -> Rules:
 class NodeRights:
     """The rights of some enclaves that their own nodes need to start.
 
-    The services of a node count only if the enclave may serve all of them, and no other enclave may
-    serve one of them: with such a right, a process can pose as another enclave's node.  A right to
-    serve the services of nodes of any name, which an enclave without a policy has, is not compared.
+    The services of a node are among these rights only if the enclave may serve all of them and no
+    other enclave may serve any of them, because with such a right, a process can pose as another
+    enclave's node.  The comparison leaves out a right to serve the services of nodes with any name,
+    which enclaves without a policy have.
     """
 
     def __init__(self, rights: Iterable[Right]) -> None:
         served: defaultdict[tuple[str, str], set[str]] = defaultdict(set)
         enclaves: defaultdict[str, set[str]] = defaultdict(set)
-        for right in unfolded(rights):
+        for right in split_actions(rights):
             if (right.qualifier, right.right) != (ALLOW, "reply"):
                 continue
             node, _, service = right.name.rpartition("/")
@@ -54,7 +55,8 @@ class NodeRights:
         def is_alone(enclave: str, node: str, services: set[str]) -> bool:
             if node == _ANY_NODE:
                 return True
-            # Nodes without parameters, such as those of tf2_ros, have one name in many processes.
+            # Nodes without parameters, such as those of tf2_ros, can have the same name in many
+            # processes.
             compared = PARAMETER_SERVICES if services == _WITHOUT_PARAMETERS else NODE_SERVICES
             names = {f"{node}/{service}" for service in compared}
             names |= {expression for name in [*names] for expression in wild.overlapping(name)}
@@ -68,7 +70,7 @@ class NodeRights:
         }
 
     def needs(self, right: Right) -> bool:
-        """Return whether a right is one that the nodes of its enclave need to start."""
+        """Return whether the nodes of the right's enclave need ``right`` to start."""
         node, _, service = right.name.rpartition("/")
         if right.qualifier is not ALLOW:
             return False
@@ -78,5 +80,5 @@ class NodeRights:
 
 
 def are_basic(rights: Iterable[Right]) -> bool:
-    """Return whether rights are among those that an enclave without a policy has."""
+    """Return whether all ``rights`` are among those of an enclave without a policy."""
     return all(_basics().cover(right._replace(enclave="/")) for right in rights)

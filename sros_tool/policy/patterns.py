@@ -1,12 +1,12 @@
 """Name expressions with wildcards: matching, covering and overlapping.
 
 ``*`` matches any characters, also "/"; ``?`` matches one character; ``[abc]`` and ``[a-c]`` match
-one character of a set, ``[!a-c]`` one that is not in it.  This is fnmatch of glibc without escapes,
-as the DDS vendors match.
+one character of a set, and ``[!a-c]`` one character outside of it.  This is fnmatch of glibc
+without escapes, as in the DDS vendors.
 
 `overlap` and `covers` compare two expressions, `Names` searches many.  `common_name` compares any
-number, also with exceptions, and returns an example; it only considers valid absolute ROS names.
-`listed_expressions` writes an expression as several without ``?`` and sets of characters.
+number, also with exceptions, and returns an example; it considers only valid absolute ROS names.
+`listed_expressions` replaces an expression by several without ``?`` and sets of characters.
 """
 
 from __future__ import annotations
@@ -33,11 +33,15 @@ _MANY = 4096
 _WILDCARD = re.compile(r"[*?\[]")
 _PIECE = re.compile(r"\*+|\?|\[(!?)([^\]]+)\]|(.)", re.DOTALL)
 _RANGE = re.compile(r"(.)-(.)|(.)", re.DOTALL)
-_ALPHABET = frozenset(map(chr, range(33, 127)))  # wider than ROS names: DDS topics may be foreign
+# More than the letters of ROS names, because DDS topics need not be from ROS.
+_ALPHABET = frozenset(map(chr, range(33, 127)))
 _ANY = frozenset([""])
-"""The pattern piece for ``*``."""
-ELSEWHERE = "/[\ue000]"
-"""Any namespace but ``/``: of the names that a file can have, only ``*`` covers the letter."""
+"""The piece for ``*`` in an expression."""
+OTHER_NAMESPACE = "/[\ue000]"
+"""Any namespace except ``/``, as an expression.
+
+The letter in it does not occur in files, so of their expressions only ``*`` matches it.
+"""
 _ROS_LETTERS = f"_{digits}{ascii_letters}/"
 _CHOICE = re.compile(r"\[(!?)([^\]]+)\]|(\?)|([^?\[]+)")
 _STARS = re.compile(r"\*\*+")
@@ -50,10 +54,10 @@ def compiled(expression: str) -> re.Pattern[str]:
 
 
 def matches(expression: str, name: str) -> bool:
-    """Return whether ``expression`` matches ``name``, which has no wildcards."""
+    """Return whether ``expression`` matches ``name``, which must have no wildcards."""
     if "?" in expression or "[" in expression:
         return compiled(expression).match(name) is not None
-    # To compile an expression takes much longer than to look for its parts once.
+    # Searching the parts of an expression once is much faster than compiling the expression.
     parts = expression.split("*")
     return expression == name if len(parts) == 1 else has_parts(name, parts)
 
@@ -66,8 +70,8 @@ def literal_prefix(expression: str) -> str:
 def covers(wide: str, narrow: str) -> bool:
     """Return whether ``wide`` matches every name that ``narrow`` matches.
 
-    True is always correct.  False can be wrong for unusual expressions: ``?*`` and ``*?`` match the
-    same names, but do not cover each other here.  Callers then keep a redundant rule.
+    True is always right.  False can be wrong for unusual expressions: ``?*`` and ``*?`` match the
+    same names, but do not cover each other here.  Then callers keep a redundant rule.
     """
     if wide == narrow:
         return True
@@ -75,28 +79,27 @@ def covers(wide: str, narrow: str) -> bool:
         return False
     if not is_expression(narrow):
         return matches(wide, narrow)
-    return narrow.startswith(literal_prefix(wide)) and _pattern_form(wide).covers(
-        _pattern_form(narrow)
-    )
+    return narrow.startswith(literal_prefix(wide)) and _pattern(wide).covers(_pattern(narrow))
 
 
 def overlap(first: str, second: str) -> bool:
-    """Return whether at least one name matches both expressions."""
+    """Return whether some name matches both expressions."""
     if not is_expression(first):
         return matches(second, first) if is_expression(second) else first == second
     if not is_expression(second):
         return matches(first, second)
     shorter, longer = sorted((literal_prefix(first), literal_prefix(second)), key=len)
-    return longer.startswith(shorter) and _pattern_form(first).overlaps(_pattern_form(second))
+    return longer.startswith(shorter) and _pattern(first).overlaps(_pattern(second))
 
 
 _Pieces = tuple[frozenset[str], ...]
 
 
-class _Form:
-    """An expression as a sequence of pieces; sets of positions are bits of an integer.
+class _Pattern:
+    """An expression as a sequence of pieces.
 
-    Bit i of a set of positions stands for "the first i pieces have matched".
+    Sets of positions are the bits of an integer: bit i stands for "the first i pieces have
+    matched".
     """
 
     __slots__ = ("_covering", "_letters", "_meeting", "back", "front", "pieces", "starred", "stars")
@@ -112,37 +115,39 @@ class _Form:
         self._covering: dict[frozenset[str], int] = {}
         self._meeting: dict[frozenset[str], int] = {}
 
-    def covers(self, narrow: _Form) -> bool:
-        """Return whether the pieces cover the pieces of ``narrow``, pair by pair."""
+    def covers(self, narrow: _Pattern) -> bool:
+        """Return whether this expression covers ``narrow``, by comparing pieces."""
         reached = self._begin()
         for piece in narrow.pieces:
             kept = reached & self.stars
             if piece is not _ANY:
-                kept |= (reached & self._covers_at(piece)) << 1
+                kept |= (reached & self._covering_positions(piece)) << 1
             reached = kept | (kept & self.stars) << 1
             if not reached:
                 return False
         return bool(reached >> len(self.pieces))
 
-    def overlaps(self, other: _Form) -> bool:
-        """Return whether at least one name matches both expressions."""
+    def overlaps(self, other: _Pattern) -> bool:
+        """Return whether some name matches both expressions."""
         if not (all(self.pieces) and all(other.pieces)):
-            return False  # a set without members matches nothing
+            return False  # an empty set of characters matches nothing
         if self.starred and other.starred:
-            # A name that begins and ends as both demand, and has the middle of one and then that
-            # of the other in between, matches both: the stars match the rest.
-            return _pieces_meet(self.front, other.front) and _pieces_meet(
+            # If both begin and end alike, there is a common name: that beginning, the middle of the
+            # one, the middle of the other, and that end, in which the stars match the rest.
+            return _pieces_overlap(self.front, other.front) and _pieces_overlap(
                 self.back[::-1], other.back[::-1]
             )
         if not self.starred and not other.starred:
-            return len(self.pieces) == len(other.pieces) and _pieces_meet(self.pieces, other.pieces)
-        return self._meets(other) if self.starred else other._meets(self)
+            return len(self.pieces) == len(other.pieces) and _pieces_overlap(
+                self.pieces, other.pieces
+            )
+        return self._overlaps_fixed(other) if self.starred else other._overlaps_fixed(self)
 
-    def _meets(self, fixed_form: _Form) -> bool:
-        """Return whether a name of the pieces of ``fixed_form``, without ``*``, matches."""
+    def _overlaps_fixed(self, fixed_form: _Pattern) -> bool:
+        """Return whether some name matches both expressions; ``fixed_form`` has no ``*``."""
         reached = self._begin()
         for piece in fixed_form.pieces:
-            kept = reached & self.stars | (reached & self._meets_at(piece)) << 1
+            kept = reached & self.stars | (reached & self._overlapping_positions(piece)) << 1
             reached = kept | (kept & self.stars) << 1
             if not reached:
                 return False
@@ -151,8 +156,8 @@ class _Form:
     def _begin(self) -> int:
         return 1 | (self.stars & 1) << 1
 
-    def _covers_at(self, piece: frozenset[str]) -> int:
-        """Return the positions whose pieces match all letters of ``piece``."""
+    def _covering_positions(self, piece: frozenset[str]) -> int:
+        """Return the positions whose pieces match all characters of ``piece``."""
         if piece not in self._covering:
             all_covered = ~0
             for letter in piece:
@@ -160,8 +165,8 @@ class _Form:
             self._covering[piece] = all_covered & (1 << len(self.pieces)) - 1 & ~self.stars
         return self._covering[piece]
 
-    def _meets_at(self, piece: frozenset[str]) -> int:
-        """Return the positions whose pieces match at least one letter of ``piece``."""
+    def _overlapping_positions(self, piece: frozenset[str]) -> int:
+        """Return the positions whose pieces match at least one character of ``piece``."""
         if piece not in self._meeting:
             positions = 0
             for letter in piece:
@@ -177,18 +182,18 @@ class _Form:
         return self._letters[letter]
 
 
-def _pieces_meet(first: _Pieces, second: _Pieces) -> bool:
-    """Return whether the pieces at every position share a letter; extra pieces are ignored."""
+def _pieces_overlap(first: _Pieces, second: _Pieces) -> bool:
+    """Return whether the pieces at each position share a character; extra pieces are ignored."""
     return not any(map(frozenset.isdisjoint, first, second))
 
 
 @lru_cache(maxsize=4 * _MANY)
-def _pattern_form(expression: str) -> _Form:
-    return _Form(_pieces(expression))
+def _pattern(expression: str) -> _Pattern:
+    return _Pattern(_pieces(expression))
 
 
 def _pieces(expression: str) -> _Pieces:
-    """Split an expression into pieces: `_ANY` for ``*``, else the set of matching characters."""
+    """Split an expression into pieces: `_ANY` for ``*``, or else a set of matching characters."""
     letter_sets: list[frozenset[str]] = []
     for piece in _PIECE.finditer(expression):
         negated, members, literal = piece.groups()
@@ -218,14 +223,14 @@ def _members(text: str) -> frozenset[str]:
 
 
 class ComparisonLimit:
-    """A limit on comparisons, so that a question about many expressions ends in time."""
+    """A limit on comparisons, so that searching many expressions ends in time."""
 
     def __init__(self, maximum: int = 60_000_000) -> None:
         """Set the limit to ``maximum`` characters; the default takes about ten seconds."""
         self._left = maximum
 
     def spend(self, characters: int) -> None:
-        """Count a comparison without result against the limit, by the length of the expressions.
+        """Count a comparison of two expressions that did not match, by the length of both.
 
         Raises:
             DocumentError: the limit is exceeded.
@@ -241,7 +246,7 @@ class ComparisonLimit:
 
 
 _FEW = 16
-"""Up to this number, expressions are compared one by one, without an index."""
+"""Number of expressions up to which they are compared one by one, without an index."""
 _LAST = "\U0010ffff"
 _END = re.compile(r".*[*?\]]", re.DOTALL)
 _BETWEEN = "\0"
@@ -250,10 +255,10 @@ _GRAM = 4
 
 
 class Names:
-    """An ordered set of names and expressions with a fast search for covering and overlapping ones.
+    """An ordered set of names and expressions that finds those that cover or overlap a name.
 
     Only expressions with the same beginning, end or letters are compared.  ``limit`` limits the
-    comparisons; sets that are used for one purpose share it.
+    number of comparisons; sets that are used for one purpose share a limit.
     """
 
     def __init__(self, names: Iterable[str], limit: ComparisonLimit | None = None) -> None:
@@ -264,24 +269,24 @@ class Names:
         self._limit = limit or ComparisonLimit()
 
     def cover(self, name: str) -> bool:
-        """Return whether the set contains ``name``, or an expression that covers ``name``."""
+        """Return whether the set contains ``name`` or an expression that covers it."""
         return name in self._every or (bool(self._wild) and any(self.covering(name)))
 
     def covering(self, name: str) -> Iterator[str]:
-        """Yield the other expressions that cover ``name`` (see `covers`), in set order."""
+        """Yield the expressions, other than ``name`` itself, that cover ``name``, in set order."""
         for wide in self._cover_candidates(name):
             if wide != name and self._count_failure(covers(wide, name), wide, name):
                 yield wide
 
-    def meets(self, name: str) -> bool:
-        """Return whether an expression of the set overlaps with ``name``."""
+    def overlaps(self, name: str) -> bool:
+        """Return whether an expression of the set overlaps ``name``."""
         if is_expression(name):
             candidates = map(self._names.__getitem__, self._overlap_candidates(name))
             return any(self._count_failure(overlap(e, name), e, name) for e in candidates)
         return name in self._exact or (bool(self._wild) and any(self.covering(name)))
 
     def overlapping(self, name: str) -> Iterator[str]:
-        """Yield the expressions of the set that overlap with ``name``, in the order of the set."""
+        """Yield the expressions of the set that overlap ``name``, in set order."""
         if is_expression(name):
             for expression in map(self._names.__getitem__, sorted(self._overlap_candidates(name))):
                 if self._count_failure(overlap(expression, name), expression, name):
@@ -292,7 +297,7 @@ class Names:
         yield from self.covering(name)
 
     def _count_failure(self, fits: bool, first: str, second: str) -> bool:
-        """Return ``fits``; a comparison without result counts against the limit."""
+        """Return ``fits``; if it is False, count the comparison against the limit."""
         if not fits:
             self._limit.spend(len(first) + len(second))
         return fits
@@ -311,9 +316,9 @@ class Names:
 
     @cached_property
     def _by_letters(self) -> dict[str, list[int]]:
-        """Map letters that every matching name has to the numbers of the expressions.
+        """Map parts of names to the positions of expressions whose names all have this part.
 
-        For each expression, the letters that the fewest other expressions have are used.
+        Each expression is listed once, by the part that the fewest expressions have in common.
         """
         grams = [
             {gram for run in _RUN.findall(_letters_of(expression)) for gram in _grams(run)}
@@ -331,7 +336,7 @@ class Names:
         return numbers_by_letters
 
     def _overlap_candidates(self, expression: str) -> Sequence[int]:
-        """Return the numbers of expressions that could overlap with ``expression``."""
+        """Return the positions of expressions that may overlap ``expression``."""
         if len(self._names) <= _FEW:
             return range(len(self._names))
         begin, end = literal_prefix(expression), _END.sub("", expression)[::-1]
@@ -358,7 +363,10 @@ class Names:
 
 
 class _Beginnings:
-    """An index of numbered texts by their beginnings; open texts continue with anything."""
+    """An index of texts by their beginnings; open texts can go on with anything.
+
+    A text is identified by its number, the position in the list.
+    """
 
     def __init__(self, texts: Sequence[tuple[str, bool]]) -> None:
         ordered = sorted((text, number) for number, (text, _) in enumerate(texts))
@@ -371,7 +379,7 @@ class _Beginnings:
         self._sizes = sorted({len(text) for text in self._open})
 
     def numbers_of_texts(self, begin: str) -> list[int]:
-        """Return the numbers of the texts that can begin with ``begin``."""
+        """Return the numbers of the texts that begin with ``begin`` or, if open, can do so."""
         first = bisect_left(self._texts, begin)
         numbers = self._numbers[first : bisect_left(self._texts, begin + _LAST, lo=first)]
         for size in self._sizes:
@@ -382,17 +390,17 @@ class _Beginnings:
 
 
 def _letters_of(expression: str) -> str:
-    """Return the fixed letters of an expression, with NUL for all other characters."""
+    """Return the fixed letters of an expression, with NUL in place of all other characters."""
     if "[" not in expression:
         return expression.replace("*", _BETWEEN).replace("?", _BETWEEN)
-    pieces = _pattern_form(expression).pieces
+    pieces = _pattern(expression).pieces
     return "".join(
         next(iter(piece)) or _BETWEEN if len(piece) == 1 else _BETWEEN for piece in pieces
     )
 
 
 def _grams(run: str) -> Iterator[str]:
-    """Yield the four-letter parts of a text, or the whole text if it is shorter."""
+    """Yield all parts of a text with four letters, or the whole text if it is shorter."""
     for i in range(max(len(run) - _GRAM, 0) + 1):
         yield run[i : i + _GRAM]
 
@@ -400,17 +408,17 @@ def _grams(run: str) -> Iterator[str]:
 # ── names that expressions have in common ──────────────────────────────────────────────────
 
 
-# Most questions need no automata, which take long to import.
+# Most callers need no automata, which take long to import.
 @cache
 def _ros_names(absolute: bool, elsewhere: bool) -> NameSet:
-    """Return the set of all valid ROS names, with or without a leading "/", or in `ELSEWHERE`."""
+    """Return the set of all valid ROS names: with "/" first or without, or in `OTHER_NAMESPACE`."""
     from sros_tool.automata import Automaton, Letters, NameSet
 
     word, slash = Letters.between([("A", "Z"), ("a", "z"), ("_", "_")]), Letters.of("/")
     parts = ((1, word, 2), (2, word | Letters.between([("0", "9")]), 2), (2, slash, 1))
     begin = [(0, slash, 1)] if absolute else [(0, word, 2)]
     if elsewhere:
-        begin = [(0, slash, 3), (3, Letters.of(ELSEWHERE[2]), 4), (4, slash, 1)]
+        begin = [(0, slash, 3), (3, Letters.of(OTHER_NAMESPACE[2]), 4), (4, slash, 1)]
     return NameSet((), [Automaton((*begin, *parts), frozenset((2,)))])
 
 
@@ -439,11 +447,11 @@ def common_name(
 ) -> str | None:
     """Return the shortest name that matches all ``wanted_names`` and no ``unwanted_names``.
 
-    Without ``absolute``, the name has no leading "/", like DDS topics.  If ``wanted_names`` begin
-    with `ELSEWHERE`, so does the name.  Returns None if there is no such name.
+    Without ``absolute``, the name has no leading "/", like a DDS topic.  If the ``wanted_names``
+    begin with `OTHER_NAMESPACE`, so does the name.  The result is None if there is no such name.
 
     Raises:
-        DocumentError: there are too many ``?`` after ``*`` to decide it.
+        DocumentError: the expressions have too many ``?`` after ``*`` for a decision.
     """
     inner, outer = tuple(dict.fromkeys(wanted_names)), tuple(dict.fromkeys(unwanted_names))
     for name in inner:
@@ -462,7 +470,7 @@ def common_name(
 def _search(wanted: tuple[str, ...], unwanted_names: tuple[str, ...], absolute: bool) -> str | None:
     from sros_tool.automata import NameSet
 
-    elsewhere = any(name.startswith(ELSEWHERE) for name in wanted)
+    elsewhere = any(name.startswith(OTHER_NAMESPACE) for name in wanted)
     both = reduce(and_, map(_names_of, wanted), _ros_names(absolute, elsewhere))
     return (both - NameSet.union(map(_names_of, unwanted_names))).example()
 
@@ -475,12 +483,12 @@ class TooManyNames(Exception):  # noqa: N818 - the caller makes an error of it
 
 
 def listed_expressions(expression: str, maximum: int) -> list[str]:
-    """Return expressions whose only wildcard is ``*`` and that match the same ROS names.
+    """Return expressions that together match the same ROS names, with ``*`` as their only wildcard.
 
-    A ``?`` is any character of ROS names.
+    A ``?`` stands for any character of ROS names.
 
     Raises:
-        TooManyNames: there are more than ``maximum``.
+        TooManyNames: the result would have more than ``maximum`` expressions.
     """
     if "?" not in expression and "[" not in expression:
         return [_STARS.sub("*", expression)]
@@ -488,13 +496,13 @@ def listed_expressions(expression: str, maximum: int) -> list[str]:
     if prod(map(len, pieces)) > maximum:
         raise TooManyNames
     names = ("".join(choice) for choice in product(*pieces))
-    # "/" next to another one or at the end is in no name.
+    # A name has no "//" and no "/" at the end.
     expressions = (_STARS.sub("*", name) for name in names if "//" not in name and name[-1:] != "/")
     return list(dict.fromkeys(expressions))
 
 
 def _letters_or_text(negated: str, listed: str, any_letter: str, text: str) -> Sequence[str]:
-    """Return what one match of `_CHOICE` stands for: several letters, or its text alone."""
+    """Return the alternatives for one match of `_CHOICE`: several letters, or only its text."""
     if text:
         return [text]
     if any_letter:

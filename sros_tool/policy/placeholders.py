@@ -1,10 +1,11 @@
 """Placeholders in policy names, which stand for names that differ between robots of a fleet.
 
-``{robot}`` and ``{namespace}`` stand for the name and the ROS namespace of one robot, ``{robots}``
-and ``{namespaces}`` for one name for each robot.  ``{robot:carriers}`` means the robots of a group.
+``{robot}`` and ``{namespace}`` stand for the name and the ROS namespace of one robot.  With
+``{robots}`` and ``{namespaces}``, a name stands for several names, one for each robot.
+``{robot:carriers}`` means the robots of the group carriers.
 
-The place of a placeholder is limited so that its value cannot widen a name: no wildcard may stand
-in the same part of the name, because ``/r1*`` would match the names of a robot r10, too.
+A placeholder must not stand where its value could widen a name: a part of a name with a placeholder
+must have no wildcard, because ``/r1*`` would also match the names of a robot r10.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ Parts = tuple[str | Placeholder, ...]
 
 
 def has_placeholder(text: str) -> bool:
-    """Return whether ``text`` contains a brace, which stands only in placeholders."""
+    """Return whether ``text`` contains a brace, which is only allowed in placeholders."""
     return "{" in text or "}" in text
 
 
@@ -45,8 +46,8 @@ def parts_of(text: str) -> Parts:
     """Split a name into text and placeholders.
 
     Raises:
-        ValueError: a brace is not of a placeholder, or one stands where it may not; the message
-            is a sentence.
+        ValueError: a brace does not belong to a placeholder, or a placeholder is not allowed in its
+            place; the message is a sentence.
     """
     parts: list[str | Placeholder] = []
     end = 0
@@ -94,7 +95,7 @@ def placeholders_of(parts: Parts) -> tuple[Placeholder, ...]:
 
 
 def sample(parts: Parts) -> str:
-    """Return the name filled with the shortest possible values, to check the name's grammar."""
+    """Return the name with the shortest possible values for placeholders, to check its grammar."""
     return "".join(part if isinstance(part, str) else _SAMPLES[part.value] for part in parts)
 
 
@@ -102,7 +103,7 @@ def check_path(path: Parts) -> None:
     """Check that an enclave path stands for one enclave, or one for each robot of a group.
 
     Raises:
-        ValueError: the path does not; the message is a sentence.
+        ValueError: the path stands for something else; the message is a sentence.
     """
     path_placeholders = placeholders_of(path)
     if plural := next((part for part in path_placeholders if part.plural), None):
@@ -118,7 +119,7 @@ def check_name(name: Parts, path: Parts, *, several: bool) -> None:
     Args:
         name: the name.
         path: the path of the enclave that states it, which `check_path` accepts.
-        several: whether the name may stand for one name for each robot.
+        several: whether the name may stand for several names, one for each robot.
 
     Raises:
         ValueError: a placeholder has no value; the message is a sentence.
@@ -146,7 +147,7 @@ def check_name(name: Parts, path: Parts, *, several: bool) -> None:
 
 
 def fill(parts: Parts, robot: str, namespace: str, *, plural: bool = False) -> Parts:
-    """Fill in the placeholders of a name: the singular or, with ``plural``, the plural ones."""
+    """Fill in the singular placeholders of a name, or with ``plural``, the plural ones."""
     values = {"robot": robot, "namespace": namespace}
     if namespace == "/" and len(parts) > 1:
         values["namespace"] = ""  # in the root namespace, {namespace}/scan is /scan

@@ -1,11 +1,12 @@
-"""Remapping of the names in a policy, as ROS remaps the names of the nodes that it is for.
+"""Remapping of the names in a policy, as ROS remaps the names of nodes.
 
-A rule is that of ``--ros-args -r`` (ROS 2 design, "Static Remapping"): ``[NODE:]FROM:=TO``, where
-``__node`` and ``__ns`` stand for name and namespace of a node.  Both names are relative to the node
-unless they are absolute, and the first rule that fits a name counts.  A rule with NODE, other than
-one of ``__node``, is for the node that has this name after ``__node`` (rcl, node.c).  The name of
-an action is remapped since rcl_action 10.0.2, and on Jazzy since 9.2.8; before, only the names of
-the topics and services that it consists of (rcl, pull request 1170).
+A rule has the form of ``--ros-args -r`` (ROS 2 design, "Static Remapping"): ``[NODE:]FROM:=TO``,
+where ``__node`` and ``__ns`` stand for the name and the namespace of a node.  FROM and TO are
+relative to the node unless they are absolute, and the first rule that fits a name applies.  NODE is
+the name of a node after rules for ``__node`` were applied, except in these rules themselves (rcl,
+node.c).  The name of an action is remapped since rcl_action 10.0.2, and on Jazzy since 9.2.8; in
+earlier versions, only the names of the action's topics and services are remapped (rcl, pull request
+1170).
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ _SHOWN = 3
 
 
 class Remapping(NamedTuple):
-    """A rule that remaps a name for the nodes named ``node`` ("": for all nodes)."""
+    """A rule that remaps a name for the nodes named ``node``; "" stands for all nodes."""
 
     node: str
     old: str
@@ -47,7 +48,7 @@ class Remapping(NamedTuple):
 
     @property
     def is_of_node(self) -> bool:
-        """Whether its names differ from node to node."""
+        """Whether the names of the rule differ from node to node."""
         return self.old == _NODE or "~" in (self.old[0], self.new[0])
 
     def __str__(self) -> str:
@@ -55,10 +56,10 @@ class Remapping(NamedTuple):
 
 
 class UsedRule(NamedTuple):
-    """A rule that changed a node (``kind`` is ""), or a name in one of the node's groups.
+    """A use of a rule: it changed a node (``kind`` is ""), or a name in one of the node's groups.
 
-    ``kind`` is that of the group; ``old`` and ``new`` are the full name, of node or group, before
-    and after.
+    ``kind`` is the kind of the group; ``old`` and ``new`` are the full name, of the node or in the
+    group, before and after the change.
     """
 
     rule: Remapping
@@ -72,8 +73,8 @@ def parse_remapping(text: str) -> Remapping:
     """Return the rule in a text such as ``image:=/left/image`` or ``driver:__node:=left_driver``.
 
     Raises:
-        UsageError: it is not such a rule.
-        InvalidNameError: it has a namespace that is not valid.
+        UsageError: the text is not a rule.
+        InvalidNameError: the rule has a namespace that is not valid.
     """
     rule = _RULE.fullmatch(text)
     if not rule:
@@ -96,10 +97,10 @@ def parse_remapping(text: str) -> Remapping:
 
 
 def parse_remapping_of_names(text: str) -> Remapping:
-    """Return the rule in a text, for names that are of no single node, as in requirements.
+    """Return the rule in a text, for names that do not belong to a single node, as in requirements.
 
     Raises:
-        UsageError: (or another error of `parse_remapping`) it is not such a rule.
+        UsageError: (or another error of `parse_remapping`) the text is not such a rule.
     """
     rule = parse_remapping(text)
     problem = remedy = ""
@@ -117,9 +118,10 @@ def parse_remapping_of_names(text: str) -> Remapping:
 
 
 def remapped_name(name: str, ns: str, rules: Iterable[Remapping]) -> list[str]:
-    """Return the names for a full name of any node in a namespace, by `parse_remapping_of_names`.
+    """Return the full names that replace a full name of any node in a namespace.
 
-    A wildcard that matches an old name stays, and the new name is added.
+    The ``rules`` are those of `parse_remapping_of_names`.  A wildcard that matches an old name
+    stays, and the new name is added.
     """
     rules = tuple(rules)
     for rule in rules:
@@ -155,13 +157,14 @@ def has_new_name(rule: Remapping, names: Iterable[str], namespaces: Iterable[str
 def remapped_policies(
     policies: Iterable[Policy], texts: Iterable[str], file: Policy = _EMPTY
 ) -> tuple[list[Policy], list[Note]]:
-    """Return policies remapped by rules, and notes on what the nodes may do otherwise.
+    """Return remapped policies, and notes on what the nodes may do differently afterwards.
 
-    A note also names each DENY in ``file``, the policy to merge into, of an old name alone.
+    ``texts`` are rules.  There is also a note for each DENY in ``file``, the policy to merge into,
+    that denies an old name but not its new name.
 
     Raises:
-        UsageError: (or another error of `parse_remapping`) a text is not a rule, or its rule is for
-            a name that no policy has.
+        UsageError: (or another error of `parse_remapping`) a text is not a rule, or no policy has
+            the name for which the rule is.
     """
     rules = [parse_remapping(text) for text in texts]
     policies = tuple(policies)
@@ -202,10 +205,10 @@ def remapped_policies(
 def _notes_on_requirements(
     policies: Iterable[Policy], rules: Iterable[Remapping]
 ) -> Iterator[Note]:
-    """Yield a note on the names that no node has any more, but for services of every node.
+    """Yield a note on names that no node has any more, except for the services of every node.
 
-    A requirement that says who may use such a name holds, whoever may use the new one.  A namespace
-    does not count: `sros check` puts requirements into one, too.
+    A requirement for such a name would hold, whoever may use the new name.  Rules for namespaces
+    are ignored, because `sros check` puts requirements into a namespace, too.
     """
     of_names = [rule for rule in rules if rule.old != _NAMESPACE]
     policies = tuple(policies)
@@ -222,7 +225,7 @@ def _notes_on_requirements(
     moved = {name for _, name in before - after}
     gone = {name for name in moved if name.rpartition("/")[2] not in NODE_SERVICES}
     if gone:
-        # As `parse_remapping_of_names` takes them, where no node keeps the name.
+        # These rules are for `parse_remapping_of_names`, where no node is named.
         options = {
             str(use.rule._replace(node=use.node if use.rule.is_of_node else ""))
             for _, uses in remapped
@@ -273,10 +276,10 @@ def remapped_policy(
 ) -> tuple[Policy, set[UsedRule]]:
     """Return a policy with remapped names, and the uses of the rules.
 
-    Where a wildcard matches the old name, the new name is added to the wildcard.  The names in
-    ``moved_names``, of any node, are also added to each DENY that matches the old one.  An old name
-    stays denied where a wildcard of its enclave, among the rights ``stated`` by all policies, would
-    allow it.
+    A wildcard that matches an old name stays, and the new name is added to its group.  The new
+    names in ``moved_names``, of any node, are also added to each DENY that matches the old name.
+    An old name stays denied if a wildcard of its enclave, among the rights ``stated`` by all
+    policies, would allow it.
     """
     used: set[UsedRule] = set()
     wildcards = Rules(right for right in stated if is_expression(right.name))
@@ -311,7 +314,7 @@ def remapped_policy(
 def _remapped_group(
     group: Group, rules: Iterable[Remapping], ns: str, node: str, used: set[UsedRule]
 ) -> Group:
-    """Return a group of a node with remapped names; add the rules that apply to ``used``."""
+    """Return a node's group with remapped names, and add the uses of rules to ``used``."""
     by_name: dict[str, Remapping] = {}
     for rule in rules:
         by_name.setdefault(expand(rule.old, ns, node), rule)
@@ -345,9 +348,10 @@ def _more_denials(
     ns: str,
     node: str,
 ) -> Iterator[Group]:
-    """Yield a group of the names that a DENY of ``group`` also has to deny, if there are any.
+    """Yield a group with names that a DENY of ``group`` must deny in addition, if there are any.
 
-    That is each moved name, and each in ``by_wildcards`` that no node has instead of another now.
+    These are the new names in ``moved_names``, and the names in ``by_wildcards`` that no node has
+    as its new name.
     """
     denials = tuple(right for right in group.rights if right[1] is DENY)
     if not denials:

@@ -1,8 +1,8 @@
 """Rights and denials with absolute names: reading them from policies, and comparing them.
 
 Two documents have the same meaning if their rights in normal form are equal.  An action consists of
-three services and two topics (ROS 2 design "Actions"): `unfolded` splits it into them, `folded`
-joins them again.
+three services and two topics (ROS 2 design "Actions"): `split_actions` splits an action into these
+parts, `join_actions` joins the parts again.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from sros_tool.names import (
 from sros_tool.policy.model import (
     ALLOW,
     DENY,
-    OFFERING_SIDE,
-    OTHER_SIDE,
+    OFFERING_RIGHT,
+    PEER_RIGHT,
     RIGHTS,
     Enclave,
     Group,
@@ -46,16 +46,16 @@ KindOfName = Annotated[str, Words((*RIGHTS, "dds"))]
 RIGHT_ORDER = {right: number for number, right in enumerate(KIND_OF)}
 """The order in which rights are listed: publish, subscribe, request, reply, call, execute."""
 
-WHOLE = {"request": "call", "reply": "execute"}
-"""Maps a right to a service to the right to a whole action."""
+ACTION_RIGHT = {"request": "call", "reply": "execute"}
+"""Maps a right to use or offer a service to the same right for a whole action."""
 
 
 @shows("enclave", "qualifier", "kind", "right", "name")
 class Right(NamedTuple):
     """A right or a denial of one enclave for one name.
 
-    A name without a leading "/" is a DDS topic without a ROS name; it occurs only in permissions
-    that sros did not make.
+    A name without a leading "/" is a DDS topic that is not a ROS name; it occurs only in
+    permissions that sros did not write.
     """
 
     enclave: str
@@ -82,7 +82,7 @@ class Right(NamedTuple):
 
     def peer_right(self, enclave: str) -> Right:
         """Return the right that a peer enclave needs, such as subscribe for publish."""
-        return self._replace(enclave=enclave, right=OTHER_SIDE[self.right])
+        return self._replace(enclave=enclave, right=PEER_RIGHT[self.right])
 
     def __str__(self) -> str:
         """Return text such as ``/talker ALLOW publish topic /chatter``."""
@@ -104,7 +104,7 @@ GroupRights = tuple[tuple[str, Qualifier], ...]
 
 
 def group_rights(rights: Iterable[tuple[str, Qualifier]]) -> Iterator[GroupRights]:
-    """Yield groups for ``rights`` to one name: two if a right is both allowed and denied."""
+    """Yield the rights of groups for one name: two groups if a right is allowed and denied."""
     ordered = sorted(rights, key=lambda right: (RIGHT_ORDER[right[0]], right[1]))
     if len({right for right, _ in ordered}) == len(ordered):
         yield tuple(ordered)
@@ -124,7 +124,7 @@ def policy_rights(policy: Policy) -> frozenset[Right]:
 
 
 class PlacedRight(NamedTuple):
-    """A right with its position in a policy; ``written`` is the name as written there."""
+    """A right with its place in a policy; ``written`` is the name as in the policy."""
 
     right: Right
     written: str
@@ -134,7 +134,7 @@ class PlacedRight(NamedTuple):
 
 
 def placed_rights(enclave: Enclave) -> Iterator[PlacedRight]:
-    """Yield each right and denial of an enclave with its position, in document order."""
+    """Yield each right and denial of an enclave with its place, in document order."""
     for profile in enclave.all_profiles():
         for group in profile.groups:
             for index, written in enumerate(group.names):
@@ -158,7 +158,7 @@ def profile_rights(enclave: str, profile: Profile) -> Iterator[Right]:
 
 
 def parts(right: Right) -> tuple[Right, ...]:
-    """Split an action's right into its five topics and services; keep other rights."""
+    """Return the rights to the five topics and services of an action; or the right itself."""
     part_rights = ACTION_PARTS.get(right.right)
     if part_rights is None:
         return (right,)
@@ -167,10 +167,11 @@ def parts(right: Right) -> tuple[Right, ...]:
     )
 
 
-def of_whole_action(right: str, name: str) -> tuple[str, str]:
+def action_right(right: str, name: str) -> tuple[str, str]:
     """Return the right to the action of which ``right`` to ``name`` is a part, and its name.
 
-    Other rights stay. So does a subscription: who only watches an action need not command it.
+    Other pairs are returned unchanged.  So are subscriptions, because watching an action does not
+    need the right to command it.
     """
     action, part = action_part(name)
     for whole, of in ACTION_PARTS.items():
@@ -179,18 +180,20 @@ def of_whole_action(right: str, name: str) -> tuple[str, str]:
     return right, name
 
 
-def unfolded(rights: Iterable[Right]) -> frozenset[Right]:
+def split_actions(rights: Iterable[Right]) -> frozenset[Right]:
     """Return the rights with every action split into its topics and services."""
     return frozenset(part for right in rights for part in parts(right))
 
 
-def folded(rights: Iterable[Right]) -> frozenset[Right]:
-    """Return the normal form: the five parts of an action joined to one right."""
-    remaining = set(unfolded(rights))
+def join_actions(rights: Iterable[Right]) -> frozenset[Right]:
+    """Return the rights in normal form: the five parts of an action are joined into one right."""
+    remaining = set(split_actions(rights))
     actions = [
-        Right(right.enclave, right.qualifier, WHOLE[right.right], right.name.removesuffix(GOAL))
+        Right(
+            right.enclave, right.qualifier, ACTION_RIGHT[right.right], right.name.removesuffix(GOAL)
+        )
         for right in remaining
-        if right.right in WHOLE and right.name.endswith(GOAL) and right.name.startswith("/")
+        if right.right in ACTION_RIGHT and right.name.endswith(GOAL) and right.name.startswith("/")
     ]
     complete = [right for right in actions if right.name and remaining.issuperset(parts(right))]
     for right in complete:
@@ -205,7 +208,7 @@ class Rules:
     """A set of rights with fast queries: exact names by lookup, wildcards by matching."""
 
     def __init__(self, rights: Iterable[Right]) -> None:
-        self._stated = unfolded(rights)
+        self._stated = split_actions(rights)
         names: dict[_Place, list[str]] = defaultdict(list)
         for enclave, qualifier, right, name in sorted(self._stated):
             names[enclave, qualifier, right].append(name)
@@ -217,13 +220,13 @@ class Rules:
         return all(self._covering_right(part) for part in parts(right))
 
     def covering_rights(self, right: Right) -> tuple[Right, ...]:
-        """Return the rights that together cover ``right``, or () if it is not covered."""
+        """Return the rights that together cover ``right``; () if they cover only a part of it."""
         covering = [self._covering_right(part) for part in parts(right)]
         return tuple(dict.fromkeys(filter(None, covering))) if all(covering) else ()
 
     def overlaps(self, right: Right) -> bool:
         """Return whether a right of the set has a name in common with ``right``."""
-        return any(self._names_at(part).meets(part.name) for part in parts(right))
+        return any(self._names_at(part).overlaps(part.name) for part in parts(right))
 
     def overlapping(self, right: Right) -> tuple[Right, ...]:
         """Return the rights of the set that have a name in common with ``right``."""
@@ -240,7 +243,7 @@ class Rules:
             denied = self._names.get((enclave, DENY, part.right))
             if not allowed or not allowed.cover(part.name):
                 return False
-            if denied and denied.meets(part.name):
+            if denied and denied.overlaps(part.name):
                 return False
         return True
 
@@ -259,10 +262,10 @@ _Place = tuple[str, Qualifier, str]
 
 
 class RightsDifference(NamedTuple):
-    """The rights that only one side has, in normal form and sorted.
+    """The rights that only one of two sides has, in normal form and sorted.
 
-    ``covered`` maps some of these rights to the wildcards of the other side that cover them, unless
-    that side denies a part of them.
+    ``covered`` maps a right to the wildcards of the other side that cover it, unless the other side
+    denies a part of it.
     """
 
     only_first: tuple[Right, ...]
@@ -273,12 +276,12 @@ class RightsDifference(NamedTuple):
         return bool(self.only_first or self.only_second)
 
     def lines(self) -> list[tuple[str, Right]]:
-        """Return the different rights with "-" (only first side) or "+" (only second side)."""
+        """Return the different rights, with "-" for the first side only and "+" for the second."""
         lines = [("-", right) for right in self.only_first] + [("+", e) for e in self.only_second]
         return sorted(lines, key=lambda line: (*order(line[1]), line[0] == "+"))
 
     def without(self, enclaves: Collection[str]) -> RightsDifference:
-        """Return the difference in the rights of all other enclaves."""
+        """Return the difference without the rights of some enclaves."""
         only_first, only_second = (
             tuple(right for right in side if right.enclave not in enclaves)
             for side in (self.only_first, self.only_second)
@@ -291,7 +294,7 @@ def renamed_enclaves(
 ) -> dict[str, str]:
     """Map enclaves that only the first rights have to enclaves with equal rights among the second.
 
-    An enclave is left out where several others have the same rights.
+    An enclave is left out if several other enclaves have the same rights.
     """
     before, after = (_rights_by_enclave(side) for side in (first_rights, second_rights))
     gone: dict[frozenset[Right], list[str]] = defaultdict(list)
@@ -308,7 +311,7 @@ def renamed_enclaves(
 
 
 def _rights_by_enclave(rights: Iterable[Right]) -> dict[str, set[Right]]:
-    """Return the rights of each enclave, without the enclave."""
+    """Return the rights of each enclave, with "" in place of the enclave's path."""
     by_enclave: dict[str, set[Right]] = defaultdict(set)
     for right in rights:
         by_enclave[right.enclave].add(right._replace(enclave=""))
@@ -323,21 +326,25 @@ def compare(
     """Compare two sets of rights of the enclaves in ``scope`` (None: all enclaves).
 
     An action counts as its services and topics.  A right that only one side states is no difference
-    if wildcards that both state cover it: large permissions leave such names out.  A part of an
-    action is one if the other side has it only with the whole action, which is a difference.
+    if it is covered by wildcards that both sides state, because large permissions leave such rights
+    out.  But a part of an action is a difference if the other side has it only with the whole
+    action, and the whole action is a difference.
     """
     first, second = (
-        folded(right for right in side if scope is None or right.enclave in scope)
+        join_actions(right for right in side if scope is None or right.enclave in scope)
         for side in (first_rights, second_rights)
     )
-    common = Rules(unfolded(first) & unfolded(second) if first != second else ())
+    common = Rules(split_actions(first) & split_actions(second) if first != second else ())
     first_only, second_only = first - second, second - first
     gone, new = (
         {right for right in side if not common.cover(right)} for side in (first_only, second_only)
     )
     only_first, only_second = (
         tuple(sorted(rights, key=order))
-        for rights in (gone | first_only & unfolded(new), new | second_only & unfolded(gone))
+        for rights in (
+            gone | first_only & split_actions(new),
+            new | second_only & split_actions(gone),
+        )
     )
     covered: dict[Right, tuple[Right, ...]] = {}
     for rights, side in ((only_first, second), (only_second, first)):
@@ -360,7 +367,7 @@ CHANGING_NODES = (
     "_ros2cli_",
     "_sros_observer_",
 )
-"""Beginnings of node names that end in an address or a process id, and change with every start."""
+"""Beginnings of node names that end with an address or process id, which changes every time."""
 _SERVED_BY_EVERY_NODE = frozenset(f"~/{service}" for service in NODE_SERVICES)
 
 
@@ -371,24 +378,25 @@ class NodeName(NamedTuple):
     name: str
 
     def is_within(self, wider: NodeName) -> bool:
-        """Return whether ``wider`` stands for all nodes that this name stands for."""
+        """Return whether ``wider`` stands for all nodes for which this name stands."""
         in_root = (wider.ns, self.ns) == ("/*", "/")
         return covers(wider.ns, self.ns) and covers(wider.name, self.name) and not in_root
 
-    def meets(self, other: NodeName) -> bool:
-        """Return whether both names may stand for the same node."""
+    def overlaps(self, other: NodeName) -> bool:
+        """Return whether some node matches both names."""
         return overlap(self.ns, other.ns) and overlap(self.name, other.name)
 
 
 def nodes_of(enclave: Enclave) -> tuple[NodeName, ...]:
-    """Return the nodes of an enclave, from the profiles of its policy."""
+    """Return the nodes of an enclave, by the profiles of its policy."""
     return tuple(dict.fromkeys(map(node_of, enclave.all_profiles())))
 
 
 def nodes_not_shown(enclave: Enclave) -> tuple[NodeName, ...]:
-    """Return the nodes of a policy's enclave that its permissions do not show.
+    """Return the nodes of a policy's enclave that cannot be derived from its permissions.
 
-    `nodes_of_rights` derives the others, unless their own services are denied (`denied_nodes`).
+    `nodes_of_rights` derives nodes from the services that every node offers, unless these services
+    are denied (`denied_nodes`).
     """
     profiles = tuple(enclave.all_profiles())
     rights = {right for profile in profiles for right in profile_rights(enclave.path, profile)}
@@ -405,7 +413,7 @@ def nodes_not_shown(enclave: Enclave) -> tuple[NodeName, ...]:
 def node_of(profile: Profile) -> NodeName:
     """Return namespace and name of the node of a profile."""
     ns = profile.ns.strip("/")
-    # A namespace that begins with a wildcard has no "/" before it.
+    # A namespace that begins with a wildcard does not need a "/" before it.
     return NodeName(ns if ns.startswith("*") else f"/{ns}", profile.node)
 
 
@@ -414,9 +422,9 @@ def _offers_node_services(group: Group) -> bool:
 
 
 def nodes_of_rights(rights: Iterable[Right]) -> tuple[NodeName, ...]:
-    """Return the nodes whose standard services the rights of an enclave allow to offer.
+    """Return the nodes whose standard services an enclave may offer by its rights.
 
-    Denials take nodes of wildcards away: `denied_nodes`.
+    Denials are ignored here; `denied_nodes` returns the nodes that they take away.
     """
     nodes = (
         node
@@ -429,10 +437,10 @@ def nodes_of_rights(rights: Iterable[Right]) -> tuple[NodeName, ...]:
 
 
 def denied_nodes(rights: Iterable[Right]) -> tuple[NodeName, ...]:
-    """Return the nodes whose standard services are allowed, and then all denied again.
+    """Return the nodes whose standard services are allowed but then all denied.
 
-    A node that may offer any standard service is not returned.  If a denial matches a part of what
-    a wildcard allows, it counts for all nodes that the denial matches.
+    Nodes that may offer any of their standard services are left out.  If a denial matches a part of
+    what a wildcard allows, the result has all nodes that the denial matches.
     """
     allowed: dict[str, None] = {}
     denied: dict[str, None] = {}
@@ -451,7 +459,7 @@ def denied_nodes(rights: Iterable[Right]) -> tuple[NodeName, ...]:
         return all(
             never.cover(f"{node}/{service}")
             for service, nodes in offering.items()
-            if nodes.meets(node)
+            if nodes.overlaps(node)
         )
 
     candidates = {
@@ -468,7 +476,7 @@ def denied_nodes(rights: Iterable[Right]) -> tuple[NodeName, ...]:
 def _full_names(name: str, service: str = "") -> Iterator[str]:
     """Yield the full names of nodes, perhaps with wildcards, whose standard services match a name.
 
-    With ``service``, only nodes that offer this service by that name.
+    With ``service``, only nodes that offer this service by the name are returned.
     """
     node, _, last = name.rpartition("/")
     if last in NODE_SERVICES and service in ("", last):
@@ -479,13 +487,13 @@ def _full_names(name: str, service: str = "") -> Iterator[str]:
 
 
 def _texts_before(name: str, end: str) -> Iterator[str]:
-    """Yield expressions for all texts that, with ``end`` after them, ``name`` matches."""
+    """Yield expressions for the texts that match ``name`` when ``end`` is added."""
     if not is_expression(name):
         if name.endswith(end):
             yield name.removesuffix(end)
         return
     for at in range(1, len(name)):
-        # A star may match the end of the text and the beginning of ``end``.
+        # A star can match the end of the text and the beginning of ``end``.
         if matches(name[at:], end):
             yield name[: at + 1] if name[at] == "*" else name[:at]
 
@@ -493,7 +501,7 @@ def _texts_before(name: str, end: str) -> Iterator[str]:
 def _nodes(name: str) -> Iterator[NodeName]:
     """Yield the nodes whose full name matches ``name``.
 
-    A ``*`` may also stand for the "/" between namespace and node name.
+    A ``*`` can also match the "/" between namespace and node name.
     """
     ns, _, last = name.rpartition("/")
     if last:
@@ -504,25 +512,25 @@ def _nodes(name: str) -> Iterator[NodeName]:
 
 
 def nodes_as_text(nodes: Iterable[NodeName]) -> str:
-    """Return nodes as text for the ledger: full names, separated by commas."""
+    """Return nodes as text for the ledger: "NAMESPACE NAME" of each, separated by commas."""
     return ", ".join(f"{node.ns} {node.name}" for node in nodes)
 
 
 def nodes_from_text(text: str) -> tuple[NodeName, ...]:
-    """Parse the text that `nodes_as_text` returns."""
+    """Parse a text that `nodes_as_text` returned."""
     pairs = (node.partition(" ") for node in text.split(", ") if node)
     return tuple(NodeName(ns, name) for ns, _, name in pairs)
 
 
-def unanswered_rights(
+def rights_without_counterpart(
     first_rights: Collection[Right], second_rights: Collection[Right], difference: RightsDifference
 ) -> list[Right]:
-    """Return the ``second_rights`` whose other side enclaves have only in ``first_rights``.
+    """Return the ``second_rights`` that have lost their counterpart since ``first_rights``.
 
-    For example, a right to subscribe to a topic that no enclave may publish any more, because the
-    right to publish it is gone or denied, or a right to publish a topic that is not subscribed to.
-    A right to a wildcard counts if the other side has no name any more that it matches.  What every
-    node offers, such as its parameters, needs nobody who uses it.
+    An example is a right to subscribe to a topic that no enclave may publish any more, because the
+    right to publish it is gone or denied; another is a right to publish a topic to which no enclave
+    may subscribe any more.  A right with a wildcard counts if no counterpart has a name that it
+    matches.  What every node offers, such as its parameters, needs no counterpart.
     """
     reduced = [right for right in difference.only_first if right.qualifier is not DENY]
     reduced += (right for right in difference.only_second if right.qualifier is DENY)
@@ -533,29 +541,29 @@ def unanswered_rights(
     asked = [
         right
         for right in second_rights
-        if (other := OTHER_SIDE[right.right]) in touched
+        if (other := PEER_RIGHT[right.right]) in touched
         and right.qualifier is not DENY
-        and touched[other].meets(right.name)
-        and (right.right in OFFERING_SIDE or not _is_offered_by_every_node(right.name))
+        and touched[other].overlaps(right.name)
+        and (right.right in OFFERING_RIGHT or not _is_offered_by_every_node(right.name))
     ]
     if not asked:
         return []
-    names = {(OTHER_SIDE[e.right], e.name) for e in asked if not is_expression(e.name)}
+    names = {(PEER_RIGHT[e.right], e.name) for e in asked if not is_expression(e.name)}
     before, after = _allowed_pairs(first_rights, names), _allowed_pairs(second_rights, names)
-    present = unfolded(right for right in second_rights if right.qualifier is not DENY)
+    present = split_actions(right for right in second_rights if right.qualifier is not DENY)
     others = {
         word: Names(sorted(right.name for right in present if right.right == word))
         for word in touched
     }
     lost = before - after
     lost |= {
-        (OTHER_SIDE[right.right], right.name)
+        (PEER_RIGHT[right.right], right.name)
         for right in asked
         if is_expression(right.name)
         and right.right not in ("call", "execute")
-        and not others[OTHER_SIDE[right.right]].meets(right.name)
+        and not others[PEER_RIGHT[right.right]].overlaps(right.name)
     }
-    return sorted(right for right in asked if (OTHER_SIDE[right.right], right.name) in lost)
+    return sorted(right for right in asked if (PEER_RIGHT[right.right], right.name) in lost)
 
 
 def _is_offered_by_every_node(name: str) -> bool:
@@ -565,7 +573,7 @@ def _is_offered_by_every_node(name: str) -> bool:
 def _allowed_pairs(
     rights: Iterable[Right], names: Iterable[tuple[str, str]]
 ) -> set[tuple[str, str]]:
-    """Return the pairs of a right and a name that the rights allow to at least one enclave."""
+    """Return the pairs (right, name) that the rights allow to at least one enclave."""
     rules, enclaves = Rules(rights), {right.enclave for right in rights}
     return {
         (word, name)
@@ -574,8 +582,8 @@ def _allowed_pairs(
     }
 
 
-def unanswered_text(right: Right) -> str:
-    """Return the text on one of the `unanswered_rights`."""
-    other = OTHER_SIDE[right.right]
+def lost_counterpart_text(right: Right) -> str:
+    """Return a clause on one of the `rights_without_counterpart`."""
+    other = PEER_RIGHT[right.right]
     other = {"reply": "serve", "subscribe": "subscribe to"}.get(other, other)
     return f"{right.enclave} may {right.right} {right.name}, but no enclave may {other} it any more"

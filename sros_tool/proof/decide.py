@@ -34,7 +34,7 @@ from sros_tool.names import (
     is_expression,
     right_to_use,
 )
-from sros_tool.policy.model import OTHER_SIDE, RIGHTS
+from sros_tool.policy.model import PEER_RIGHT, RIGHTS
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.proof.requirements import (
@@ -703,7 +703,7 @@ def _restricted_names(requirement: Requirement) -> Iterator[tuple[str, str, tupl
     for right, names in rights:
         parts = _sufficient_parts(right)
         if isinstance(requirement, Nobody | Protected):
-            parts = (*_sufficient_parts(OTHER_SIDE[right]), *parts)
+            parts = (*_sufficient_parts(PEER_RIGHT[right]), *parts)
         yield from ((right, name, parts) for name in names)
 
 

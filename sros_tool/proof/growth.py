@@ -54,14 +54,14 @@ from sros_tool.policy.rights import (
     KIND_OF,
     Right,
     Rules,
-    folded,
+    join_actions,
     node_of,
     nodes_of,
     order,
     parts,
     profile_rights,
     renamed_enclaves,
-    unfolded,
+    split_actions,
 )
 from sros_tool.proof.protection import (
     added_crossing,
@@ -1187,7 +1187,7 @@ _ROS_NAMES = valid_topics("", "")
 def _allowed_names(rights: Iterable[Right]) -> dict[str, NameSet]:
     """Map each right, such as publish, to the names that rights allow and do not deny."""
     names: dict[tuple[str, Qualifier], list[str]] = defaultdict(list)
-    for _, qualifier, right, name in unfolded(rights):
+    for _, qualifier, right, name in split_actions(rights):
         names[right, qualifier].append(name)
     allowed, denied = (
         {
@@ -1205,7 +1205,7 @@ def _allowed_names(rights: Iterable[Right]) -> dict[str, NameSet]:
 
 def _dropped_denials(before: AccessSource, after: AccessSource) -> Iterator[DroppedDenial]:
     """Yield denials that ``after`` drops or narrows, and denials that a node left behind."""
-    denials = {right for right in unfolded(before.rights) if right.qualifier is DENY}
+    denials = {right for right in split_actions(before.rights) if right.qualifier is DENY}
     if not denials:
         return
     stated = Rules(after.rights)
@@ -1217,11 +1217,11 @@ def _dropped_denials(before: AccessSource, after: AccessSource) -> Iterator[Drop
             now = _enclaves_near(new_nodes.get(node, {}), robot).keys()
             new = now - _enclaves_near(robots, robot).keys()
             for path, old_path in product(new, profiles.keys() - now):
-                rights = unfolded(profile_rights(path, profiles[old_path]))
+                rights = split_actions(profile_rights(path, profiles[old_path]))
                 owed[old_path].update(right for right in rights if right.qualifier is DENY)
     for old_path, denied in owed.items():
         names = {part: undenied_name(part, stated) for part in denied}
-        for right in sorted(folded(part for part, name in names.items() if name)):
+        for right in sorted(join_actions(part for part, name in names.items() if name)):
             part = parts(right)[0]
             name = (names[part] or "").removesuffix(part.name.removeprefix(right.name))
             yield DroppedDenial(right, name if stated.overlaps(right) else "", old_path)

@@ -39,7 +39,7 @@ from sros_tool.files import read_toml
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.names import expand, expression_problem, is_expression
 from sros_tool.policy.model import RIGHTS, Level, Source, below_namespace
-from sros_tool.policy.patterns import ELSEWHERE, covers, overlap
+from sros_tool.policy.patterns import OTHER_NAMESPACE, covers, overlap
 from sros_tool.policy.placeholders import (
     Placeholder,
     fill,
@@ -372,7 +372,7 @@ def parse_requirements(
     for table in filled:
         requirement = _READERS[table.kind](table)
         if not namespaces:
-            moved = _READERS[table.kind](replace(table, namespace=ELSEWHERE, remaps=()))
+            moved = _READERS[table.kind](replace(table, namespace=OTHER_NAMESPACE, remaps=()))
             requirement = replace(requirement, elsewhere=moved)
         requirements.append(requirement)
         if len(requirements) > _MOST_FILLED:
@@ -1132,7 +1132,7 @@ def _enclaves_within(narrow: Sequence[str], wide: Sequence[str]) -> bool:
     )
     narrow_names = [name for name in narrow if not name.startswith(EXCEPT)]
     wide_names = [name for name in wide if not name.startswith(EXCEPT)]
-    names = [name.replace(ELSEWHERE, "/*", 1) for name in narrow_names]
+    names = [name.replace(OTHER_NAMESPACE, "/*", 1) for name in narrow_names]
     still_excepted = (
         enclave for enclave in wide_excepted if any(overlap(enclave, name) for name in names)
     )

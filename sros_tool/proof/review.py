@@ -65,7 +65,7 @@ from sros_tool.keystore.template import Template, load_template, read_template, 
 from sros_tool.names import expand
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Policy, Profile, policy_in_namespace
-from sros_tool.policy.patterns import ELSEWHERE, common_name
+from sros_tool.policy.patterns import OTHER_NAMESPACE, common_name
 from sros_tool.policy.remapping import Remapping
 from sros_tool.policy.rights import (
     NodeName,
@@ -1319,7 +1319,7 @@ def _moved_rights(enclave: Enclave) -> Iterator[tuple[PlacedRight, Right]]:
     """Yield each right of an enclave, and the same right for a node in another namespace."""
 
     def elsewhere(profile: Profile) -> Profile:
-        return replace(profile, ns=f"{ELSEWHERE}{profile.ns}".rstrip("/"))
+        return replace(profile, ns=f"{OTHER_NAMESPACE}{profile.ns}".rstrip("/"))
 
     moved = placed_rights(enclave.with_profiles(elsewhere))
     for placed, moved_right in zip(placed_rights(enclave), moved, strict=True):

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from sros_tool.automata import SearchLimit
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.names import READING_SERVICES, expression_problem, is_expression, moves_robot
-from sros_tool.policy.model import OTHER_SIDE, RIGHTS, Level, Source
+from sros_tool.policy.model import PEER_RIGHT, RIGHTS, Level, Source
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.placeholders import Placeholder
 from sros_tool.policy.rights import Right
@@ -161,7 +161,7 @@ def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
     Names that move the robot get a requirement for any number of enclaves, even without a known
     receiver.
     """
-    other = OTHER_SIDE[right]
+    other = PEER_RIGHT[right]
     names: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for name in stated_rights.names(right):
         users = tuple(sorted(stated_rights.users[right, name]))

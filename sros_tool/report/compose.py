@@ -30,10 +30,10 @@ from sros_tool.policy.rights import (
     RIGHT_ORDER,
     Right,
     compare,
-    folded,
+    join_actions,
     order,
     parts,
-    unfolded,
+    split_actions,
 )
 from sros_tool.reach import DomainRights
 from sros_tool.report.picture import (
@@ -138,7 +138,7 @@ def compose(first_source: PictureSource, hosts: Mapping[str, str] = _NO_HOSTS) -
     """
     rights = first_source.rights
     known, edges = _with_all_wildcards(rights, lambda known: _edges_of(rights, known))
-    stated = dict.fromkeys(folded(rights), OverlaySide.BOTH)
+    stated = dict.fromkeys(join_actions(rights), OverlaySide.BOTH)
     return _picture((first_source,), edges, stated, known, hosts)
 
 
@@ -160,7 +160,7 @@ def overlay(
         return _marked_rights(*sides, allowed_by=kind == "use")
 
     known, edges = _with_all_wildcards(rights[0] | rights[1], marked_edges)
-    normal = [folded(own) for own in rights]
+    normal = [join_actions(own) for own in rights]
     stated = {
         right: OverlaySide.BOTH
         if right in normal[0] and right in normal[1]
@@ -461,7 +461,7 @@ class NamesOfRights:
 
     def __init__(self, rights: Collection[Right]) -> None:
         self._names: dict[tuple[str, str], list[str]] = defaultdict(list)
-        for right in unfolded(rights) | folded(rights):
+        for right in split_actions(rights) | join_actions(rights):
             if not is_expression(right.name):
                 self._names[right.enclave, right.right].append(right.name)
 
@@ -493,7 +493,7 @@ def _with_all_wildcards(
     drawn = {(edge.enclave, edge.right, edge.name) for edge in edges}
     unseen = [
         right
-        for right in folded(rights)
+        for right in join_actions(rights)
         if is_expression(right.name)
         and right not in by
         and (right.enclave, right.right, right.name) not in drawn
@@ -513,19 +513,19 @@ class Known:
     def __init__(self, rights: Iterable[Right], wildcards: Iterable[Right] = ()) -> None:
         rights = frozenset(rights)
         known: dict[str, set[str]] = defaultdict(set)
-        for part in unfolded(rights):
+        for part in split_actions(rights):
             if not is_expression(part.name):
                 known[part.kind].add(part.name)
         self.actions = frozenset(
             right.name
-            for right in folded(rights)
+            for right in join_actions(rights)
             if right.kind == "actions" and not is_expression(right.name)
         )
         self._names = {kind: sorted(names) for kind, names in known.items()}
         self._matched: dict[tuple[str, str], tuple[str, ...]] = {}
         wild: dict[str, list[str]] = defaultdict(list)
-        chosen = unfolded(wildcards)
-        for part in sorted(unfolded(rights)):
+        chosen = split_actions(wildcards)
+        for part in sorted(split_actions(rights)):
             if is_expression(part.name) and (
                 part in chosen or not self.matching_names(part.kind, part.name)
             ):
@@ -604,7 +604,7 @@ def _edges_of(rights: Collection[Right], known_names: Known) -> list[Edge]:
     """
     nodes = NodeRights(rights)
     topics: dict[tuple[str, str, str, str], _Found] = defaultdict(lambda: defaultdict(set))
-    for stated in unfolded(rights):
+    for stated in split_actions(rights):
         by = stated.name if is_expression(stated.name) else ""
         for reached in known_names.names_to_draw(stated):
             # A wildcard drawn as a name is treated like an exact name.

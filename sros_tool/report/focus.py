@@ -23,7 +23,7 @@ from sros_tool.dds.governance import Governance
 from sros_tool.errors import UsageError
 from sros_tool.keystore.selection import likely_names
 from sros_tool.names import ACTION_SEPARATOR, dds_names, is_expression
-from sros_tool.policy.model import ALLOW, DENY, OTHER_SIDE
+from sros_tool.policy.model import ALLOW, DENY, PEER_RIGHT
 from sros_tool.policy.patterns import matches, overlap
 from sros_tool.policy.rights import Right
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, HopPath, Network, path_text, unguarded
@@ -343,7 +343,7 @@ class _System:
         for hop in {hop for path in self._paths for hop in path}:
             for enclave, right, stated, fits in (
                 (hop.source, hop.right, hop.said, _may_write),
-                (hop.target, OTHER_SIDE[hop.right], hop.heard, _may_read),
+                (hop.target, PEER_RIGHT[hop.right], hop.heard, _may_read),
             ):
                 if (enclave, hop.kind, hop.name, fits) not in drawn:
                     by = () if stated == hop.name else (stated,)

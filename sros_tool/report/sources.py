@@ -313,7 +313,7 @@ def drawn_difference(
         used = frozenset(
             right
             for right in source.rights
-            if right.kind in names and names[right.kind].meets(right.name)
+            if right.kind in names and names[right.kind].overlaps(right.name)
         )
         return PictureSource(SourceTitle(title, source.kind), used, scope=source.scope)
 

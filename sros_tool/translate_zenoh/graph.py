@@ -134,7 +134,7 @@ def graph_rules(
         [
             denial
             for denial in without
-            if any(map(denial.meets, left)) or not any(map(denial.meets, nodes))
+            if any(map(denial.overlaps, left)) or not any(map(denial.overlaps, nodes))
         ]
     )
     whole_domain = f"{GRAPH}/{domain}/{ANY_CHUNKS}"
@@ -176,7 +176,7 @@ class _Tokens:
             )
             if without:
                 never = Names(without)
-                stated = {n: None for n in stated if is_expression(n) or not never.meets(n)}
+                stated = {n: None for n in stated if is_expression(n) or not never.overlaps(n)}
             wild = [expression for expression in stated if is_expression(expression)]
             allowed += self._announced(right, stated)
             denied += [

@@ -43,7 +43,7 @@ from sros_tool.policy.rights import (
     RIGHT_ORDER,
     NodeName,
     Right,
-    folded,
+    join_actions,
     nodes_of,
     parts,
     placed_rights,
@@ -286,7 +286,7 @@ def _allowed_keys(
         exact = {
             tuple(name[1:].split("/"))
             for name in places
-            if not is_expression(name) and not denials.meets(name)
+            if not is_expression(name) and not denials.overlaps(name)
         }
         wild = {name: place for name, place in places.items() if is_expression(name)}
         difference = Difference(str(domain), end, _forms(wild), _forms(never))
@@ -922,7 +922,9 @@ def policy_of(subjects: Iterable[RightsOfSubject]) -> Policy:
             rights.setdefault(enclave, set()).update(
                 Right(enclave, ALLOW, stated.right, stated.name) for stated in subject.rights
             )
-    return Policy(tuple(_enclave(name, folded(of)) for name, of in sorted(rights.items()) if of))
+    return Policy(
+        tuple(_enclave(name, join_actions(of)) for name, of in sorted(rights.items()) if of)
+    )
 
 
 def _enclave(name: str, rights: Iterable[Right]) -> Enclave:

@@ -16,7 +16,7 @@ from sros_tool.explain.answer import ask
 from sros_tool.explain.zenoh import ZenohEvaluator
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.rights import Rules, policy_rights, unfolded
+from sros_tool.policy.rights import Rules, policy_rights, split_actions
 from tests.explain.zenoh_policies import NAMES, OTHER_END, WORD, drawn_policy
 from tests.support.children import LONG
 from tests.support.harness import Ended, copy_of, policy_text, publish, sros
@@ -447,7 +447,7 @@ def test_random_policies_are_answered_as_their_permissions_say(
     sros("create_keystore", root, "--template", "production").ok()
     sros("generate_artifacts", "-k", root, "-p", policy).ok()
     sros("zenoh", root, "--mode", mode).ok()
-    rules = Rules(unfolded(policy_rights(read_policy(policy))))
+    rules = Rules(split_actions(policy_rights(read_policy(policy))))
     evaluator = ZenohEvaluator(OpenedKeystore(root), moment=now(), domain=0)
     enclaves = [each for each in evaluator.names if each != "/router"]
     allowed = denied = 0

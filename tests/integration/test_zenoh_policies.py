@@ -18,7 +18,7 @@ from sros_tool.files import policies_dir
 from sros_tool.names import is_expression
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import RIGHTS
-from sros_tool.policy.rights import KIND_OF, Rules, policy_rights, unfolded
+from sros_tool.policy.rights import KIND_OF, Rules, policy_rights, split_actions
 from tests.support.children import LONG
 from tests.support.harness import policy_text, publish, sros
 from tests.support.long_form import some
@@ -40,7 +40,7 @@ WITNESS = policy_text(
 
 def matrix_of(policies: list[Path]) -> dict[str, Any]:
     """Return the names of policies, and the rights of their enclaves to each of them."""
-    rights = unfolded(right for each in policies for right in policy_rights(read_policy(each)))
+    rights = split_actions(right for each in policies for right in policy_rights(read_policy(each)))
     names: dict[str, set[str]] = {kind: {"/elsewhere", "/else/where"} for kind in KINDS}
     for each in rights:
         names[KIND_OF[each.right]].update(examples(each.name))

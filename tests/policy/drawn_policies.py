@@ -124,7 +124,7 @@ def portable_permissions(now: datetime) -> st.SearchStrategy[Permissions]:
         return permissions_for(enclave, subject=f"CN={path}", validity=validity, domains=DOMAINS)
 
     def fits(permissions: Permissions) -> bool:
-        notes = portability_problems(permissions, 0, lambda names: Names(names).meets)
+        notes = portability_problems(permissions, 0, lambda names: Names(names).overlaps)
         allows = any(rule.allow for rule in permissions.grants[0].rules)
         return allows and all(identity == "portable.character-set" for identity, _ in notes)
 

@@ -133,7 +133,7 @@ def test_many_expressions(names: list[str], asked: str) -> None:
             covering = [e for e in known if e != asked and plainly_covers(e, asked)]
             assert list(found.covering(asked)) == [e for e in covering if is_expression(e)]
             met = [e for e in known if plainly_overlap(e, asked)]
-            assert found.meets(asked) == bool(met)
+            assert found.overlaps(asked) == bool(met)
             assert sorted(found.overlapping(asked)) == sorted(met)
             if is_expression(asked):
                 assert list(found.overlapping(asked)) == met
@@ -160,7 +160,7 @@ def test_few_of_many_are_compared(kind: str) -> None:
     found = Names(names, limit)
     for each in other:
         list(found.covering(each))
-        found.meets(each)
+        found.overlaps(each)
     with pytest.raises(DocumentError, match="too many"):
         limit.spend(200 * total + 1)
 

@@ -15,11 +15,11 @@ from sros_tool.policy.rights import (
     Right,
     Rules,
     compare,
-    folded,
+    join_actions,
     parts,
     policy_rights,
-    unanswered_rights,
-    unfolded,
+    rights_without_counterpart,
+    split_actions,
 )
 from sros_tool.translate import grant_rights
 from tests.policy.drawn_policies import PATHS, effective, grant_of, policies
@@ -73,14 +73,14 @@ def test_covering_and_overlapping_are_true_of_every_name(one: str, other: str) -
 def test_permissions_tell_the_same_rights_as_their_policy(policy: Policy) -> None:
     for path in PATHS:
         own = {right for right in policy_rights(policy) if right.enclave == path}
-        assert folded(grant_rights(path, grant_of(policy, path))) == folded(own)
+        assert join_actions(grant_rights(path, grant_of(policy, path))) == join_actions(own)
 
 
 @given(policies())
 def test_folding_changes_no_right(policy: Policy) -> None:
     rights = policy_rights(policy)
-    assert unfolded(folded(rights)) == unfolded(rights)
-    assert folded(folded(rights)) == folded(rights)
+    assert split_actions(join_actions(rights)) == split_actions(rights)
+    assert join_actions(join_actions(rights)) == join_actions(rights)
 
 
 @given(policies())
@@ -95,9 +95,9 @@ def test_rules_answer_as_dds_does(policy: Policy) -> None:
 def test_an_action_is_told_once() -> None:
     action = Right("/a", ALLOW, "call", "/fib")
     status = Right("/a", ALLOW, "subscribe", "/fib/_action/status")
-    assert folded([action, status]) == {action}
-    assert folded(parts(action)) == {action}
-    assert folded(parts(action)[1:]) == frozenset(parts(action)[1:])
+    assert join_actions([action, status]) == {action}
+    assert join_actions(parts(action)) == {action}
+    assert join_actions(parts(action)[1:]) == frozenset(parts(action)[1:])
 
 
 def test_a_denied_action_is_denied_by_its_parts() -> None:
@@ -134,7 +134,7 @@ def test_rights_whose_other_side_is_gone(
         Right("/deaf", DENY, "subscribe", "/base/odom"),
     ]
     before = [lost, *after]
-    unanswered = unanswered_rights(before, after, compare(before, after))
+    unanswered = rights_without_counterpart(before, after, compare(before, after))
     assert unanswered == sorted([name, *([wildcard] if is_wildcard_unanswered else [])])
 
 

@@ -234,7 +234,7 @@ def check_documents(enclave: CheckedEnclave) -> Iterator[Finding]:
         return
     name, file = enclave.name, enclave.file("permissions.p7s")
     size = enclave.state.permissions_bytes
-    if any(portability_problems(permissions, size, lambda names: Names(names).meets)):
+    if any(portability_problems(permissions, size, lambda names: Names(names).overlaps)):
         from sros_tool.checks.policies import portability_findings
 
         yield from portability_findings(permissions, size, name, file)

@@ -394,7 +394,7 @@ class _Governed:
         """Yield the domains that an enclave may join."""
         return chain.from_iterable(self.domains)
 
-    def meets(self, other: _Governed) -> bool:
+    def overlaps(self, other: _Governed) -> bool:
         """Return whether two enclaves may join one domain; True if that is unknown."""
         return _domains_meet(self.first, other.first) or _domains_meet(self.domains, other.domains)
 
@@ -454,7 +454,7 @@ def _incompatible_governance_findings(
 
 
 def _incompatibility_of(own_side: _Governed, other_side: _Governed) -> _Incompatibility | None:
-    if not own_side.meets(other_side):
+    if not own_side.overlaps(other_side):
         return _Incompatibility(PEERS_DOMAINS)
     different = [
         _differences_between(*pair) for pair in product(own_side.documents, other_side.documents)
