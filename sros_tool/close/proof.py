@@ -6,6 +6,7 @@ import json
 import shlex
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from sros_tool.checks.keystores.issued import STALE
@@ -36,7 +37,9 @@ from sros_tool.graph.observation import (
     make_observation,
     observation_from_json,
 )
+from sros_tool.keystore.expiry import renewal_command, survey
 from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.names import expand, is_expression
 from sros_tool.proof.requirements import Must, read_requirements
 from sros_tool.runtime.environment import ROS_ARGS, named_enclave
@@ -62,7 +65,12 @@ def prove(robot: LocalRobot) -> CloseState:
 
 
 def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Proof]:
-    """Wait until each process runs in its enclave, and prove that the robot is closed."""
+    """Wait until each process runs in its enclave, and prove that the robot is closed.
+
+    If the enclave of the observer has expired, nothing but the files is examined.
+    """
+    if OBSERVER in _expired_enclaves(robot, robot.export):
+        return [_proof_of_files(robot)]
     expected = {process.enclave for process in state.observed.processes} | {*state.new}
     if not expected:
         return [Proof(_STARTED, False, "no process of the robot is known")]
@@ -96,7 +104,9 @@ def _proof_of_files(robot: LocalRobot) -> Proof:
     status = robot.shell.check(place)
     holds = {0: True, 1: False}.get(status)
     reason = "sros check finds no error" if holds else "they are not checked"
-    if holds is False:
+    if expired := _expired_enclaves(robot, robot.export):
+        holds, reason = False, _expired_text(robot, expired)
+    elif holds is False:
         reason = f"{_errors_text(robot)}; then run `{robot.close_command}`, and restart the "
         reason += "processes"
     if holds and robot.keystore.exists():  # an outdated export has no error of its own
@@ -114,6 +124,27 @@ def _proof_of_files(robot: LocalRobot) -> Proof:
                 holds, reason = False, f"{reason}; `{robot.close_command}` exports them"
     unsigned = _unsigned_policy_text(robot) if status == 0 else ""
     return Proof("the files are accepted", holds, f"{reason}: {robot.export}{unsigned}")
+
+
+def _expired_enclaves(robot: LocalRobot, root: Path) -> list[str]:
+    """Return the enclaves below ``root`` whose certificate or permissions have expired."""
+    lifetimes, _ = survey(OpenedKeystore(root)) if root.exists() else ((), ())
+    now = robot.shell.now()
+    return [lifetime.name for lifetime in lifetimes if lifetime.expires() < now]
+
+
+def _expired_text(robot: LocalRobot, expired: Sequence[str]) -> str:
+    """Return that enclaves of the export have expired, and how to renew those that need it."""
+    text = f"the files of {first_few(expired, MOST_NAMES)} have expired; "
+    if not robot.keystore.exists():
+        return (
+            f"{text}renew them where the keystore is (`{renewal_command(Path('KEYSTORE'))}`), "
+            f"export them again, and restart all processes together"
+        )
+    if to_renew := [name for name in _expired_enclaves(robot, robot.keystore) if name in expired]:
+        words = ("sros", "renew", str(robot.keystore), *to_renew)
+        text += f"run `{shlex.join(words)}`, and then "
+    return f"{text}run `{robot.close_command}`, and restart all processes together"
 
 
 def _unsigned_policy_text(robot: LocalRobot) -> str:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
+from sros_tool.close import proof
 from sros_tool.close.nodes import MovedEndpoint
 from sros_tool.close.proof import (
     _abandoned_names,
@@ -19,9 +20,12 @@ from sros_tool.close.proof import (
 )
 from sros_tool.explain.audit import DeniedRight
 from sros_tool.graph.observation import Endpoint, make_observation
+from sros_tool.keystore.expiry import Lifetime
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right
 from sros_tool.runtime.processes import Process, ProcessEnclave
+from sros_tool.validity import Window
 from tests.close.test_assignment import node
 
 
@@ -94,8 +98,8 @@ def test_requirements_hold_if_they_hold_here_and_elsewhere(
         not_here=["/laptop"] * (len(statuses) > 1),
         shell=SimpleNamespace(check=lambda *_: next(answers)),
     )
-    (proof,) = _proof_of_requirements(robot)
-    assert proof.holds is holds
+    (said,) = _proof_of_requirements(robot)
+    assert said.holds is holds
 
 
 def test_a_demand_for_an_enclave_that_the_export_lacks_is_judged_by_the_keystore(
@@ -113,8 +117,8 @@ def test_a_demand_for_an_enclave_that_the_export_lacks_is_judged_by_the_keystore
         not_here=[],
         shell=SimpleNamespace(check=lambda place, *_: answers[place]),
     )
-    (proof,) = _proof_of_requirements(robot)
-    assert proof.holds is False
+    (said,) = _proof_of_requirements(robot)
+    assert said.holds is False
 
 
 def test_a_node_that_others_do_not_see_on_zenoh_needs_its_enclave_in_its_command() -> None:
@@ -123,3 +127,39 @@ def test_a_node_that_others_do_not_see_on_zenoh_needs_its_enclave_in_its_command
     now: Any = SimpleNamespace(secured=[(process, ProcessEnclave("/export", "/talker"))])
     unseen = _unseen_text(now, "/talker", "/talker")
     assert "start process 1 (talk) with `--ros-args --enclave /talker` at its end" in unseen
+
+
+def test_expired_files_are_named_with_the_keystore_that_renews_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The observer of the proof has expired as all others have, and cannot look at the robot."""
+    now = datetime.now(UTC)
+    ended, lasting = (Window(now - timedelta(9), now + timedelta(days)) for days in (-1, 1))
+    expired = {"export": ["/s", "/sros_observer"], "keystore": ["/s", "/sros_observer", "/away"]}
+
+    def survey(keystore: OpenedKeystore) -> object:
+        names = expired[keystore.root.name]
+        found = [Lifetime(name, lasting, ended) for name in names]
+        return [*found, Lifetime("/later", lasting, lasting)], ()
+
+    monkeypatch.setattr(proof, "survey", survey)
+    robot: Any = SimpleNamespace(
+        export=tmp_path / "export",
+        keystore=tmp_path / "keystore",
+        close_command="sros close robot",
+        shell=SimpleNamespace(check=lambda *_: 1, now=lambda: now),
+    )
+    robot.export.mkdir()
+    told, state = [], cast(Any, None)
+    for change in (robot.keystore.mkdir, lambda: expired.update(keystore=[]), robot.keystore.rmdir):
+        change()
+        (said,) = proof.proofs_of(robot, state, 0)
+        assert said.holds is False
+        told.append(said.reason)
+    then = f"run `sros close robot`, and restart all processes together: {robot.export}"
+    begin = "the files of /s, /sros_observer have expired; "
+    assert told[:2] == [
+        f"{begin}run `sros renew {robot.keystore} /s /sros_observer`, and then {then}",
+        f"{begin}{then}",
+    ]
+    assert f"{begin}renew them where the keystore is (`sros renew KEYSTORE --all" in told[2]
