@@ -219,7 +219,7 @@ def _check_folders_closed(keystore: OpenedKeystore, folder: Path, name: str) -> 
         if why := other_writers(path.stat(), trusted):
             raise KeystoreError(
                 f"others can replace the files of enclave {name}",
-                f"'{path}': {why}. Whoever replaces them decides whom the process trusts.",
+                f"'{path}': {why}. Whoever replaces files decides whom the process trusts.",
                 f"Run `chmod go-w {quote(str(path))}`, then `sros verify "
                 f"{quote(str(keystore.root))}`. To run it nevertheless, add --accept-readable-key.",
             )

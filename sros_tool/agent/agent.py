@@ -113,8 +113,8 @@ _REPLACED_FOR = timedelta(days=30)
 _REPAIRED_FOR = timedelta(days=1)
 """How long the agent reports that it replaced files which differed from the release."""
 _BRING_KEY = (
-    " A release has no keys: bring the key as for the first time, with `sros distribute_key "
-    "KEYSTORE --robot {} DIR --force` in the keystore."
+    " A release has no keys: bring the key as at the first delivery, with `sros "
+    "distribute_key KEYSTORE --robot {} DIR --force` in the keystore."
 )
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _Answer = TypeVar("_Answer")

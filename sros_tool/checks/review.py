@@ -50,7 +50,7 @@ UNDECIDED = FindingKind(
     "review.undecided",
     ERROR,
     "a part of the review that could not be decided",
-    "An undecided part counts neither as right nor as wrong.",
+    "An undecided part counts as neither passed nor failed.",
     "The files of both commits.",
     "Repair what the message names, and review again.",
 )

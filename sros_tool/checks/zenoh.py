@@ -175,7 +175,7 @@ NO_MUTUAL_TLS = FindingKind(
     "zenoh.no-mutual-tls",
     ERROR,
     "a listener that asks for no certificate",
-    "Everybody gets a connection, without a name that a rule could require.",
+    "Everybody gets a connection without a certificate, so rules cannot require a name.",
     _TESTED,
     'Write "enable_mtls": true in transport/link/tls.',
 )

@@ -59,8 +59,8 @@ if TYPE_CHECKING:
     "[default: the vendor of this machine's RMW]",
 )
 @distro_option(
-    "Decide as the DDS of this ROS 2 distribution does, such as lyrical: its default, or the one "
-    "of $RMW_IMPLEMENTATION or --vendor. [default: $ROS_DISTRO]"
+    "Decide as a DDS that this ROS 2 distribution ships, such as lyrical: the DDS of --vendor or "
+    "$RMW_IMPLEMENTATION, else the default DDS of the distribution. [default: $ROS_DISTRO]"
 )
 @click.option(
     "--patch",
@@ -76,8 +76,8 @@ if TYPE_CHECKING:
 @click.option(
     "--unjudged",
     is_flag=True,
-    help="Exit with 0 if nothing is denied, even if something that was seen was not judged, or the "
-    "graph kept changing.",
+    help="Exit with 0 if nothing is denied, even if a part of the graph could not be judged, or "
+    "the graph kept changing.",
 )
 @fleet_option("The robots that the placeholders of POLICY stand for.")
 @force_option

@@ -187,8 +187,8 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
 )
 @all_distros_option("Report the findings for all supported ROS 2 distributions.")
 @distro_option(
-    "Report only the differences after an update to this ROS 2 distribution, from the current "
-    "one: --distro, else the keystore's settings, else $ROS_DISTRO.",
+    "Report only what changes with an update to this ROS 2 distribution. The distribution before "
+    "the update is that of --distro, else of the keystore's settings, else of $ROS_DISTRO.",
     "--upgrade-to",
 )
 @click.option(

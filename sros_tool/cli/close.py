@@ -193,7 +193,7 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
     policy = read_policy(robot.policy)
     if not closed.is_signed:
         return
-    echo(f"who may do what, without what every node needs (all of it: {robot.page}):")
+    echo(f"who may do what, except what every node needs (everything: {robot.page}):")
     for line in access_lines(policy, robot.folder):
         echo(f"  {line}")
     for left_open in unguarded(OpenedKeystore(robot.keystore).governance):
@@ -242,7 +242,7 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
     elif runs:
         restart = f"runs {_NOT_CURRENT}: {restart}"
     if process.alike:
-        state = f"{process.pids_text}, which sros cannot tell"
+        state = process.pids_text
     elif process.enclave in closed.absent:
         state = "not running"
     elif process.pid:
@@ -251,8 +251,8 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
         sign = signs.get(process.known_by, f"its {process.known_by}")
         state = f"process {process.pid}" + ("" if runs else f", known by {sign}")
     elif runs:
-        state = "started by another command than observed, which sros keeps (to change it, watch "
-        state += "the open robot again)"
+        state = "runs by another command than the observed one, which sros keeps (to replace "
+        state += "it, watch the open robot again)"
     else:
         ended = process.enclave in closed.observed.ended
         state = "has ended" if ended else "not running as observed"

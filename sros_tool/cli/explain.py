@@ -186,8 +186,8 @@ def _refuse_ignored(mode: str) -> None:
 )
 @click.option("--all-vendors", is_flag=True, help="Compare the decisions of all vendors.")
 @distro_option(
-    "Decide as the DDS of this ROS 2 distribution does, such as lyrical: its default, or the one "
-    "of $RMW_IMPLEMENTATION or --vendor. [default: $ROS_DISTRO]"
+    "Decide as a DDS that this ROS 2 distribution ships, such as lyrical: the DDS of --vendor or "
+    "$RMW_IMPLEMENTATION, else the default DDS of the distribution. [default: $ROS_DISTRO]"
 )
 @all_distros_option("Compare the decisions of all supported ROS 2 distributions.")
 @click.option(
@@ -1111,8 +1111,8 @@ def _text_without_findings(log: str) -> str:
     match = SECURITY_DIRECTORY.search(log)
     if match is None:
         return (
-            "no line says 'Found security directory': on DDS, its nodes ran open, or it is not the "
-            "whole log. `sros check runtime` on that machine says how its processes run; "
+            "no line says 'Found security directory': on DDS, its nodes ran open, or the log is "
+            "not complete. `sros check runtime` on that machine says how its processes run; "
             f"{_SILENT_ON_ZENOH}"
         )
     return (

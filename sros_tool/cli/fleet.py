@@ -599,8 +599,8 @@ class ComparedFleet(NamedTuple):
     type=click.Choice(["delivery", "vulnerabilities"]),
     default="delivery",
     show_default=True,
-    help="What makes the exit status 1: only the delivery of files, or also a DDS with known "
-    "vulnerabilities that a later release fixes.",
+    help="`delivery`: the exit status is 1 only for problems with the delivery of files. "
+    "`vulnerabilities`: also for a DDS with known vulnerabilities that a later release fixes.",
 )
 @output_option("Replace FILE atomically instead of printing.")
 @dry_run_option

@@ -164,7 +164,7 @@ def create_permission(
         if robot.name in robots and name not in chosen
     ]
     if left_out:
-        text = "left out, because the keystore does not have them, or not as enclaves of a robot: "
+        text = "left out, because the keystore lacks them, or has them as enclaves of no robot: "
         text += f"{shown_names(left_out)}. `sros generate_artifacts --robot` creates them, too."
         result = replace(result, notes=(*result.notes, Note("enclave.left-out", text)))
     _show(result, as_json, [policy])

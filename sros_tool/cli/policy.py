@@ -323,7 +323,7 @@ def diff_policy(
             number = counted(len(compared.enclaves), "enclave")
             echo(f"only one side has {number} without rights", err=True)
         if protections:
-            echo("what the policies say about protection differs", err=True)
+            echo("the policies demand different protection", err=True)
         if compared.governance_differs:
             command = f"sros diff_policy --no-new-access {quote(str(a))} {quote(str(b))}"
             shows = f"`{command}` shows what B opens, `sros inspect` shows each governance"
@@ -361,7 +361,7 @@ def rights_markdown(
             parts.append(bounded_list(map(code, signed), _MOST_LINES, shown_by))
     if unanswered := list(unanswered_lines(difference, second_source.fleet)):
         parts += [
-            "**Nobody answers any more**",
+            "**Rights without a counterpart now**",
             bounded_list(map(code, unanswered), _MOST_LINES, shown_by),
         ]
     if difference.governance_differs:

@@ -224,8 +224,7 @@ class _RemainingProcesses:
                 why = f" ({enclave.problem})" if enclave.problem else ""
                 yield (
                     f"{process.label} runs secured with the files of '{keystore_text(enclave)}'"
-                    f"{why}, which are not known as those of this folder; open processes do not "
-                    "hear it"
+                    f"{why}, which are not the files of this folder; open processes do not hear it"
                 )
         unseen_processes = running.processes.unseen
         for unseen in unseen_processes:

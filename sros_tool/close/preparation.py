@@ -170,7 +170,7 @@ def _with_renamed_enclaves(robot: LocalRobot, observed: ObservedProcesses) -> Ob
         enclaves = moved.get(process.enclave, set()) - taken
         if len(enclaves) == len(moved.get(process.enclave, ())) == 1 and not process.shares:
             (name,) = enclaves
-            robot.shell.say(f"{name} was {process.enclave}: the policy has its nodes there now")
+            robot.shell.say(f"{name} was {process.enclave} before the policy moved its nodes")
             process = process._replace(enclave=name)
         renamed.append(process)
     return observed._replace(processes=renamed)
@@ -257,7 +257,9 @@ def _do(robot: LocalRobot, step: CommandStep) -> tuple[str, list[str]]:
         robot.shell.say_lines(messages)
     needed = shlex.quote(str(robot.requirements))
     if step.guards and VACUOUS.id in output:
-        robot.shell.say(f"`sros review` fails for a requirement that cannot fail: edit {needed}")
+        robot.shell.say(
+            f"`sros review` refuses a requirement that nothing can break: edit {needed}"
+        )
     if status:
         remedy = "; nothing was signed" if step.guards else ""
         if VIOLATED.id in output:
@@ -313,7 +315,10 @@ def _problems_of(robot: LocalRobot, state: CloseState, *, partial: bool) -> Iter
         yield f"{name} belongs to another machine, and a process runs in it here: stop it"
     for name in _enclaves_without_origin(robot):
         remove = f"rm -r {shlex.quote(str(enclave_path(robot.export, name)))}"
-        yield f"the export has {name}, which the keystore neither has nor revoked: {remove}"
+        yield (
+            f"the export has {name}, which is not in the keystore and was not revoked there: "
+            f"{remove}"
+        )
     yield from _user_problems(robot, state.observed)
     yield from _launch_problems(robot, state.observed)
     if not partial:

@@ -100,7 +100,8 @@ class ClosedProcess(NamedTuple):
         """The id of the process, or the ids that fit equally, as text; "" if it does not run."""
         if self.alike:
             return (
-                f"that of the processes {enumerated([*map(str, self.alike)])} which is this robot's"
+                f"one of the processes {enumerated([*map(str, self.alike)])} (sros cannot tell "
+                "which is this robot's)"
             )
         return f"process {self.pid}" if self.pid else ""
 

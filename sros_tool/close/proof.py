@@ -432,7 +432,7 @@ def _renamed_text(nodes: ObservedNodes, current: Observation | None, *, fails: b
         topics = sorted({(ros_use(pair.old)[1], ros_use(pair.new)[1]) for pair in pairs})
         private = tuple(f"{name}/" for name in renamed)
         if moved := [f"{old} as {new}" for old, new in topics if not old.startswith(private)]:
-            text += f", with {enumerated(moved)} (a name that does not move: write it absolute)"
+            text += f", with {enumerated(moved)} (write a name absolute if it must not move)"
         if fails:
             text += " (if the new name is another node: remove the unused rights from its profile)"
     _, without_profile = nodes.divide_by_profile(nodes.as_observed)

@@ -157,12 +157,12 @@ class RunningRobot:
         if process.environment.get(STRATEGY) != "Enforce":
             return f"no {STRATEGY}=Enforce in"
         if not enclave.is_there:
-            return f"without files{f' ({enclave.problem})' * bool(enclave.problem)} run"
+            return f"no files are there{f' ({enclave.problem})' * bool(enclave.problem)} for"
         names = [*newer_files(process, enclave)]
         newer = first_few(names, MOST_NAMES)
         if not newer:
             finding = next(zenoh_findings(process), None)
-            return f"not as the files say ({finding.text}) run" if finding else ""
+            return f"the files are not in force ({finding.text}) in" if finding else ""
         mode = enclave.file(KEY_FILE).mode
         readable = (
             f"others can read {KEY_FILE} (its mode is {mode:04o}): if anybody did, `sros renew "

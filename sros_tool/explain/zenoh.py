@@ -169,7 +169,8 @@ class ZenohAnswer:
     """The decision of Zenoh on a question about an enclave.
 
     ``text`` is the reason, as a clause.  ``checks`` are the decisions on the messages of the right
-    itself.  ``domains`` are the ROS domains that allow it, if several were asked about.
+    itself.  ``domains`` are the ROS domains in which the right is allowed, if several were asked
+    about.
     """
 
     enclave: str

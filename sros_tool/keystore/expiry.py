@@ -25,8 +25,8 @@ from sros_tool.wording import counted, first_few
 
 IF_EXPIRED = "If files that processes loaded have expired, restart all processes together."
 ONE_BY_ONE = (
-    "restart the processes one by one; processes before and after the restart communicate, as long "
-    f"as the files that they loaded are valid. {IF_EXPIRED}"
+    "restart the processes one by one; restarted processes communicate with all others, as long as "
+    f"the files that they loaded are valid. {IF_EXPIRED}"
 )
 """Which processes to restart together.
 

@@ -477,8 +477,8 @@ def _vacuous_finding(requirement: Requirement, why: Sequence[str], remedy: str =
 
 
 _GONE = (
-    "If the name is another one now, write this in the requirement, too. If nobody uses the name "
-    "any more, approve this in the review."
+    "If the name was changed, change it in the requirement, too. If nobody uses the name any more, "
+    "approve this in the review."
 )
 
 

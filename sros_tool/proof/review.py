@@ -144,7 +144,7 @@ _SETTINGS = re.compile(
 """A table of a keystore template or of requirements."""
 _LARGEST_SETTINGS = 1024 * 1024
 _PRIVATE_KEY_FOUND = (
-    "has a private key, which whoever can read the repository has now: replace the key, because "
+    "has a private key, which everybody who can read the repository has now: replace it, because "
     "its history keeps it"
 )
 _OK, _FOUND, _UNDECIDED = 0, 1, 2

@@ -225,7 +225,7 @@ def _link_text(link: Link, overlay: Overlay | None) -> str:
     if link.violates:
         text += ": breaks a requirement"
     if link.differs:
-        text += ": not for the equal units"
+        text += ": the equal units do not have this right"
     if overlay and link.mark is not OverlaySide.BOTH:
         text += f": {overlay.first if link.mark is OverlaySide.FIRST else overlay.second}"
     return f"{text}, {LEVEL_NAMES[link.level]}"
@@ -308,7 +308,9 @@ def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
     if any(link.violates for link in scene.links):
         rows.append(('<path class="link violates" d="M0 -4h40"/>', "breaks a requirement"))
     if any(link.differs for link in scene.links):
-        rows.append(('<path class="link differs" d="M0 -4h40"/>', "not for the equal units"))
+        rows.append(
+            ('<path class="link differs" d="M0 -4h40"/>', "the equal units do not have this right")
+        )
     if picture.overlay:
         rows.append(('<path class="link first" d="M0 -4h40"/>', picture.overlay.first))
         rows.append(('<path class="link second" d="M0 -4h40"/>', picture.overlay.second))
@@ -332,14 +334,16 @@ def _card_legend(picture: Picture, scene: Scene) -> Iterable[str]:
     if any(card.chosen for card in scene.cards):
         rows.append((_BOX.format("chosen"), "in focus: information goes to it from the left"))
     if any(card.lacks for card in scene.cards):
-        rows.append((_BOX.format("lacking"), "may be used by one side only"))
+        rows.append((_BOX.format("lacking"), "nobody may send it, or nobody may receive it"))
     if rows:
         yield _row(rows)
     for units in picture.equal[:_MOST_LABELS]:
         of_each = f"each of {len(units.members)} {units.what}s, which are equal but for their names"
         yield _row([("", f"{units.label}: {of_each}")])
     if any(word in line for word in OTHERS for card in scene.cards for line in card.lines):
-        yield _row([("", f"{{1 {OTHERS[0]} …}}: the same name of another one of them")])
+        yield _row(
+            [("", f"{{1 {OTHERS[0]} …}}: this name of one other robot, namespace or enclave")]
+        )
 
 
 _BOX = '<g class="card {}"><rect y="-11" width="34" height="14" rx="4"/></g>'
@@ -543,7 +547,7 @@ def _link_label(picture: Picture, link: Link) -> str:
     if link.violates:
         text += ": breaks a requirement"
     if link.differs:
-        text += ": not for the equal units"
+        text += ": the equal units do not have this right"
     if picture.overlay and link.mark is not OverlaySide.BOTH:
         side = picture.overlay.first if link.mark is OverlaySide.FIRST else picture.overlay.second
         text += f": {side}"

@@ -283,7 +283,7 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     assert f"lacks 1 right seen now (/listener subscribe /chatter); {remapped}" in again.out
     assert "-r /chatter:=/old/chatter, or the policy, --remap /old/chatter:=" in again.out
     assert (
-        "; if the node lacks it, restart the node with it, and watch again: "
+        "; if the node lacks this, restart the node with it, and watch again: "
         "sros close robot --for 1m;" in again.out
     )
     assert " otherwise, if a process should not have them, stop it, and run `sros c" in again.out
@@ -325,7 +325,8 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     shutil.copytree(robot.folder / "robot/export/enclaves/talker", robot.folder / LOST)
     said = robot.close("--apply", status=1).out
     assert (
-        f"the export has /lost, which the keystore neither has nor revoked: rm -r {LOST}\n" in said
+        "the export has /lost, which is not in the keystore and was not revoked there: "
+        f"rm -r {LOST}\n" in said
     )
     assert (robot.folder / LOST / "key.pem").exists()
     shutil.rmtree(robot.folder / LOST)
@@ -521,7 +522,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     robot.absent = {"/talker"}
     robot.more += (replace(robot.more[0], pid=14, command=("/opt/c",)),)
     ended = robot.close()
-    kept = "started by another command than observed, which sros keeps (to change it, watch the op"
+    kept = "runs by another command than the observed one, which sros keeps (to replace it, watch "
     assert (
         f"  /talker: {kept}" in ended.out and "sros remembers: cd /opt && /opt/b" not in ended.err
     )
@@ -977,7 +978,7 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     )
     assert f"{denied}; new, without a profile: /ghost_node in /listener; compared " in said
     renamed = "compared under a new name: /rear_camera as /nav/stern_camera, with /odom as /nav/o"
-    assert f"; {renamed}dom (a name that does not move: write it absolute)\n" in said
+    assert f"; {renamed}dom (write a name absolute if it must not move)\n" in said
     renamed_alone = policy.read_text()
     policy.write_text(
         renamed_alone.replace(">odom</topic>", ">odom</topic><topic>/odom</topic>", 1)
@@ -992,7 +993,7 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     with monkeypatch.context() as patched:
         patched.setattr(nodes, "audit", counted_audit)
         said = robot.close("--proof").out
-    assert f"yes: {talk}3 nodes with 57 endpoints as before" in said and f"{renamed}dom (a" in said
+    assert f"yes: {talk}3 nodes with 57 endpoints as before" in said and f"{renamed}dom (w" in said
     assert len(audits) == 2, "one of all possible names, one of the nodes"
     policy.write_text(renamed_alone)
     robot.close()
@@ -1049,7 +1050,7 @@ def test_a_node_that_was_restarted_without_its_namespace(robot: Robot) -> None:
     robot.nodes = (TALKER, LISTENER)
     said = robot.close("--for", "1s", status=1).out
     hint = "perhaps /listener is /left/listener, started without its namespace (-r __ns:=/left)"
-    assert f"; {hint}; if the node lacks it, restart the node with it, and watch again" in said
+    assert f"; {hint}; if the node lacks this, restart the node with it, and watch again" in said
     robot.nodes = (TALKER, left, ros_node("listener", "010f0000071200000000"))
     assert "without its namespace" not in robot.close("--for", "1s", status=1).out
 
@@ -1423,7 +1424,7 @@ def test_a_requirement_that_lost_its_right_is_told_before_a_review_fails(tmp_pat
         needed = f'[[only]]\npublish = ["/{name}"]\nenclaves = ["/a"]\n'
         (tmp_path / "requirements.toml").write_text(needed)
         preparation._do(robot, guard)
-        assert ("`sros review` fails for a requirement" in said[-1]) is told, said
+        assert ("`sros review` refuses a requirement" in said[-1]) is told, said
 
 
 def test_a_process_with_a_new_key_is_restarted_before_others(tmp_path: Path) -> None:
@@ -1535,7 +1536,7 @@ def test_an_enclave_that_gets_another_name_keeps_its_process(robot: Robot) -> No
     for file in (policy, robot.folder / "robot/requirements.toml"):
         file.write_text(file.read_text().replace('"/logger"', '"/mission"'))
     said = robot.close(status=1)
-    assert "/mission was /logger: the policy has its nodes there now\n" in said.err
+    assert "/mission was /logger before the policy moved its nodes\n" in said.err
     known = "/mission: process 4711, known by its process id, for the nodes /logger and /talker: "
     assert f"{known}--apply restarts talker.service\n" in said.out
     assert "named after" not in said.out

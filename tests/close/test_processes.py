@@ -73,7 +73,7 @@ def test_sros_does_not_choose_among_processes_that_fit_equally() -> None:
     twins = process(8, "talk"), process(9, "talk")
     now = talker.with_current_pid(RunningProcesses(twins), 0, Path("/export"))
     assert (now.pid, [*now.alike]) == (0, [8, 9])
-    assert now.pids_text == "that of the processes 8 and 9 which is this robot's"
+    assert now.pids_text == "one of the processes 8 and 9 (sros cannot tell which is this robot's)"
     secured = replace(twins[1], enclave=ProcessEnclave("/export", "/talker"))
     for seen in ((twins[0], secured), (secured, process(7, "talk"))):
         now = now.with_current_pid(RunningProcesses(seen), 0, Path("/export"))
@@ -219,7 +219,7 @@ def test_an_enclave_is_closed_only_if_all_its_processes_are(tmp_path: Path) -> N
         ((replace(fresh, user=4321),), "user 4321, who cannot read the files, runs"),
         (
             (replace(fresh, configuration=unread),),
-            "not as the files say ('/s.json5' cannot be read: odd) run",
+            "the files are not in force ('/s.json5' cannot be read: odd) in",
         ),
     ):
         running = RunningRobot(robot, RunningProcesses(processes))

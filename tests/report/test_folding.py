@@ -263,7 +263,7 @@ def test_names_without_the_other_side_are_marked_everywhere(tmp_path: Path) -> N
     said = ("publish", "subscribe", "serve", "call")
     assert all(f'<text class="small lack" x="32" y="34">nobody may {e}<' in svg for e in said)
     assert svg.count('class="card names lacking"') == 4
-    assert "may be used by one side only" in svg
+    assert "nobody may send it, or nobody may receive it" in svg
     open_to_all = sros("view", policy, "--template", "sros2", "--json").ok().out
     assert {name["lacks"] for name in json.loads(open_to_all)["names"]} == {
         "",
@@ -281,7 +281,7 @@ def test_the_verb_says_what_is_drawn_as_one(tmp_path: Path) -> None:
         "r5 differs from r1 … r12: it has /r5/base publish /r5/x\n"
     )
     assert "{r1…r12}: each of 11 namespaces, which are equal but for their names" in ended.out
-    assert "not for the equal units" in ended.out
+    assert "the equal units do not have this right" in ended.out
     assert "r1 … r12: 11 equal namespaces are drawn as one" in sros("view", policy).ok().out
     focus = sros("view", policy, "--focus", "/r5/odom", "--format", "svg").ok()
     assert "/r5/nav" in focus.out and "in focus" in focus.out

@@ -579,7 +579,7 @@ def test_what_all_names_have_in_common_is_said_once(
         page.click("#tab-names")
         assert page.locator("#names .link-button wbr").count() > 50
         titles = page.locator("#names .group b").all_inner_texts()
-        assert titles[0] == "Moves the robot, by name"
+        assert titles[0] == "Usually moves the robot:"
         assert titles[1:] == sorted(titles[1:]) and len(titles) > 5
     with opened(browser, mixed, "phone") as page:
         page.click("#tab-map")

@@ -23,7 +23,7 @@ export function rank(row) {
   return row.names.some(moves) ? (row.lacks ? 1 : 0) : row.all_send || row.all_receive ? 2 : row.lacks ? 4 : 3;
 }
 
-const GROUPS = ["Moves the robot, by name", "Moves the robot, by name", "Open to everybody"];
+const GROUPS = ["Usually moves the robot:", "Usually moves the robot:", "Open to everybody:"];
 
 // A test whether a row has a name that holds a text.  A label such as {r1…r9} stands for the name
 // of each equal unit; one of others, such as {1 other of r1…r9}, may stand for any of them.

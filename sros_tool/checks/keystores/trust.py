@@ -76,8 +76,9 @@ _REVOKE_AGAIN = (
 )
 _REVOKE_FIRST = (
     "The keystore was perhaps restored from a backup: the export's own list revokes certificates "
-    "that the keystore's does not. Unless they expired, first revoke them there again, with `sros "
-    f"crl KEYSTORE --refresh --crl FILE`. FILE is the export's crl.pem. {PEERS_ACCEPT.remedy}"
+    "that the keystore's list does not revoke. Unless they expired, first revoke them there again, "
+    "with `sros crl KEYSTORE --refresh --crl FILE`. FILE is the export's crl.pem. "
+    f"{PEERS_ACCEPT.remedy}"
 )
 PEERS_PROTECTION = FindingKind(
     "keystore.peers-protection",

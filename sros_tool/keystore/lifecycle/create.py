@@ -706,8 +706,8 @@ def _restart_text(mismatch: Mismatch, *, revoked: bool) -> str:
             which, more = "the processes that use these names", f" {IF_EXPIRED}"
             effect += f" on {', '.join(mismatch.names)}, but do on everything else"
         return (
-            f"Cyclone DDS and Fast DDS: restart {which} together; processes before and after the "
-            f"restart {effect}. Until then, running processes communicate as before.{more}"
+            f"Cyclone DDS and Fast DDS: restart {which} together; restarted and other processes "
+            f"{effect}. Until then, running processes communicate as before.{more}"
         )
     return f"All vendors: {ONE_BY_ONE} Until its restart, a process keeps its former files."
 

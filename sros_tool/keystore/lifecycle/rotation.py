@@ -284,8 +284,8 @@ def _restart_remarks(keystore: OpenedKeystore, rotation: Rotation) -> list[str]:
         f"Fast DDS: {hindrance} Restart all processes together."
         if hindrance
         else f"Fast DDS: {ONE_BY_ONE} Continue when all have been restarted.",
-        "Cyclone DDS: it trusts one CA at a time, so restart all processes together; processes "
-        "before and after the restart do not communicate.",
+        "Cyclone DDS: it trusts one CA at a time, so restart all processes together; restarted "
+        "and other processes do not communicate.",
     ]
     with suppress(SrosError):  # `check` finds settings that cannot be read
         if keystore.template.zenoh:
