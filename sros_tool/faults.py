@@ -499,3 +499,8 @@ VENDOR_FAULTS = (
     Fault.DOCUMENT_SIZE,
 )
 """The faults for which only some vendors refuse an enclave."""
+BEFORE_DDS = (Fault.FILE_MISSING, Fault.LINK_DANGLING, Fault.FILE_NO_FILE)
+"""Faults that end a process before DDS reads a file: the RMW checks first that all files exist.
+
+Source: rmw_dds_common of ROS 2 Jazzy (security.cpp); tested with rmw_fastrtps 8.4.
+"""

@@ -12,7 +12,7 @@ import click
 from sros_tool.checks.kind import all_kinds
 from sros_tool.keystore.template import load_template, settings_values, template_names
 from sros_tool.policy.model import Level
-from sros_tool.runtime.log_texts import LOG_TEXTS
+from sros_tool.runtime.log_texts import LOG_TEXTS, STARTS
 from tools.distributions_page import distributions_page
 from tools.page_parts import cell, page_text, table_text
 from tools.steps import CHECKOUT
@@ -97,9 +97,13 @@ def _log_texts() -> str:
         "The security messages of DDS vendors, rcl and the RMWs, and what each means. `sros "
         "explain KEYSTORE --log FILE` finds them in a log, and looks for the cause in the enclave. "
         "A text is a regular expression that is searched in a line.",
+        "`Found security directory` does not prove that a node is secured. Unless "
+        "`ROS_SECURITY_STRATEGY` is exactly `Enforce` (`Permissive` is the usual other value), a "
+        "node that lacks its enclave or one of its files then runs unsecured, and with Fast DDS "
+        "nothing else is logged. `sros check runtime` finds such processes.",
     ]
     by_vendor: dict[str, list[tuple[str, ...]]] = {}
-    for each in LOG_TEXTS:
+    for each in (*STARTS, *LOG_TEXTS):
         vendor = each.vendor.title if each.vendor else "rcl and RMWs, with every DDS"
         causes = [fault.title for fault in each.faults]
         meaning = each.cause or "; or ".join(causes) or "the text alone does not show a cause"

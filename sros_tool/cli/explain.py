@@ -1116,10 +1116,11 @@ def _text_without_findings(log: str) -> str:
             f"{_SILENT_ON_ZENOH}"
         )
     return (
-        f"the log shows nothing that was refused to a node in '{match['folder']}'. If it hears "
-        "nothing, peers may refuse it silently: explain their logs, too, and run `sros check "
-        "FOLDER OTHER` (CAs, revocation list, governance, domains) and `sros check runtime` "
-        "(clock) on both machines; on Zenoh, only logs with RUST_LOG=zenoh=trace have denials"
+        f"the log shows nothing that was refused to a node in '{match['folder']}'. If a file was "
+        "missing and the strategy was not Enforce, it runs open: `sros check runtime` on its "
+        "machine shows that, and the clock. If it hears nothing, peers may refuse it silently: "
+        "explain their logs, and run `sros check FOLDER OTHER` (CAs, revocation list, governance, "
+        "domains); on Zenoh, only logs with RUST_LOG=zenoh=trace have denials"
     )
 
 

@@ -38,6 +38,7 @@ from sros_tool.keystore.layout import (
     folder_of_closed_robot,
     is_original_keystore,
 )
+from sros_tool.keystore.loading import leaves_open
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, VendorParticipant
 from sros_tool.keystore.reader import OpenedKeystore, Problem
 from sros_tool.names import (
@@ -491,7 +492,10 @@ class Answer(NamedTuple):
                 entity = _CREATED.get(self.question.word, "it")
                 return f"DDS in the process itself: {entity} is not created"
             case _:
-                return "DDS in the process itself: no node of the enclave starts"
+                text = "DDS in the process itself: no node of the enclave starts"
+                if not leaves_open(self.problems):
+                    return text
+                return f"{text} with the strategy Enforce; with Permissive, each starts open"
 
     @property
     def rule(self) -> DecidingRule | None:

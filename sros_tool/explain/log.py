@@ -42,6 +42,7 @@ from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.keystore.known_keys import enclaves_by_identity
 from sros_tool.keystore.layout import ROUTER_FILE, is_keystore, is_original_keystore
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
+from sros_tool.keystore.loading import leaves_open
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import RightsSource, load_rights
@@ -62,8 +63,11 @@ from sros_tool.runtime.log_texts import (
     LET_ENTER_EXPORT,
     LET_ENTER_ORIGINAL,
     NO_ENCLAVE,
+    RAN_OPEN,
     RUNS_OPEN,
+    STARTS,
     UNKNOWN,
+    UNNOTICED_FAULT,
     LogText,
 )
 from sros_tool.runtime.vendor_log import (
@@ -332,6 +336,9 @@ def explain_log_of(
     def find(enclave: str) -> LoadedEnclave | None:
         if named is not None and enclave in ("", named.name):
             return named
+        # Without its certificate, an enclave's folder does not tell the name of the enclave.
+        if named and not named.name and str(Path(name).absolute()).endswith(f"/enclaves{enclave}"):
+            return named._replace(name=enclave)
         if policy is None and (keystore is None or not enclave):
             return None
         try:
@@ -387,9 +394,7 @@ def explain_log(
     reported = {denial.process for denial in denied}
     hits = _strongest_hits(_log_hits(_joined_lines(lines)), reported)
     findings = [
-        examiner.message(group)
-        for group in _grouped_hits(hits)
-        if examiner.is_security_message(group[0])
+        finding for group in _grouped_hits(hits) if (finding := examiner.message(group)) is not None
     ]
     lacking = examiner.missing_namespaces(denied)
     findings += [
@@ -455,8 +460,8 @@ def _log_hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
         process, rest = labeled_line(line)
         if named := SECURITY_DIRECTORY.search(line):
             enclaves[process] = named["enclave"] or "/"
-            if enclaves[process] == "/":
-                yield _Hit(number, " ".join(rest.split()), process, "/", RUNS_OPEN, {})
+            text = " ".join(rest.split())
+            yield _Hit(number, text, process, enclaves[process], RUNS_OPEN, {})
             continue
         if following and (rejoined := _rejoined_message(process, line, rest, following[0][1])):
             following.popleft()
@@ -666,19 +671,26 @@ class _Examiner:
         self._keystore = keystore
         self._evaluators: dict[tuple[Vendor, str], Evaluator] = {}
 
-    def is_security_message(self, hit: _Hit) -> bool:
-        """Return whether a hit is a security message; not `RUNS_OPEN` if the enclave / exists."""
-        return hit.meaning is not RUNS_OPEN or self._find("/") is None
+    def _meaning(self, hit: _Hit, enclave: LoadedEnclave | None) -> LogText | None:
+        """Return the meaning of a hit in its enclave; None if it is no security message."""
+        unnamed = hit.enclave == "/" and enclave is None
+        if hit.meaning is not RUNS_OPEN:
+            return NO_ENCLAVE if unnamed and hit.meaning.id == "files-missing" else hit.meaning
+        if enclave is None or self._policy:
+            return RUNS_OPEN if unnamed else None
+        problems = self._answer(enclave, Vendor.FAST, ask("join")).problems
+        if leaves_open(problems):
+            return RAN_OPEN
+        return UNNOTICED_FAULT if problems else None
 
-    def message(self, hits: list[_Hit]) -> LogFinding:
-        """Return the finding for one group of equal messages."""
-        first = hits[0]
-        meaning = first.meaning
+    def message(self, hits: list[_Hit]) -> LogFinding | None:
+        """Return the finding for one group of equal messages; None if they are no trouble."""
+        named = self._find(hits[0].enclave)
+        meaning = self._meaning(hits[0], named)
+        if meaning is None:
+            return None
+        first = replace(hits[0], meaning=meaning)
         vendor = vendor_of_line(first.text) if meaning is UNKNOWN else meaning.vendor
-        named = self._find(first.enclave)
-        if meaning.id == "files-missing" and first.enclave == "/" and named is None:
-            first = replace(first, meaning=NO_ENCLAVE)
-            meaning = NO_ENCLAVE
         remedy_of = self._with_names(meaning.remedy, named, first)
         plain = LogFinding(
             meaning.id,
@@ -713,6 +725,7 @@ class _Examiner:
             return replace(plain, enclave=enclave.name, found=_nodes(answer), checked=True)
         causes = causes or list(self._wrong_domain_cause(enclave, answer, first))
         remedies = list(dict.fromkeys(remedy for _, remedy in causes if remedy))
+        remedies += [remedy_of] * (meaning in STARTS)
         remedy = self._with_names(meaning.remedy_without_fault, enclave, first)
         nothing_found = f"{_nothing_found(enclave)} {remedy}".rstrip()
         return replace(

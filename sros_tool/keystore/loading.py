@@ -6,7 +6,7 @@ the faults that all vendors refuse; they are not checked here again.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import datetime, timedelta
 from functools import lru_cache
 from itertools import dropwhile
@@ -26,7 +26,7 @@ from sros_tool.dds.decision.vendors import (
     joined_titles,
 )
 from sros_tool.errors import PkiError
-from sros_tool.faults import Fault
+from sros_tool.faults import BEFORE_DDS, Fault
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
@@ -37,6 +37,7 @@ from sros_tool.keystore.layout import (
     KEY_URI_FILE,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
+    REQUIRED_FILES,
 )
 from sros_tool.keystore.reader import OpenedEnclave, Problem
 from sros_tool.pki import smime
@@ -83,12 +84,9 @@ _VENDOR_SPECIFIC = frozenset(
 _UNREADABLE = (Fault.NOT_SIGNED, Fault.CERTIFICATE_MALFORMED)
 CRASHES = (Fault.CA_CRASH, Fault.CERTIFICATE_CRASH)
 """Faults that crash a process."""
-BEFORE_DDS = (Fault.FILE_MISSING, Fault.LINK_DANGLING)
-"""Faults that end a process before DDS reads a file: the RMW checks first that all files exist."""
 _READ_FIRST = (IDENTITY_CA_FILE, CRL_FILE, CERTIFICATE_FILE)
 _ON_READING = (
     Fault.FILE_UNREADABLE,
-    Fault.FILE_NO_FILE,
     Fault.FILE_EMPTY,
     Fault.CERTIFICATE_MALFORMED,
     Fault.CERTIFICATE_FILE,
@@ -98,6 +96,18 @@ _ON_READING = (
 """Faults that a process meets before it verifies a chain."""
 _OF_CA = (Fault.SIGNATURE_HASH, Fault.CA_CHAIN)
 """Faults in the file of a CA that a process meets together with ``_ON_READING``."""
+
+
+def leaves_open(problems: Iterable[Problem]) -> bool:
+    """Return whether a process with these problems starts without security, except with Enforce.
+
+    It does if the RMW does not find a file that every enclave needs.
+    """
+    return any(
+        problem.fault is Fault.KEY_ON_TOKEN
+        or (problem.fault in BEFORE_DDS and problem.file in REQUIRED_FILES)
+        for problem in problems
+    )
 
 
 def vendor_problems(

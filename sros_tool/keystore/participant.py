@@ -37,14 +37,14 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance, render_governance
 from sros_tool.dds.permissions import Permissions, render_permissions
 from sros_tool.errors import SrosError
-from sros_tool.faults import Fault
+from sros_tool.faults import BEFORE_DDS, Fault
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
     KEY_FILE,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
 )
-from sros_tool.keystore.loading import BEFORE_DDS, CRASHES, vendor_problems
+from sros_tool.keystore.loading import CRASHES, vendor_problems
 from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, Problem, open_enclave
 from sros_tool.names import ROS_DISCOVERY_TOPIC
 from sros_tool.pki.certificates import (

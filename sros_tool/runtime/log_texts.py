@@ -14,7 +14,7 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.faults import Fault
+from sros_tool.faults import BEFORE_DDS, Fault
 from sros_tool.runtime.rmw import denial_trace_variables
 
 
@@ -90,11 +90,9 @@ _CRL_FAULTS = (
     Fault.REVOKED,
 )
 _FILE_FAULTS = (
-    Fault.FILE_MISSING,
+    *BEFORE_DDS,
     Fault.FILE_EMPTY,
     Fault.FILE_UNREADABLE,
-    Fault.FILE_NO_FILE,
-    Fault.LINK_DANGLING,
 )
 _KEY_FAULTS = (Fault.KEY_ENCRYPTED, Fault.KEY_MALFORMED)
 _SIGNATURE_FAULTS = (Fault.SIGNATURE, Fault.NOT_SIGNED)
@@ -781,11 +779,30 @@ NO_ENCLAVE = _log_text(
     refuses=RefusedObject.PARTICIPANT,
 )  # fmt: skip
 """The meaning of `files-missing` in a process that named no enclave."""
+_AFTER_START = "security directory: "
 RUNS_OPEN = _log_text(
-    "runs-open", _ROS, "",
+    "runs-open", _ROS, _AFTER_START,
     "no enclave is named for this process, so it gets the enclave /. If the keystore has no "
     "enclave /, the process does not start with ROS_SECURITY_STRATEGY=Enforce; with any other "
     "value, it RUNS UNSECURED without a further message",
     f"If the process runs, stop the process. Then {_NAME_ENCLAVE}", vagueness=4,
 )  # fmt: skip
-"""The meaning of rcl's line about the enclave /, in a log without an error after it."""
+"""The meaning of rcl's line about the enclave /, which is missing, without an error after it."""
+RAN_OPEN = _log_text(
+    "ran-open", _ROS, _AFTER_START,
+    "the enclave lacks a file, yet this log shows no refusal that sros knows: on DDS the node RAN "
+    "UNSECURED (ROS_SECURITY_STRATEGY is not exactly Enforce), unless the file went missing since",
+    "Start the node with `sros run KEYSTORE ENCLAVE -- COMMAND`, which runs a node secured or "
+    "not at all.",
+    (*BEFORE_DDS, Fault.KEY_ON_TOKEN), vagueness=4,
+)  # fmt: skip
+"""The meaning of rcl's line about an enclave that lacks a file, without an error after it."""
+UNNOTICED_FAULT = _log_text(
+    "unnoticed-fault", _ROS, _AFTER_START,
+    "the enclave has a fault, yet this log shows no refusal that sros knows: the fault came after "
+    "the start, only the peers of the node notice the fault, or the DDS of the node accepts it",
+    "Correct the fault, and start the node again.", _ALL_FAULTS, vagueness=4,
+)  # fmt: skip
+"""The meaning of rcl's line about an enclave with another fault, without an error after it."""
+STARTS = (RUNS_OPEN, RAN_OPEN, UNNOTICED_FAULT)
+"""The meanings of rcl's line about the enclave, by the state in which sros finds the enclave."""

@@ -6,6 +6,7 @@ import json
 import re
 import shlex
 import shutil
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from itertools import groupby
 from pathlib import Path
@@ -653,7 +654,8 @@ def test_nothing_found_is_said_of_what_was_read(tmp_path: Path) -> None:
         line = f"{found} security directory: /k/enclaves/talker\n"
         (tmp_path / "robot.log").write_text(line)
         ended = sros("explain", "--log", tmp_path / "robot.log").ok()
-        assert "nothing that was refused to a node in '/k/enclaves/talker'. If it" in ended.err
+        assert "nothing that was refused to a node in '/k/enclaves/talker'. If a" in ended.err
+        assert "the strategy was not Enforce, it runs open: `sros check runtime`" in ended.err
         assert len(ended.err) < 500
     for cause in ("CAs", "revocation list", "governance", "domains", "clock"):
         assert cause in ended.err
@@ -839,6 +841,59 @@ def test_no_enclave_for_everybody_is_advised(name: str, keystore: Path, tmp_path
     ended = sros("explain", keystore, "--log", log)
     assert "no enclave is named" not in ended.out
     assert ended.status == (0 if name.startswith("permissive") else 1)
+
+
+def start_log(folder: Path, enclave: str) -> Path:
+    """The log of a node that rcl started in an enclave, as with the strategy Permissive."""
+    log = folder / "start.log"
+    directory = folder / f"ks/enclaves{enclave}"
+    log.write_text(f"[INFO] [1.0] [rcl]: Found security directory: {directory}\n[INFO] [2.0] up\n")
+    return log
+
+
+def folder_in_place(file: Path) -> None:
+    file.unlink()
+    file.mkdir()
+
+
+@pytest.mark.parametrize(
+    ("file", "damage"),
+    [
+        ("permissions.p7s", Path.unlink),
+        ("key.pem", folder_in_place),
+        ("cert.pem", lambda file: (file.unlink(), file.symlink_to("nowhere"))),
+    ],
+)
+def test_a_node_that_started_without_a_file_ran_open(
+    file: str, damage: Callable[[Path], object], keystore: Path, tmp_path: Path
+) -> None:
+    """As rclpy of Jazzy does with the strategy Permissive: Fast DDS logs nothing about it."""
+    log = start_log(tmp_path, ENCLAVE)
+    assert sros("explain", keystore, ENCLAVE, "--log", log).status == 0
+    folder = Enclave(keystore).folder
+    damage(folder / file)
+    for words in ((keystore, ENCLAVE), (keystore,), (folder,)):
+        ended = sros("explain", *words, "--log", log)
+        assert ended.status == 1
+        assert "on DDS the node RAN UNSECURED" in ended.out
+        assert f"  found     {file}: " in ended.out
+        assert f"{ENCLAVE} -- COMMAND`, which runs a node secured or not at all" in ended.out
+    denied = log.read_text() + f"{FAST_LINE}rt/x topic not found in allow rule.\n"
+    assert "RAN UNSECURED" not in "".join(each.cause for each in explained(denied))
+    asked = sros("explain", keystore, ENCLAVE, "publish", "/x").out
+    assert "starts with the strategy Enforce; with Permissive, each starts open\n" in asked
+
+
+def test_a_fault_of_which_a_log_says_nothing_is_no_proof_of_an_open_node(
+    keystore: Path, tmp_path: Path
+) -> None:
+    (Enclave(keystore).folder / "cert.pem").write_text("garbage")
+    ended = sros("explain", keystore, ENCLAVE, "--log", start_log(tmp_path, ENCLAVE))
+    assert ended.status == 1
+    assert "the fault came after the start, only the peers" in ended.out
+    assert "  found     cert.pem: " in ended.out and "UNSECURED" not in ended.out
+    asked = sros("explain", keystore, ENCLAVE, "publish", "/x").out
+    assert "no node of the enclave starts\n" in asked
 
 
 def test_an_error_says_more_than_that_no_enclave_is_named() -> None:
