@@ -28,6 +28,7 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
 from sros_tool.policy.patterns import overlap
 from sros_tool.runtime.rmw import chosen_vendor
+from sros_tool.wording import counted
 
 
 class MovedEndpoint(NamedTuple):
@@ -255,3 +256,8 @@ def ros_use(endpoint: Endpoint) -> tuple[str, str]:
 def node_name(node: ObservedNode) -> str:
     """Return the full name of a node, with ``*`` for the part that changes with every start."""
     return f"{node.ns.rstrip('/')}/{stable_name(node.name)}"
+
+
+def nodes_text(nodes: Iterable[ObservedNode]) -> str:
+    """Return the number of nodes in words; a node that started several times counts once."""
+    return counted(len({*map(node_name, nodes)}), "node")

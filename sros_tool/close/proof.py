@@ -12,7 +12,7 @@ from typing import Any
 from sros_tool.checks.keystores.issued import STALE
 from sros_tool.checks.kind import NOTE, Finding
 from sros_tool.checks.processes import PROCESS_NOT_SEEN, process_findings
-from sros_tool.close.nodes import MovedEndpoint, ObservedNodes, node_name, ros_use
+from sros_tool.close.nodes import MovedEndpoint, ObservedNodes, node_name, nodes_text, ros_use
 from sros_tool.close.processes import ObservedProcesses
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot
 from sros_tool.close.state import (
@@ -219,8 +219,8 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
         return Proof(SILENCE, False, f"it sees {first_few(sorted(nodes), MOST_NAMES)}")
     if not hears:
         return Proof(SILENCE, None, "nor does the observer in its enclave see the robot now")
-    number = counted(len(before.nodes), "node")
-    return Proof(SILENCE, True, f"the observer that saw {number} before sees none")
+    seen = nodes_text(before.nodes)
+    return Proof(SILENCE, True, f"the observer that saw {seen} before sees none")
 
 
 def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
@@ -400,8 +400,9 @@ class _TalkComparison:
     def summary(self) -> str:
         """Return what was compared, what the policy denies now, and which nodes are new."""
         before = self._nodes.compared(self._away)
-        number = counted(len(before.nodes), "node")
-        text = f"{number} with {before.endpoint_count} endpoints as before (types are not compared)"
+        endpoints = len({*_endpoints_of(before.nodes)})
+        text = f"{nodes_text(before.nodes)} with {endpoints} endpoints as before (types are not "
+        text += "compared)"
         text += f", without {', '.join(sorted(self._away))}" if self._away else ""
         if denied := self._denied:
             text += f", but for {counted(len(denied), 'right')} that the policy denies now: "

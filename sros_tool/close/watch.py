@@ -16,7 +16,7 @@ from sros_tool.close.assignment import (
     process_ids_of_cyclone,
     with_command_of_unit,
 )
-from sros_tool.close.nodes import ObservedNodes, node_name
+from sros_tool.close.nodes import ObservedNodes, node_name, nodes_text
 from sros_tool.close.processes import ObservedProcesses
 from sros_tool.close.robot import MOST_NAMES, LocalRobot
 from sros_tool.close.state import RunningRobot
@@ -106,7 +106,7 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
     _remember(robot, document, observed)
     _say_variables(running, observed)
     number = counted(len(observed.processes), "process", "processes")
-    robot.shell.say(f"saw {counted(len(nodes), 'node')}, and {number} of this machine")
+    robot.shell.say(f"saw {nodes_text(nodes)}, and {number} of this machine")
     if others := running.in_other_domains():
         robot.shell.say(others)
     if os.path.lexists(robot.observed_policy):  # a file of an earlier watch

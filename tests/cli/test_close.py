@@ -392,6 +392,10 @@ def renew_without_hands(robot: Robot) -> None:
 def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     robot.units, robot.spelled = UNITS, "systemd/../robot/export"
     robot.close()
+    seen = robot.folder / "robot/observed.json"
+    twice = json.loads(seen.read_text())
+    twice["nodes"].append({**twice["nodes"][0], "participant": "of an earlier start"})
+    seen.write_text(json.dumps(twice))
     closed = robot.close("--apply")
     assert robot.restarts == ["daemon-reload", "restart listener.service talker.service"]
     assert closed.out.splitlines()[-5:] == [
@@ -1158,7 +1162,8 @@ def test_tools_that_ended_while_sros_watched(robot: Robot, monkeypatch: pytest.M
     seen = {7: ("/opt/tool", "a b"), 9: ("/opt/job",), 10: ("ros2", "topic", "list")}
     origins = {9: ProcessOrigin("job.service", "/opt")}
     find_origins(monkeypatch, lambda pid: origins.get(pid, ProcessOrigin("", "/opt")))
-    run, left = close._run, json.dumps([f"{node[3]}0000" for node in (tool, look, job)])
+    again = ros_node("job", "010f0000060000000000", "publish rt/job")
+    run, left = close._run, json.dumps([f"{node[3]}0000" for node in (tool, look, job, again)])
 
     def ran(words: Any, live: bool) -> tuple[int, str, str]:
         robot.more = tuple(
@@ -1170,8 +1175,9 @@ def test_tools_that_ended_while_sros_watched(robot: Robot, monkeypatch: pytest.M
         return status, output.replace('"ended": []', f'"ended": {left}'), messages
 
     monkeypatch.setattr(close, "_run", ran)
-    robot.nodes = (TALKER, LISTENER, tool, look, job)
+    robot.nodes = (TALKER, LISTENER, tool, look, job, again)
     ended = robot.close("--for", "1s")
+    assert "\nsaw 5 nodes, and " in ended.err
     run_it = f"sros run {robot.folder / 'robot/export'}"
     assert f"  /look: has ended, start it with: {run_it} /look -- COMMAND\n" in ended.out
     assert "  /tool: has ended: by hand\n" in ended.out
