@@ -688,8 +688,8 @@ def test_a_publishing_folder_teaches_nothing_that_the_cas_did_not_sign(publisher
     folder = publisher.pub / "targets/robots"
     for number, content in enumerate((certificate, own)):
         files = {"enclaves/r2/base/cert.pem": content}
-        (seal,) = seal_releases([("r2", 999, files)], publisher.permissions_ca())
-        data = pack_release(Release("r2", 999, files, seal))
+        (seal,) = seal_releases([("r2", 1, files)], publisher.permissions_ca())
+        data = pack_release(Release("r2", 1, files, seal))
         (folder / f"{hashlib.sha256(data).hexdigest()}.r2.tar.gz").write_bytes(data)
         (folder / f"{number:064x}.r5.tar.gz").write_bytes(b"x")
     before = len(OpenedKeystore(publisher.root).ledger.entries)
@@ -1162,6 +1162,33 @@ def test_a_restored_keystore_never_brings_back_a_ca_that_was_replaced(
     replace_cas(later if has_key else {})
     assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
     assert (authorities() == later) is has_key
+
+
+@pytest.mark.parametrize("is_replaced", [True, False])
+def test_a_key_that_was_replaced_after_a_rotation_is_not_certified_again(
+    publisher: Home, is_replaced: bool
+) -> None:
+    """The new certificate is from a CA that the keystore has lost, as is what that CA revoked."""
+
+    def rotate() -> None:
+        publisher.run("rotate_ca", "ks", "--identity", "--finish", "--allow-unconfirmed")
+
+    publisher.publish()
+    backup = copy_of(publisher.root, publisher.folder / "backup")
+    rotate()
+    publisher.publish()
+    replace = ("--new-key", "--revoke-old") if is_replaced else ()
+    publisher.run("renew", "ks", "/r2/base", *replace)
+    publisher.publish()
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    rotate()
+    if is_replaced:
+        for _ in range(2):
+            with pytest.raises(KeystoreError, match="after the backup, /r2/base got another key"):
+                publisher.publish(restored=True)
+        publisher.run("renew", "ks", "/r2/base", *replace)
+    assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
 
 
 @pytest.mark.parametrize("steps", [(0, 1), (1, 3)])

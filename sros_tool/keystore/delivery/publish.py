@@ -85,6 +85,7 @@ from sros_tool.pki.certificates import (
     authority_key,
     authority_text,
     digest,
+    key_digest,
     load_certificates,
     validity_of,
 )
@@ -113,6 +114,8 @@ _ROLES = ("root", "targets", "snapshot", "timestamp")
 _ONLINE = _ROLES[1:]
 """The roles whose keys have to be in the keystore."""
 _METADATA, _TARGETS, _ARCHIVES = "metadata", "targets", "targets/robots"
+_MOST_NAMES = 3
+"""Maximum number of enclaves that a message names."""
 _KEPT = timedelta(days=2)
 """How long unused files stay: robots may be in the middle of an update."""
 _OURS = re.compile(
@@ -668,6 +671,7 @@ class _Run:
             else:
                 self._notes.append(self._not_shown_note())
             self._restore(forgotten, keyring)
+            self._check_replaced_keys()
         if not (is_later and self._dry_run):  # which has not revoked again
             self._check_removed()
         if is_lost or restored:
@@ -793,7 +797,7 @@ class _Run:
                 if robot not in known or release.number > known[robot].release.number
             ]
             raise self._restored_error(
-                f"has later releases: {first_few(robots, 3)}, up to the number {latest}",
+                f"has later releases: {first_few(robots, _MOST_NAMES)}, up to the number {latest}",
                 f"repeat the later changes, and add --restored to {self._command}, which "
                 "revokes again what these releases revoke",
             )
@@ -814,7 +818,7 @@ class _Run:
             if removed := [robot for robot in gone if self._enclaves(fleet, robot)]:
                 revoke = f"sros revoke {quote(str(self.keystore.root))} --robot {removed[0]}"
                 raise self._restored_error(
-                    f"was published later without {first_few(removed, 3)}",
+                    f"was published later without {first_few(removed, _MOST_NAMES)}",
                     f"repeat the revocations (`{revoke}`), remove robots that left the fleet from "
                     "the fleet file, and publish again",
                 )
@@ -937,6 +941,48 @@ class _Run:
                 )
         self._notes += revocation.notes
 
+    def _check_replaced_keys(self) -> None:
+        """Refuse to certify the earlier key of an enclave whose last release has another one.
+
+        The seal shows it even if the keystore has lost the identity CA of that release.
+        """
+        last = {
+            release.robot: release
+            for release in sorted(self._sealed_releases(), key=lambda release: release.number)
+        }
+        replaced = sorted(
+            name
+            for release in last.values()
+            for name, files in release.enclaves().items()
+            if self._has_earlier_key(name, files.get(CERTIFICATE_FILE, b""))
+        )
+        if replaced:
+            names = " ".join(map(quote, replaced))
+            raise KeystoreError(
+                f"'{self._folder}' cannot be published yet: after the backup, "
+                f"{first_few(replaced, _MOST_NAMES)} got another key, and the keystore has only "
+                "the earlier one",
+                "Whoever has the earlier key could be trusted again.",
+                "Give these enclaves new keys: "
+                f"`sros renew {quote(str(self.keystore.root))} {names} --new-key --revoke-old`; "
+                "for keys that were made on the robot, `sros revoke` the enclaves, and sign the "
+                "requests again. Then repeat this command, with --restored.",
+            )
+
+    def _has_earlier_key(self, name: str, sent: bytes) -> bool:
+        """Return whether the keystore's key of an enclave is older than that of a certificate."""
+        with suppress(SrosError):  # without a certificate on one side, no key was replaced
+            later, own = load_certificates(sent, name)[0], self.keystore.certificate_of(name)
+            keys = [key_digest(each.public_key()) for each in (later, own)]  # type: ignore[arg-type]
+            issued = [
+                entry.not_before
+                for entry in self.keystore.ledger_file.with_values("enclave", [name]).entries
+                if entry.what == "certificate" and entry.key == keys[1]
+            ]
+            began, later_began = (iso(validity_of(each).not_before) for each in (own, later))
+            return keys[0] != keys[1] and min(began, *issued) < later_began
+        return False
+
     def _unknown_releases(self) -> list[Release]:
         """Return the sealed releases, by number, that the keystore does not know, or whose list.
 
@@ -992,7 +1038,7 @@ class _Run:
         if foreign:
             raise KeystoreError(
                 f"'{self._folder}' has releases that no CA of the keystore '{self.keystore.root}' "
-                f"sealed: {first_few(sorted(foreign), 3)}",
+                f"sealed: {first_few(sorted(foreign), _MOST_NAMES)}",
                 "Another keystore published them, or this keystore was restored from a backup from "
                 "before its permissions CA was replaced: publishing would undo later changes, such "
                 "as a revocation.",
@@ -1007,7 +1053,8 @@ class _Run:
         if not self._published_before:
             end = "publish again, and give agents the new root metadata (`sros agent init --force`)"
         return self._restored_error(
-            f"has releases that the keystore's CA sealed: {first_few(robots, 3)}, up to the number "
+            "has releases that the keystore's CA sealed: "
+            f"{first_few(robots, _MOST_NAMES)}, up to the number "
             f"{unknown[-1].number}",
             f"first run `sros fleet collect {where} INBOX`, because messages of robots show what "
             f"was revoked; revoke again what else was revoked (`sros revoke {where} --robot "
