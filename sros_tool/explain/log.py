@@ -727,7 +727,7 @@ class _Examiner:
         remedies = list(dict.fromkeys(remedy for _, remedy in causes if remedy))
         remedies += [remedy_of] * (meaning in STARTS)
         remedy = self._with_names(meaning.remedy_without_fault, enclave, first)
-        nothing_found = f"{_nothing_found(enclave)} {remedy}".rstrip()
+        nothing_found = f"{remedy} {_nothing_found(enclave)}".lstrip()
         return replace(
             plain,
             enclave=enclave.name,
@@ -1194,7 +1194,7 @@ def _listed_nodes(nodes: Sequence[str]) -> str:
 
 def _nothing_found(enclave: LoadedEnclave) -> str:
     return (
-        f"Enclave {enclave.name} now has no fault that would explain it: "
+        f"Enclave {enclave.name} now has no fault that would explain the message: "
         "check the files on the robot itself, its clock and its time zone."
     )
 

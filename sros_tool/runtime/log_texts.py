@@ -417,6 +417,7 @@ _CYCLONE_START_TEXTS = (
         "file-missing", _CYCLONE, r"File could not be found, opened or is empty, path: "
         r"(?P<path>\S+)",
         "the file {path} is missing, empty or not readable", "Restore the file.", _FILE_FAULTS,
+        remedy_without_fault=_MAKE_READABLE,
     ),
     _log_text(
         "peer-refused", _CYCLONE, r"Remote secure participant \S+ not allowed"

@@ -148,7 +148,7 @@ def test_the_true_cause_is_found_in_the_enclave(breakage: str, log: Path, keysto
         assert "the governance is for domain 0: the process was in " in whole.out
     else:
         assert "\n  found " not in whole.out
-        assert "has no fault that would explain it" in whole.out
+        assert "has no fault that would explain the message" in whole.out
     BREAKAGES[breakage](Enclave(keystore))
     broken = sros(*asked)
     assert broken.status == 1
@@ -197,7 +197,7 @@ def test_a_governance_as_plain_xml_is_not_mended_by_permissions(keystore: Path) 
     assert "create_permission" not in found
     command = re.findall("`(openssl .+?)`", found)[0]
     in_shell(command)
-    assert "has no fault that would explain it" in sros(*asked).out
+    assert "has no fault that would explain the message" in sros(*asked).out
 
 
 def test_the_remedy_for_a_ca_that_expired_does_not_presume_a_rotation(tmp_path: Path) -> None:
@@ -207,7 +207,7 @@ def test_the_remedy_for_a_ca_that_expired_does_not_presume_a_rotation(tmp_path: 
     assert "identity_ca.cert.pem: it expired" in found
     command = re.findall("`(sros rotate_ca .+?)`", found)[0]
     in_shell(command)
-    assert "has no fault that would explain it" in sros(*asked).out
+    assert "has no fault that would explain the message" in sros(*asked).out
 
 
 def test_during_a_rotation_the_remedy_is_its_next_stage(keystore: Path) -> None:
@@ -337,6 +337,24 @@ def test_cyclone_says_nothing_of_a_whole_enclave(keystore: Path, tmp_path: Path)
 )
 def test_without_a_keystore(file: str, ids: list[str]) -> None:
     assert [each.id for each in explained((LOGS / file).read_text())] == ids
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        f"{FAST_LINE}OpenSSL library cannot read file %s",
+        f"{FAST_LINE}Cannot read file file://%s",
+        f"{CYCLONE_LINE}File could not be found, opened or is empty, path: %s",
+    ],
+)
+def test_a_file_that_only_the_user_of_the_node_cannot_read_is_the_first_suspect(
+    line: str, keystore: Path, tmp_path: Path
+) -> None:
+    key = Enclave(keystore).folder / "key.pem"
+    (tmp_path / "robot.log").write_text(line % key)
+    ended = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "robot.log")
+    assert "  remedy    Allow the user of the node to read the file" in ended.out
+    assert f"can be read. Enclave {ENCLAVE} now has no fault" in ended.out
 
 
 @pytest.mark.parametrize(
