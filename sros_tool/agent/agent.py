@@ -114,7 +114,9 @@ _REPAIRED_FOR = timedelta(days=1)
 """How long the agent reports that it replaced files which differed from the release."""
 _BRING_KEY = (
     " A release has no keys: bring the key as at the first delivery, with `sros "
-    "distribute_key KEYSTORE --robot {} DIR --force` in the keystore."
+    "distribute_key KEYSTORE --robot {} DIR --force` in the keystore. If the keystore does not "
+    "have the key, because it was made on a robot: if this computer was replaced, switch it off; "
+    "otherwise make a new key, as for new hardware (docs/howto/one_robot.md)."
 )
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _Answer = TypeVar("_Answer")

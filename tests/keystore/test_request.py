@@ -235,10 +235,12 @@ def test_a_request_for_an_existing_enclave_is_refused(
     sign(home, robot)
     thief = create_request(tmp_path / "thief", NAME)
     before = snapshot(home)
-    with pytest.raises(KeystoreError, match="already exists"):
+    with pytest.raises(KeystoreError, match=f"already exists.*`sros revoke .* {NAME}`.* --enclave"):
         sign_request(home, thief.file.read_bytes(), now=NOW)
+    with pytest.raises(KeystoreError, match=r"already exists.*add --renew;"):
+        sign_request(home, request_of(robot), now=NOW)
     base = create_request(tmp_path / "thief", "/base")
-    with pytest.raises(KeystoreError, match="has another key"):
+    with pytest.raises(KeystoreError, match=r"has another key.*, without --renew"):
         sign_request(home, base.file.read_bytes(), now=NOW, renew=True)
     assert snapshot(home) == before
     (note,) = sign_request(home, thief.file.read_bytes(), now=NOW, renew=True).notes

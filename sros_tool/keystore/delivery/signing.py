@@ -378,7 +378,7 @@ class _Signer:
         change, root, name = self._change, self._root, request.name
         known, authority = change.known, change.permissions.certificate
         stated = self._stated_rights[name].enclave
-        _check_name(change.keystore, name, renew)
+        _check_name(change.keystore, request, renew)
         if stated is not None:
             refuse_less_protected(change.keystore, change.governance, stated_protections([stated]))
         present = change.keystore.certificate_of(name) if renew else None
@@ -496,13 +496,19 @@ def _check_free(answer: Path, force: bool) -> None:
         )
 
 
-def _check_name(keystore: OpenedKeystore, name: str, renew: bool) -> None:
+def _check_name(keystore: OpenedKeystore, request: SigningRequest, renew: bool) -> None:
+    name = request.name
     exists = keystore.has_enclave(name)
     if exists and not renew:
+        intended = (
+            "add --renew"
+            if _is_certified(keystore, request)
+            else f"for example because the robot has new hardware, first {_revoke(keystore, name)}"
+        )
         raise KeystoreError(
             f"enclave {name} already exists in keystore '{keystore.root}'",
             "The sender of the request would get the rights of this enclave.",
-            "If that is intended, add --renew; otherwise create the request for another name.",
+            f"If that is intended, {intended}; otherwise create the request for another name.",
         )
     if renew and not exists:
         raise KeystoreError(
@@ -546,8 +552,16 @@ def _check_same_key(
         raise KeystoreError(
             f"enclave {request.name} has another key in keystore '{root}'",
             f"Its {path.name} would not fit a certificate for the key in the request.",
-            f"Revoke the enclave first, with `sros revoke {quote(str(root))} {request.name}`.",
+            f"First {_revoke(keystore, request.name)}, without --renew.",
         )
+
+
+def _revoke(keystore: OpenedKeystore, name: str) -> str:
+    """Return the words for how an enclave gets a key that its robot made."""
+    return (
+        f"revoke the old key with `sros revoke {quote(str(keystore.root))} {name}` (or, with "
+        f"--robot, all keys of its robot), and then repeat this command with --enclave {name}"
+    )
 
 
 def _check_result(answer: RequestAnswer, request: SigningRequest, now: datetime) -> None:
