@@ -40,7 +40,16 @@ from sros_tool.graph.observation import (
 from sros_tool.keystore.expiry import renewal_command, survey
 from sros_tool.keystore.layout import list_enclaves
 from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.keystore.rights import load_rights
 from sros_tool.names import expand, is_expression
+from sros_tool.policy.model import ALLOW
+from sros_tool.policy.patterns import overlap
+from sros_tool.policy.rights import (
+    Right,
+    RightsDifference,
+    lost_counterpart_text,
+    rights_without_counterpart,
+)
 from sros_tool.proof.requirements import Must, read_requirements
 from sros_tool.runtime.environment import ROS_ARGS, named_enclave
 from sros_tool.runtime.variables import ENCLAVE
@@ -407,6 +416,8 @@ class _TalkComparison:
         if denied := self._denied:
             text += f", but for {counted(len(denied), 'right')} that the policy denies now: "
             text += ", ".join(f"{right.right.enclave} {right.right.describe()}" for right in denied)
+            lost = _without_counterpart(self._running.robot, [right.right for right in denied])
+            text += f"; {first_few(lost, MOST_NAMES, '; ')}" if lost else ""
         known = {*map(node_name, before.nodes)}
         with_profile, without_profile = self._nodes.divide_by_profile(self.current.nodes)
         new = sorted(
@@ -421,6 +432,23 @@ class _TalkComparison:
             text += f"; not compared: {first_few(new, MOST_NAMES)} (new; compared once "
             text += f"{_watch_again(self._nodes)})"
         return text
+
+
+def _without_counterpart(robot: LocalRobot, denied: Sequence[Right]) -> list[str]:
+    """Return clauses on the rights that nobody answers now that the rights ``denied`` are gone."""
+    now = load_rights(robot.rights_source).rights
+    before = [
+        right
+        for right in now
+        if not any(
+            right._replace(qualifier=ALLOW, name=gone.name) == gone
+            and overlap(right.name, gone.name)
+            for gone in denied
+        )
+    ]
+    difference = RightsDifference(tuple(denied), (), {})
+    lost = rights_without_counterpart([*before, *denied], now, difference)
+    return [*map(lost_counterpart_text, lost)]
 
 
 def _renamed_text(nodes: ObservedNodes, current: Observation | None, *, fails: bool) -> str:

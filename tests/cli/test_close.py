@@ -296,7 +296,8 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     robot.remaining = (TALKER, ros_node("listener", "04"))
     said = robot.close("--apply").out
     assert "(types are not compared), but for 1 right that the policy denies now: " in said
-    assert "denies now: /listener subscribe topic /chatter\n" in said
+    alone = "/talker may publish /chatter, but no enclave may subscribe to it any more"
+    assert f"denies now: /listener subscribe topic /chatter; {alone}\n" in said
 
 
 LOST = "robot/export/enclaves/lost"

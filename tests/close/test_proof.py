@@ -17,6 +17,7 @@ from sros_tool.close.proof import (
     _lonely_endpoints,
     _proof_of_requirements,
     _unseen_text,
+    _without_counterpart,
 )
 from sros_tool.explain.audit import DeniedRight
 from sros_tool.graph.observation import Endpoint, make_observation
@@ -27,6 +28,7 @@ from sros_tool.policy.rights import Right
 from sros_tool.runtime.processes import Process, ProcessEnclave
 from sros_tool.validity import Window
 from tests.close.test_assignment import node
+from tests.support.harness import policy_text, publish
 
 
 def test_a_name_that_moved_leaves_nobody_alone() -> None:
@@ -163,3 +165,20 @@ def test_expired_files_are_named_with_the_keystore_that_renews_them(
         f"{begin}{then}",
     ]
     assert f"{begin}renew them where the keystore is (`sros renew KEYSTORE --all" in told[2]
+
+
+def test_listeners_of_what_nobody_may_send_any_more_are_named(tmp_path: Path) -> None:
+    """Twin: another enclave may send it; where a DENY refuses it, the DENY is what is new."""
+    hears = '<topics subscribe="ALLOW"><topic>/depth</topic></topics>'
+    denies = f'{publish("/*")}<topics publish="DENY"><topic>/depth</topic></topics>'
+    gone = Right("/altimeter", ALLOW, "publish", "/depth")
+    robot: Any = SimpleNamespace(rights_source=tmp_path / "policy.xml")
+    for own, other, alone in (
+        (publish("/depth_m"), "", True),
+        (denies, "", True),
+        (publish("/depth_m"), publish("/depth"), False),
+    ):
+        enclaves = {"/altimeter": own, "/autopilot": hears, "/other": other}
+        robot.rights_source.write_text(policy_text(enclaves))
+        named = "/autopilot may subscribe /depth, but no enclave may publish it any more"
+        assert _without_counterpart(robot, [gone]) == [named] * alone, own
