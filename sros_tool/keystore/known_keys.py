@@ -428,12 +428,19 @@ class KnownKeys:
         return key in self._revoked
 
     def refuse_revoked(
-        self, key: PublicKey, holder: str, remedy: str, certificate: x509.Certificate | None = None
+        self,
+        key: PublicKey,
+        holder: str,
+        remedy: str,
+        certificate: x509.Certificate | None = None,
+        *,
+        publish_first: bool = True,
     ) -> None:
         """Raise `KeystoreError` if ``key`` was revoked; ``holder`` names its holder in the error.
 
         ``certificate`` is the current certificate for the key: a backup may have restored a revoked
-        certificate.
+        certificate.  With ``publish_first``, what only published lists revoke has the remedy to
+        publish with --restored, which is refused until CAs that were replaced are replaced again.
         """
         revoked = self._revoked.get(key_digest(key))
         if certificate and certificate.serial_number in self._revoked_serials:
@@ -448,7 +455,7 @@ class KnownKeys:
                 read_published,
             )
 
-            if may_have_later_releases(self._keystore):
+            if publish_first and may_have_later_releases(self._keystore):
                 folder = quote(read_published(self._keystore).folder)
                 publish = f"sros fleet publish {quote(str(self._keystore.root))} {folder}"
                 remedy = f"First run `{publish} --restored`, which takes this list over."

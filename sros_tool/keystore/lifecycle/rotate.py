@@ -834,8 +834,12 @@ def _issuance(
                 "the identity CA of this keystore"
             )
         key: PublicKey = kept.public_key()  # type: ignore[assignment]
-        remedy = f"Renew it with `sros renew {quote(str(root))} {name} --new-key`, or revoke it."
-        change.known.refuse_revoked(key, f"enclave {name}", remedy, kept)
+        where = f"{quote(str(root))} {name}"
+        remedy = (
+            f"Revoke the enclave again, with `sros revoke {where}` (or, with --robot, all of its "
+            f"robot); to keep it, renew it with `sros renew {where} --new-key --revoke-old`."
+        )
+        change.known.refuse_revoked(key, f"enclave {name}", remedy, kept, publish_first=False)
         certificate = NewIdentity(kept.subject, key)
     rights = None
     if permissions and (folder / PERMISSIONS_FILE).exists():
