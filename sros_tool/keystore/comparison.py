@@ -1,4 +1,4 @@
-"""Compare two governances, or two settings of keystores: what permits more, what permits less."""
+"""Comparison of two governances, or two settings of keystores: what becomes looser or tighter."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Effect(StrEnum):
     LOOSER = "looser"
     TIGHTER = "tighter"
     LATER = "later"
-    """Changes nothing now: applies to files that are made later."""
+    """The change has no effect now, but applies to files that are made later."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +32,9 @@ class SettingChange:
     """A setting that changes."""
 
     effect: Effect
-    """``looser``: more is allowed; ``tighter``: less is allowed; ``later``: applies only to what
-    is made later."""
+    """``looser``: more is allowed; ``tighter``: less is allowed; ``later``: the change applies only
+    to files that are made later.
+    """
     key: str
     """Key of the setting in sros.toml, or ``domain``."""
     before: str
@@ -56,7 +57,7 @@ _PROPERTIES: dict[ProtectionKind, frozenset[str]] = {
         {"integrity", "secrecy", "origin"}
     ),
 }
-"""Properties that each protection kind gives a message (DDS-Security 1.1, 9.4.1.2.3)."""
+"""Maps a protection kind to the properties it gives messages (DDS-Security 1.1, 9.4.1.2.3)."""
 
 _LOSS = {
     "secrecy": "no longer encrypted",
@@ -101,7 +102,7 @@ _FLAG_WORDS = {
         "writing {} needs permissions",
     ),
 }
-"""For each flag of governance, the clauses for its open and its protecting value."""
+"""Maps a flag of governance to the clauses for its open value and its protecting value."""
 
 
 # ── governance ─────────────────────────────────────────────────────────────────────────────
@@ -110,8 +111,8 @@ _FLAG_WORDS = {
 def compare_governance(old: Governance, new: Governance) -> tuple[SettingChange, ...]:
     """Return the changes from governance ``old`` to ``new``, in ROS terms.
 
-    Only the first rule that matches a topic protects it, so rules are compared by the protection
-    that topics get, not by their text.
+    Only the first rule that matches a topic protects the topic.  So the comparison is of the
+    protection that topics get, not of the text of rules.
     """
     return tuple(dict.fromkeys(_governance_changes(old, new)))
 
@@ -155,16 +156,17 @@ def _rule_of(governance: Governance, domain: int) -> DomainRule:
 def _topic_pairs(
     old: DomainRule, new: DomainRule
 ) -> Iterator[tuple[str, TopicRule | None, TopicRule | None]]:
-    """Yield (topic expression, its old rule, its new rule) where the deciding rule differs.
+    """Yield (topic expression, old rule, new rule) for topics to which different rules apply.
 
     A rule is None if no rule of the domain covers the expression.
     """
     rules = (*old.topic_access_rules, *new.topic_access_rules)
     expressions = list(dict.fromkeys(rule.topic_expression for rule in rules))
-    # A name without wildcards is covered by what it overlaps with.
+    # If an expression overlaps a name without wildcards, it covers the name, so only wildcards
+    # matter here.
     for first, second in combinations(filter(is_expression, expressions), 2):
         parted = overlap(first, second) and not covers(first, second) and not covers(second, first)
-        # Which of the two decides depends on their order, so ask for a topic of both.
+        # The order of two overlapping rules decides, so a topic that both match is compared, too.
         if parted and (name := common_name((first, second), absolute=False)):
             expressions.append(name)
     before_of, after_of = _first_covering_rule(old), _first_covering_rule(new)
@@ -175,7 +177,7 @@ def _topic_pairs(
 
 
 def _first_covering_rule(domain: DomainRule) -> Callable[[str], TopicRule | None]:
-    """Return a function that returns the first rule that covers a topic expression, or None."""
+    """Return a function from a topic expression to the first rule that covers it, or None."""
     numbered = list(enumerate(domain.topic_access_rules))
     own = {rule.topic_expression: (number, rule) for number, rule in reversed(numbered)}
     wide = [(number, rule) for number, rule in numbered if is_expression(rule.topic_expression)]
@@ -200,9 +202,9 @@ def _equal(first: TopicRule, second: TopicRule) -> bool:
 
 
 def _key_and_name(expression: str) -> tuple[str, str]:
-    """Return the prefix of setting keys for a topic expression, and the topic's ROS name.
+    """Return the prefix of setting keys for a topic expression, and the ROS name with its kind.
 
-    The name comes with its kind, such as "service /add".
+    An example of the name is "service /add".
     """
     if expression == "*":
         return "protection.default", "everything without protection of its own"
@@ -259,10 +261,10 @@ class Mismatch:
     """Communication that fails between a process with the old governance and one with the new.
 
     Tested with Cyclone DDS 0.10.2, Fast DDS 2.9.1 and 2.14.5, which agree: two participants whose
-    domain rules differ in a protection kind do not communicate at all; two whose rules for a topic
-    differ do not communicate on that topic.  Differences in join access control, unauthenticated
-    participants and domains do no harm.  ``everything`` says that no communication works; ``names``
-    are the topics, services and actions, with ROS names, that do not work.
+    domain rules differ in a protection kind do not communicate at all.  Participants whose rules
+    for a topic differ do not communicate on this topic.  Differences in join access control,
+    unauthenticated participants and domains do no harm.  ``everything`` says that nothing is
+    communicated any more; ``names`` are the topics, services and actions (ROS names) that fail.
     """
 
     everything: bool = False
@@ -280,7 +282,7 @@ _DISTURBING = {
 
 
 def mismatch(old: Governance, new: Governance) -> Mismatch:
-    """Return which communication fails between processes with ``old`` and with ``new``."""
+    """Return the communication that fails between processes with ``old`` and with ``new``."""
     domains = [domain for domain in old.domains().closed() if domain in new.domains().closed()]
     names: dict[str, None] = {}
     pairs = dict.fromkeys((_rule_of(old, d), _rule_of(new, d)) for d in domains)
@@ -289,7 +291,8 @@ def mismatch(old: Governance, new: Governance) -> Mismatch:
             return Mismatch(everything=True)
         for expression, _, _ in _topic_pairs(old_rule, new_rule):
             if expression == "*":
-                return Mismatch(everything=True)  # also `ros_discovery_info`, which every node has
+                # This includes `ros_discovery_info`, which every node needs.
+                return Mismatch(everything=True)
             names[_key_and_name(expression)[1]] = None
     return Mismatch(names=tuple(names))
 
@@ -300,7 +303,7 @@ def mismatch(old: Governance, new: Governance) -> Mismatch:
 def compare_settings(old: Template, new: Template, now: datetime) -> tuple[SettingChange, ...]:
     """Return the changes between two settings of a keystore.
 
-    Changes of the protection of topics and of the names of CAs are not among them.
+    Left out are changes in the protection of topics and in the names of CAs.
     """
     return tuple(_settings_changes(old, new, now))
 
@@ -346,7 +349,7 @@ def _settings_changes(old: Template, new: Template, now: datetime) -> Iterator[S
 
 
 def _short_lived_changes(old: Template, new: Template) -> Iterator[SettingChange]:
-    """Yield the changes of settings for enclaves whose files expire earlier than others."""
+    """Yield the changes in the settings for short-lived enclaves."""
     lists = [
         {short_lived.name: short_lived.validity for short_lived in side.short_lived}
         for side in (old, new)
@@ -365,7 +368,7 @@ def _short_lived_changes(old: Template, new: Template) -> Iterator[SettingChange
 
 
 def _zenoh_changes(old: ZenohNetwork | None, new: ZenohNetwork | None) -> Iterator[SettingChange]:
-    """Yield the changes of a Zenoh network's settings; None: the keystore has no network."""
+    """Yield the changes between two Zenoh networks; None means that the keystore has no network."""
     if old is None or new is None:
         if old != new:
             first, second = (network.mode.value if network else "none" for network in (old, new))
@@ -421,7 +424,7 @@ _CHOICES = (
         ),
     ),
 )
-"""Settings with a few values: key, field, open value, and clauses for looser and tighter."""
+"""Settings with a few values: key, field, open value, and the clauses for looser and tighter."""
 
 
 def _choice_text(key: str, value: bool | str) -> str:
@@ -433,5 +436,5 @@ def _choice_text(key: str, value: bool | str) -> str:
 def _expiry_of_span(span: Span, now: datetime) -> datetime:
     try:
         return window(now, span).not_after
-    except UsageError:  # a fixed date that is over
+    except UsageError:  # a fixed date that has passed
         return now

@@ -1,9 +1,8 @@
-"""Confirmations of robots: the digests of the enclave files that a robot says it has, and its DDS.
+"""Confirmations of robots: the digests of a robot's enclave files, and its DDS.
 
-A confirmation proves nothing: whoever controls the robot can write anything into the confirmation.
-So sros reads confirmations as hostile input, only compares them with what the keystore knows, and
-opens no path in a confirmation.
-`sros_tool/schemas/confirmation.json` describes the format.
+A confirmation proves nothing, because whoever controls the robot can write anything into it.  So
+sros reads confirmations as hostile input, only compares them with what the keystore knows, and
+never opens a path from a confirmation.  `sros_tool/schemas/confirmation.json` describes the format.
 """
 
 from __future__ import annotations
@@ -53,18 +52,20 @@ _FORMAT = 1
 MAX_BYTES = 4 * 1024 * 1024
 """Largest size of a confirmation in bytes; enough for a robot with 4,000 enclaves."""
 LONGEST_REASON = 400
-"""Maximum number of characters of the reason for which a message is refused."""
+"""Maximum number of characters in the reason for refusing a message."""
 _MOST_REFUSALS = 64 * 1024 * 1024
-"""Largest size of the file of refused messages, in bytes; enough for 100,000 robots, each with the
-longest reason."""
+"""Largest size of the file of refused messages, in bytes; enough for 100,000 robots.
+
+Each of them can have the longest reason.
+"""
 MESSAGE_FILE = "confirmation.p7s"
-"""Name of a robot's signed message, in the folder of the robot in an inbox."""
+"""Name of a robot's signed message, in the robot's folder in an inbox."""
 CONFIRMED_FILES = (
     *(file for file in REQUIRED_FILES if file != KEY_FILE),
     *OPTIONAL_FILES,
     *ZENOH_FILES,
 )
-"""Names of the enclave files that a confirmation lists: all exported files but the key."""
+"""Names of the enclave files that a confirmation lists: all exported files except the key."""
 _CERTIFICATE_FILES = (CERTIFICATE_FILE, IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
 
 _KEYS = {"format", "robot", "time", "files"}
@@ -80,23 +81,23 @@ _OF_AGENT = (
     "requests",
     "crl",
 )
-"""Keys that only `sros agent` writes, except for ``crl_restart`` and ``problems``."""
+"""Keys that only `sros agent` writes, except ``crl_restart`` and ``problems``."""
 _OPTIONAL_KEYS = {"certificates", "restart", "dds", *_OF_AGENT}
 _CLOCK_TOLERANCE = timedelta(minutes=1)
 _MOST_BOOTS = 8
-_MOST_CERTIFICATES = 32  # in a file
+_MOST_CERTIFICATES = 32  # maximum number in a file
 _MOST_LIBRARIES, _MOST_UNSEEN = 100, 1_000_000
-_MOST_NUMBER = 2**53 - 1  # what every reader of JSON takes exactly
+_MOST_NUMBER = 2**53 - 1  # the largest number that every JSON reader reads exactly
 MOST_PROBLEMS, LONGEST_PROBLEM = 50, 300
 """Maximum number of problems in a confirmation, and of characters in a problem."""
 MOST_REQUESTS = 500
-"""Signing requests in a confirmation; the agent makes further requests in later ones."""
+"""Maximum number of signing requests in a confirmation; the agent sends others in later ones."""
 _LONGEST_REQUEST = 16 * 1024
 LONGEST_LIST = 1024 * 1024
 """Maximum number of characters of a revocation list in a confirmation."""
 _LIBRARY_VERSION = re.compile(r"\d{1,6}\.\d{1,6}\.\d{1,6}\Z", re.ASCII)
 _LIBRARY_PATH = re.compile(r"/[\w.+/ ?-]{1,199}\Z")
-"""Paths of plain characters; they are shown, and never opened."""
+"""Matches library paths of plain characters, which are only shown, never opened."""
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 _MOMENT = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z\Z")
 _REQUEST = re.compile(
@@ -109,12 +110,12 @@ _PEM = re.compile(rb"-----BEGIN CERTIFICATE-----([A-Za-z0-9+/=\s]*)-----END CERT
 
 
 class Seen(StrEnum):
-    """The place where a robot saw a DDS library."""
+    """Where a robot saw a DDS library."""
 
     PROCESS = "process"
-    """At least one running process has loaded it."""
+    """At least one running process has loaded the library."""
     INSTALLED = "installed"
-    """The library is installed, and no process that could be looked at has loaded it."""
+    """The library is installed, but no process that the robot could examine has loaded it."""
 
 
 class RobotLibrary(NamedTuple):
@@ -123,51 +124,51 @@ class RobotLibrary(NamedTuple):
     product: str
     """Name of the DDS, such as ``Fast DDS``."""
     version: str
-    """Version of the DDS in three numbers; empty if the name of the file does not show it."""
+    """Version of the DDS as three numbers; empty if the file name does not show the version."""
     path: str
     """Path of the library on the robot."""
     seen: Seen
-    """Whether a running process has loaded the library, or the library is only installed."""
+    """Whether a running process has loaded the library, or it is only installed."""
 
 
 class RobotDds(NamedTuple):
-    """The DDS of a robot, as the robot saw it."""
+    """The DDS of a robot, as reported by the robot."""
 
     libraries: tuple[RobotLibrary, ...]
     """The DDS libraries; an empty list if the robot saw none."""
     unseen: int
-    """Number of processes that could not be looked at, so that other libraries may be in use."""
+    """Number of processes that could not be examined, which may use other libraries."""
 
 
 class EnclaveExpiry(NamedTuple):
-    """When the files of an enclave on a robot expire; None for a file that cannot be read."""
+    """When the files of an enclave on a robot expire; None stands for an unreadable file."""
 
     certificate: datetime | None
     permissions: datetime | None
 
 
 class RunningFiles(StrEnum):
-    """The files that the running processes of an enclave have loaded, as the robot saw it."""
+    """The files that the running processes of an enclave have loaded, as reported by the robot."""
 
     CURRENT = "current"
     """All processes of the enclave that were seen have loaded the installed files."""
     EARLIER = "earlier"
-    """At least one process still has earlier files, or runs in the enclave from another folder."""
+    """At least one process still has earlier files, or runs in the enclave in another folder."""
     NOT_SEEN = "not_seen"
-    """No process of the enclave was seen: none runs, or its processes cannot be looked at."""
+    """No process of the enclave was seen: either none runs, or they cannot be examined."""
 
 
 class RobotClock(StrEnum):
     """The state of a robot's clock, as the robot reports it."""
 
     SYNCHRONIZED = "synchronized"
-    """The clock is set by a time service, as the kernel says."""
+    """A time service sets the clock, according to the kernel."""
     UNSYNCHRONIZED = "unsynchronized"
     """No time service has set the clock since the robot started."""
     BEHIND = "behind"
     """The clock is earlier than documents that the robot has already verified."""
     UNKNOWN = "unknown"
-    """The kernel does not tell."""
+    """The kernel gives no information."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,21 +176,22 @@ class Confirmation:
     """The enclave files that a robot says it has, its DDS, and the time of the robot's clock.
 
     ``files`` maps paths to the SHA-256 of the files.  ``certificates`` maps the paths of
-    certificate and CA files to the SHA-256 of each certificate (DER) in the file, in order; without
-    an entry, an earlier certificate in that file cannot be recognized.  ``dds`` is the DDS of the
-    robot; ``restart`` are the enclaves whose processes still have earlier files. Both are None if
-    the confirmation does not state them.
+    certificate and CA files to the SHA-256 of each certificate (DER) in the file, in order; if a
+    file has no entry, sros cannot recognize an earlier certificate in it.  ``dds`` is the DDS of
+    the robot; ``restart`` are the enclaves whose processes still have earlier files.  Both are None
+    if the confirmation does not state them.
 
-    The other parts come from `sros agent`, and are None in a confirmation of another program.
+    The other fields come from `sros agent`, and are None in a confirmation by another program.
     ``sequence`` is higher in each message of a robot.  ``release`` is the number of the installed
-    release; 0 for none.  ``expiry`` and ``running`` map enclaves to when their files expire, and to
-    the files that their processes have loaded.  ``crl_restart`` are the enclaves of ``restart``
-    whose processes may lack the revocation list, unless these are all: processes of the other
-    enclaves lack only their own new documents.  ``boot`` is a SHA-256 that changes with each start
-    of the computer.  ``problems`` are short sentences, and ``requests`` signing requests (PEM) for
-    certificates that expire.  ``crl`` is the newest revocation list (PEM) of each
-    identity CA on the robot, if these may differ from the lists that were published last: a
-    keystore that was restored from a backup learns its later revocations from them.
+    release; 0 for none.  ``expiry`` maps enclaves to the times at which their files expire, and
+    ``running`` maps enclaves to the files that their processes have loaded.  ``crl_restart`` are
+    the enclaves in ``restart`` whose processes may lack the revocation list; None stands for all of
+    them.  Processes of the other enclaves lack only their own new documents.  ``boot`` is a SHA-256
+    that changes with each start of the computer.  ``problems`` are short sentences, and
+    ``requests`` signing requests (PEM) for certificates that expire.  ``crl`` is the newest
+    revocation list (PEM) of each identity CA on the robot, if they may differ from the lists that
+    were published last.  From these lists, a keystore that was restored from a backup learns of its
+    later revocations.
     """
 
     robot: str
@@ -216,8 +218,9 @@ class Confirmation:
 
 KEY_NOT_HERE = "is not on this robot"
 OF_ANOTHER_KEY = "it does not belong to the enclave's key"
-"""The agent's message on an enclave for which a release needs another key than the robot has:
-there is no key on the robot, or the certificate is for another key.
+"""The agent's words if a release needs another key for an enclave than the robot has.
+
+The robot has no key, or the certificate is for another key.
 """
 
 
@@ -228,28 +231,28 @@ OF_OTHER_CA = "is not sealed by a CA that this robot trusts"
 OF_SAME_NUMBER = "of the installed release, but other files"
 """The agent's message on a release, or on published metadata, that the agent refuses."""
 COULD_NOT_START = "could not start"
-"""A robot's message on an enclave in which no process would start."""
+"""A robot's words if no process would start in an enclave."""
 
 
 def concerns_key(problem: str) -> bool:
-    """Return whether a problem of a robot is about a key, which no release can bring."""
+    """Return whether a robot's problem is about a key, which a release cannot contain."""
     is_of_key = is_unusable(problem) and KEY_FILE in problem
     return is_of_key or KEY_NOT_HERE in problem or OF_ANOTHER_KEY in problem
 
 
 def is_of_copy(problem: str) -> bool:
-    """Return whether a problem of an agent shows that its source may have an old copy."""
+    """Return whether an agent's problem shows that it may fetch from an old copy."""
     phrases = (OLDER_THAN_SEEN, OLDER_THAN_INSTALLED, OF_OTHER_CA)
     return any(phrase in problem for phrase in phrases)
 
 
 def is_unusable(problem: str) -> bool:
-    """Return whether a problem of a robot is that no process would start in an enclave."""
+    """Return whether a robot's problem is that no process would start in an enclave."""
     return f" {COULD_NOT_START}: " in problem
 
 
 def is_enclave_name(name: str) -> bool:
-    """Return whether ``name`` is that of an enclave, other than /."""
+    """Return whether ``name`` is the name of an enclave other than /."""
     try:
         return check_enclave_name(name) != "/"
     except InvalidNameError:
@@ -257,7 +260,7 @@ def is_enclave_name(name: str) -> bool:
 
 
 def enclave_of(path: str) -> str:
-    """Return the name of the enclave that the file at ``path`` of a keystore belongs to."""
+    """Return the name of the enclave to which the file at ``path`` in a keystore belongs."""
     return path.rpartition("/")[0].removeprefix(ENCLAVES) or "/"
 
 
@@ -271,17 +274,17 @@ def make_confirmation(
     now: datetime,
     unreadable: Callable[[str, Exception], None] | None = None,
 ) -> Confirmation:
-    """Return a confirmation of all enclaves in ``root``, a keystore or a robot's installed folder.
+    """Return a confirmation of all enclaves in ``root``, a keystore or a robot's security folder.
 
-    Folders that are not named like an enclave are left out: no process can run in them.
+    Folders without the name of an enclave are left out, because no process can run in them.
 
-    ``unreadable`` gets the name of each enclave of which a file cannot be read, and the error; the
-    confirmation leaves the enclave out.  Without it, the error is raised.
+    ``unreadable`` is called with the name of each enclave that has an unreadable file, and the
+    error; the confirmation leaves this enclave out.  Without ``unreadable``, the error is raised.
 
     Raises:
         DocumentError: ``robot`` is not a robot's name.
         KeystoreError: ``root`` is not a keystore, or a file in it is a link that leads out of it.
-        OSError: a file cannot be read; a confirmation without that file would be false.
+        OSError: a file cannot be read; a confirmation without this file would be false.
     """
     if problem := name_problem(robot):
         raise DocumentError(f"{robot!r} is not the name of a robot", problem)
@@ -307,13 +310,13 @@ def make_confirmation(
 
 
 def shortened_dds(dds: RobotDds) -> RobotDds:
-    """Return a DDS in the form of a confirmation: further libraries count as unseen processes."""
+    """Return a DDS as in confirmations: libraries beyond the limit count as unseen processes."""
     more = max(len(dds.libraries) - _MOST_LIBRARIES, 0)
     return RobotDds(dds.libraries[:_MOST_LIBRARIES], min(dds.unseen + more, _MOST_UNSEEN))
 
 
 def shortened_problems(problems: Iterable[str]) -> tuple[str, ...]:
-    """Return problems in the form of a confirmation: not too long, and not too many."""
+    """Return problems as in confirmations, limited in length and number."""
     texts = []
     for problem in dict.fromkeys(problems):
         text = "".join(character if character.isprintable() else "?" for character in problem)
@@ -325,7 +328,7 @@ def shortened_problems(problems: Iterable[str]) -> tuple[str, ...]:
 
 
 def _confirmed_files(root: Path, folder: Folder, name: str) -> dict[str, bytes]:
-    """Map the paths of an enclave's files that confirmations list to their content.
+    """Map the paths of an enclave's files that belong in a confirmation to the files' content.
 
     Raises:
         KeystoreError: a file is a link that leads out of the keystore.
@@ -336,7 +339,7 @@ def _confirmed_files(root: Path, folder: Folder, name: str) -> dict[str, bytes]:
 
 
 def certificate_digests(data: bytes) -> tuple[str, ...]:
-    """Return the SHA-256 of the certificates (DER) in a PEM file, without damaged certificates."""
+    """Return the SHA-256 of the certificates (DER) in a PEM file, leaving out damaged ones."""
     digests = []
     for block in _PEM.finditer(data):
         try:
@@ -347,9 +350,9 @@ def certificate_digests(data: bytes) -> tuple[str, ...]:
 
 
 def render_confirmation(confirmation: Confirmation) -> bytes:
-    """Return a confirmation as JSON, which `parse_confirmation` reads.
+    """Return a confirmation as JSON, for `parse_confirmation`.
 
-    The same confirmation always gives the same bytes.
+    Equal confirmations give equal bytes.
     """
     return _json(_value_of(confirmation))
 
@@ -396,7 +399,7 @@ def parse_confirmation(data: bytes, label: str) -> Confirmation:
 
 
 class LastMessage(NamedTuple):
-    """The last message of a robot's agent that was verified."""
+    """The last verified message of a robot's agent."""
 
     sequence: int
     """Sequence number of the message; later messages have higher numbers."""
@@ -405,14 +408,15 @@ class LastMessage(NamedTuple):
     enclave: str
     """The enclave whose key signed the message."""
     boots: tuple[str, ...] = ()
-    """Ids of the starts of the computer that sent messages, the last start first."""
+    """Ids of the computer's starts that sent messages, the latest first."""
     alternated: datetime | None = None
-    """When a message last came from an earlier start than the message before it."""
+    """When a message last came from an earlier start of the computer than the one before it."""
 
     def successor(self, boot: str | None, now: datetime) -> tuple[tuple[str, ...], datetime | None]:
-        """Return the values of ``boots`` and ``alternated`` for a message from the start ``boot``.
+        """Return the next ``boots`` and ``alternated``, after a message from the start ``boot``.
 
-        No start of a computer comes back after another one: then there are two computers.
+        A computer's start does not come back after another one, so if it does, there are two
+        computers.
         """
         if boot is None or boot in self.boots[:1]:
             return self.boots, self.alternated
@@ -424,10 +428,10 @@ class LastMessage(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """A confirmation, and when the keystore received it, by the clock of the keystore's machine.
+    """A confirmation with the time of its receipt, by the clock of the keystore's machine.
 
-    ``message`` is the last message of the robot's agent, even if a later confirmation came without
-    a message; None if the agent never sent a message.
+    ``message`` is the last message of the robot's agent, even if a later confirmation came in
+    another way; None if the agent never sent a message.
     """
 
     confirmation: Confirmation
@@ -435,7 +439,7 @@ class Received:
     message: LastMessage | None = None
 
     def two_computers(self) -> str:
-        """Return a sentence if messages came from two computers within the last day, or ""."""
+        """Return a sentence if messages of the last day came from two computers, or ""."""
         alternated = self.message.alternated if self.message else None
         if alternated is None or self.time - alternated > timedelta(days=1):
             return ""
@@ -445,7 +449,7 @@ class Received:
         )
 
     def clock_note(self) -> str:
-        """Return a clause on how far the robot's clock is off; "" for at most a minute."""
+        """Return how far the robot's clock is off, as a clause; "" for up to one minute."""
         ahead = self.confirmation.time - self.time
         if abs(ahead) <= _CLOCK_TOLERANCE:
             return ""
@@ -456,7 +460,7 @@ class Received:
 
 
 class KeptConfirmation(NamedTuple):
-    """The confirmation of a robot that was written to the keystore."""
+    """The confirmation of a robot, as written to the keystore."""
 
     keystore: NamedKeystore
     robot: str
@@ -471,21 +475,21 @@ class KeptConfirmation(NamedTuple):
     """Number of files of these enclaves, without keys."""
     dry_run: DryRun
     changes: Sequence[FileChange]
-    """The file that was written; with ``--dry-run``, the file that would be written."""
+    """The written file; with ``--dry-run``, the file that would be written."""
     notes: Notes
 
 
 def receive(data: bytes, robot: str, label: str, *, now: datetime) -> Received:
-    """Return the confirmation in ``data`` as received from ``robot`` at ``now``.
+    """Return the confirmation in ``data``, as received from ``robot`` at ``now``.
 
     Args:
-        data: JSON that `render_confirmation` writes.
-        robot: name of the robot.
-        label: name of the document in errors.
+        data: JSON as `render_confirmation` writes it.
+        robot: the name of the robot.
+        label: the name of the document in errors.
         now: the current time.
 
     Raises:
-        DocumentError: ``data`` is not a confirmation, or is the confirmation of another robot.
+        DocumentError: ``data`` is not a confirmation, or the confirmation is by another robot.
     """
     confirmation = parse_confirmation(data, label)
     if confirmation.robot != robot:
@@ -498,12 +502,12 @@ def receive(data: bytes, robot: str, label: str, *, now: datetime) -> Received:
 
 
 def refuse_older(keystore: OpenedKeystore, received: Received) -> None:
-    """Raise `DocumentError` if a report was made before the last confirmation of its robot.
+    """Raise `DocumentError` if a confirmation was made before the last one of its robot.
 
-    If the last confirmation was received before it was made, the robot's clock was ahead.
+    If the robot's clock was ahead, the last confirmation counts as made when it was received.
     """
     previous = None
-    with suppress(DocumentError):  # a damaged file
+    with suppress(DocumentError):  # the last confirmation is damaged
         previous = last_confirmation(keystore, received.confirmation.robot)
     if previous and received.confirmation.time < min(previous.confirmation.time, previous.time):
         robot, time = received.confirmation.robot, iso(received.confirmation.time)
@@ -518,10 +522,10 @@ def refuse_older(keystore: OpenedKeystore, received: Received) -> None:
 
 @contextmanager
 def locked_confirmations(root: Path) -> Iterator[None]:
-    """Lock the confirmations of a keystore: no other process stores any until the body ends.
+    """Lock the confirmations of a keystore, so that no other process writes any in the meantime.
 
     Raises:
-        KeystoreError: another process holds the lock, and does not end.
+        KeystoreError: another process holds the lock for too long.
     """
     with Folder(root, for_owner=True) as folder:
         if not folder.is_folder(CONFIRMED):
@@ -536,14 +540,14 @@ def locked_confirmations(root: Path) -> Iterator[None]:
 
 
 def keep_confirmation(keystore: OpenedKeystore, received: Received) -> str:
-    """Write a robot's confirmation to the keystore, replacing the previous one.
+    """Write a robot's confirmation to the keystore in place of the previous one.
 
-    The last message of the robot's agent stays.  The caller holds `locked_confirmations`.  Return
-    the path of the confirmation, relative to the keystore.
+    Returns the path of the confirmation, relative to the keystore.  The last message of the robot's
+    agent is kept.  The caller must hold `locked_confirmations`.
     """
     robot = received.confirmation.robot
     path, message = confirmation_file(robot), received.message
-    with suppress(DocumentError):  # a damaged file
+    with suppress(DocumentError):  # the previous confirmation is damaged
         if message is None and (previous := last_confirmation(keystore, robot)):
             message = previous.message
     value = {
@@ -557,7 +561,7 @@ def keep_confirmation(keystore: OpenedKeystore, received: Received) -> str:
 
 
 class RefusedMessage(NamedTuple):
-    """Why the last message of a robot's agent was refused, as a clause, and since when."""
+    """Why the last message of a robot's agent was refused (a clause), and since when."""
 
     time: datetime
     why: str
@@ -572,7 +576,7 @@ def keep_refusals(
 ) -> None:
     """Write the reasons for refused messages, by robot, if they differ from ``previous``.
 
-    The caller holds `locked_confirmations`.
+    The caller must hold `locked_confirmations`.
     """
     reasons = {robot: why[:LONGEST_REASON] for robot, why in refused.items()}
     if {robot: refusal.why for robot, refusal in previous.items()} == reasons:
@@ -592,8 +596,8 @@ def refusals(keystore: OpenedKeystore) -> dict[str, RefusedMessage]:
     """Return why the last messages of robots were refused, by robot.
 
     Raises:
-        DocumentError: the file cannot be read, or is damaged, so that the current robots are not
-            known.
+        DocumentError: the file cannot be read or is damaged, so it is unknown whose messages were
+            refused.
     """
     path = keystore.root / REFUSED
     if not os.path.lexists(path):
@@ -643,7 +647,7 @@ _AGAIN = "Make the confirmation again on the robot."
 
 
 class _FormError(ValueError):
-    """A part of a confirmation has another form, which the text states as a clause."""
+    """A part of a confirmation does not have its form; the text is a clause."""
 
     def __init__(self, why: str, remedy: str = _AGAIN) -> None:
         super().__init__(why)
@@ -652,7 +656,7 @@ class _FormError(ValueError):
 
 @contextmanager
 def _named_in_errors(label: str) -> Iterator[None]:
-    """Make a `DocumentError` of a `_FormError` of the body: ``label`` is not a confirmation."""
+    """Turn a `_FormError` of the body into a `DocumentError`: ``label`` is not a confirmation."""
     try:
         yield
     except _FormError as error:
@@ -667,8 +671,8 @@ def _json_value(data: bytes) -> Any:
 
 
 def _message_from(value: Any) -> LastMessage:
-    """Return the last message of a robot's agent."""
-    later = {"boots", "alternated"}  # than release 0.3.0 of sros
+    """Return the last message of a robot's agent from its JSON value."""
+    later = {"boots", "alternated"}  # fields added after release 0.3.0 of sros
     if not isinstance(value, dict) or value.keys() | later != set(LastMessage._fields):
         raise _FormError('the keys of its message are not "sequence", "sha256" and "enclave"')
     sha256 = _digest_from(value["sha256"], "the digest of its message")
@@ -743,7 +747,7 @@ def _release_from(value: Any) -> int:
 
 
 def _number_from(value: Any, why: str, *, least: int = 0, most: int = _MOST_NUMBER) -> int:
-    """Return a whole number from ``least`` to ``most``; ``why`` is the error for another value."""
+    """Return a whole number from ``least`` to ``most``; other values raise the error ``why``."""
     if type(value) is not int or not least <= value <= most:
         raise _FormError(why)
     return value
@@ -853,7 +857,7 @@ def _library_from(value: Any) -> RobotLibrary:
 def _entries(value: Mapping[str, Any], key: str) -> Iterator[tuple[str, Any]]:
     """Yield the (path, value) pairs of the JSON object at ``key``.
 
-    Every path is that of an enclave file that confirmations list.
+    Every path is that of an enclave file that belongs in confirmations.
     """
     entries = value[key]
     if not isinstance(entries, dict):

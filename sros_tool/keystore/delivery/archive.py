@@ -1,4 +1,4 @@
-"""Archives (``.tar.gz``) for robots: written reproducibly, read as untrusted input."""
+"""Archives (``.tar.gz``) for robots: reproducible when written, hostile input when read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MAX_UNPACKED = 40 * 1024 * 1024
 MAX_MEMBER = 17 * 1024 * 1024
 """Maximum size in bytes of the unpacked content of an answer, and of a file in any archive.
 
-A Zenoh configuration of the largest size that sros reads fits, with its signed document.
+This leaves room for the largest Zenoh configuration that sros reads, with its signed document.
 """
 
 
@@ -32,7 +32,7 @@ class ArchiveLimits(NamedTuple):
 
 _OF_ONE_ENCLAVE = ArchiveLimits(16 * 1024 * 1024, MAX_UNPACKED, 200)
 OF_ONE_ROBOT = ArchiveLimits(64 * 1024 * 1024, 256 * 1024 * 1024, 20_000)
-"""Limits of the archive of one enclave, and of all enclaves of a robot."""
+"""The limits of an archive with all enclaves of a robot."""
 _GZIP = 16 + zlib.MAX_WBITS
 
 
@@ -42,9 +42,9 @@ def file_mode(path: str) -> int:
 
 
 def pack(files: Mapping[str, bytes]) -> bytes:
-    """Return a ``.tar.gz`` archive of ``files`` (content by path).
+    """Return a ``.tar.gz`` archive of ``files``, which maps paths to content.
 
-    It has no users, groups and times, so the same files always give the same bytes.
+    The archive has no users, groups or times, so equal files give equal bytes.
     """
     plain, buffer = io.BytesIO(), io.BytesIO()
     with tarfile.open(fileobj=plain, mode="w", format=tarfile.PAX_FORMAT) as tar:
@@ -62,7 +62,7 @@ def pack(files: Mapping[str, bytes]) -> bytes:
 
 
 def _folders(paths: Iterable[str]) -> set[str]:
-    """Return the folders that relative paths are in, at all depths."""
+    """Return all folders, at any depth, on the way to relative paths."""
     folders: set[str] = set()
     for path in paths:
         folder = path.rpartition("/")[0]
@@ -73,13 +73,13 @@ def _folders(paths: Iterable[str]) -> set[str]:
 
 
 def listed_digests(files: Mapping[str, bytes]) -> bytes:
-    """Return the file list for a seal: a line "SHA-256, two spaces, path" per file, sorted."""
+    """Return the file list for a seal: sorted lines of SHA-256, two spaces and path."""
     digests = (f"{hashlib.sha256(data).hexdigest()}  {path}" for path, data in files.items())
     return "\n".join([*sorted(digests), ""]).encode()
 
 
 def unpack(data: bytes, limits: ArchiveLimits = _OF_ONE_ENCLAVE) -> dict[str, bytes]:
-    """Map the paths in a ``.tar.gz`` archive to the content of the files, without writing them.
+    """Map the paths in a ``.tar.gz`` archive to the content of the files; write nothing.
 
     The paths are not checked: the caller must do that.
 

@@ -1,9 +1,10 @@
 """Messages of robots in an inbox: verify and keep them, and sign their requests for renewal.
 
-An inbox is a folder with ``<robot>/confirmation.p7s`` of each robot that fetches: its confirmation,
-signed with the key of one of its enclaves.  Whoever runs the web server or carries the folder can
-write anything into it, so that nothing is believed before the signature, the certificate, the robot
-and the sequence number of a message were verified.  A refused message does not stop the others.
+An inbox is a folder with a file ``<robot>/confirmation.p7s`` for each robot that fetches.  The file
+is the robot's confirmation, signed with the key of one of its enclaves.  Whoever runs the web
+server or carries the folder can write anything into it.  So a message counts only after its
+signature, certificate, robot and sequence number were verified.  A refused message does not stop
+the others.
 """
 
 from __future__ import annotations
@@ -80,10 +81,10 @@ from sros_tool.values import DryRun, FileChange, FileChanges, NamedKeystore, Not
 from sros_tool.wording import counted, first_few
 
 _MOST_NAMES = 100_000
-"""Maximum number of names in an inbox that are searched for names without a robot in the fleet."""
+"""Maximum number of names in an inbox among which names without a robot are searched."""
 _SHOWN = 5
 _FEW = 4
-"""Number of certificates up to which a ledger without index is searched for each certificate."""
+"""Number of certificates up to which a ledger without index is searched once per certificate."""
 
 
 # ── what is done with messages and requests ────────────────────────────────────────────────
@@ -97,14 +98,16 @@ class CollectedRequest(NamedTuple):
     """A request for renewal, and its outcome."""
 
     enclave: str
-    """The enclave that the request is for; empty if the request cannot be read."""
+    """The enclave of the request; empty if the request cannot be read."""
     key_sha256: str
     """SHA-256 of the public key (DER) in the request, in hexadecimal; empty if it cannot be read.
     """
     outcome: Annotated[str, Words(REQUEST_OUTCOMES)]
-    """``renewed``: the enclave has a new certificate; ``answered``: it had one already, which comes
-    with the next release; ``not_due``: too early; ``not_allowed``: the fleet file does not allow
-    it; ``refused``: it must not be signed; ``not_signed``: the CAs cannot sign now."""
+    """``renewed``: the enclave has a new certificate; ``answered``: the enclave already has a new
+    certificate, which comes with the next release; ``not_due``: too early; ``not_allowed``: the
+    fleet file does not allow it; ``refused``: the request must not be signed; ``not_signed``: the
+    CAs cannot sign now.
+    """
     why: str
     """The reason as a clause; empty for ``renewed``."""
 
@@ -115,17 +118,18 @@ class CollectedMessage(NamedTuple):
     robot: str
     """Name of the robot."""
     outcome: Annotated[str, Words(MESSAGE_OUTCOMES)]
-    """``kept``: a new message, which is the robot's last confirmation now; ``unchanged``: the
-    same message as last time; ``older``: an earlier message, which was written before the last one
-    came, such as in an inbox that the robot used before; ``missing``: the inbox has none;
-    ``revoked``: all enclaves of the robot were revoked, so its message is not read; ``refused``:
-    the message proves nothing."""
+    """``kept``: a new message, now the robot's last confirmation; ``unchanged``: the same message
+    as last time; ``older``: an earlier message, written before the last one came, for example in an
+    inbox that the robot used before; ``missing``: the inbox has no message; ``revoked``: all
+    enclaves of the robot were revoked, so its message is not read; ``refused``: the message proves
+    nothing.
+    """
     why: str
-    """Why the message was refused or not read, as a clause; else empty."""
+    """Why the message was refused or not read, as a clause; empty for other outcomes."""
     enclave: str
-    """The enclave whose key signed the message; empty without a message that was verified."""
+    """The enclave whose key signed the message; empty if no message was verified."""
     sequence: int | None
-    """Sequence number of the message; null without a message that was verified."""
+    """Sequence number of the message; null if no message was verified."""
     remarks: Sequence[str]
     """Remarks (clauses), for example about the robot's clock or an expired certificate."""
     requests: Sequence[CollectedRequest]
@@ -133,10 +137,10 @@ class CollectedMessage(NamedTuple):
 
 
 class PublishedAnswers(NamedTuple):
-    """The releases that were published after an inbox was collected."""
+    """The releases that were published after collecting an inbox."""
 
     folder: Path
-    """The publishing folder, as it was named."""
+    """The publishing folder, as given by the user."""
     robots: Sequence[str]
     """Robots with a new release, sorted by name."""
     refused: Sequence[str]
@@ -148,27 +152,27 @@ class CollectedInbox(NamedTuple):
 
     keystore: NamedKeystore
     inbox: Path
-    """The folder with the messages, as it was named."""
+    """The folder with the messages, as given by the user."""
     robots: Sequence[CollectedMessage]
     """The robots of the fleet, sorted by name."""
     not_signed: str
-    """Why the CAs could not sign requests, as a clause: the exit status is 2; else empty."""
+    """Why the CAs could not sign requests (a clause), and the exit status is 2; otherwise empty."""
     published: PublishedAnswers | None
-    """What ``--publish`` published; null without it, or if it failed."""
+    """What ``--publish`` published; null without this option, or if publishing failed."""
     dry_run: DryRun
     changes: FileChanges
     notes: Notes
 
     @property
     def has_new_files(self) -> bool:
-        """Whether robots are to get files that are new in the keystore."""
+        """Whether the keystore has new files that robots should get."""
         requests = (request for robot in self.robots for request in robot.requests)
         renewed = any(request.outcome == "renewed" for request in requests)
         return renewed or any(note.id == REVOKED_AGAIN for note in self.notes)
 
     @property
     def complete(self) -> bool:
-        """Whether nothing was refused, and everything that may be signed is signed."""
+        """Whether nothing was refused, and every request that may be signed was signed."""
         if self.published and self.published.refused:
             return False
         requests = (request for robot in self.robots for request in robot.requests)
@@ -193,8 +197,9 @@ def collect(
         root: the keystore.
         inbox: the folder with a folder for each robot.
         now: the current time.
-        restored: robots whose disk was restored, so that one lower sequence number is accepted.
-        allow_refusal: vendors whose nodes may stop working by the renewal.
+        restored: robots whose disk was restored; a lower sequence number is accepted from them
+            once.
+        allow_refusal: vendors whose nodes may stop working because of a renewal.
         keyring: opens the keys of the CAs.
         dry_run: change nothing.
 
@@ -230,7 +235,7 @@ def collect(
                 action = "replace" if (root / path).exists() else "create"
                 changes.append(FileChange(action, str(root / path)))
                 if not dry_run:
-                    # If this run is killed now, the next one judges the same requests.
+                    # Kept now: if this run is killed, the next run decides on the same requests.
                     keep_confirmation(keystore, message.received)
             taken.append(message.without_confirmation())
         if not dry_run:
@@ -263,9 +268,9 @@ def collect(
 def _refusals(
     before: Mapping[str, RefusedMessage], messages: Sequence[_ReceivedMessage]
 ) -> dict[str, str]:
-    """Map robots to why their last messages were refused.
+    """Map robots to the reasons why their last messages were refused.
 
-    A missing or an older message changes nothing.
+    A missing or older message keeps the reason from before.
     """
     refused = {}
     for message in messages:
@@ -300,14 +305,14 @@ class _ReceivedMessage:
     verified: _Verified | None = None
     received: Received | None = None
     crl: str | None = None
-    """The revocation list in the message, which counts if a CA of the keystore signed it."""
+    """The revocation list in the message, which counts only if a CA of the keystore signed it."""
     stranger: x509.Certificate | None = None
-    """The signer's certificate, if the message does not count."""
+    """The signer's certificate, if the message itself is not accepted."""
     remarks: list[str] = field(default_factory=list)
     requests: list[_DecidedRequest] = field(default_factory=list)
 
     def without_confirmation(self) -> _ReceivedMessage:
-        """Return the message without its verified content, to save memory."""
+        """Return a copy without the verified content, to save memory."""
         if self.verified is None:
             return replace(self, crl=None, stranger=None)
         return replace(
@@ -320,7 +325,7 @@ class _ReceivedMessage:
         )
 
     def result(self) -> CollectedMessage:
-        """Return what was done with the message."""
+        """Return the outcome of the message."""
         return CollectedMessage(
             self.robot.name,
             self.outcome,
@@ -333,27 +338,27 @@ class _ReceivedMessage:
 
 
 class _RefusedError(SrosError):
-    """A message that proves nothing, or a request that must not be signed."""
+    """The message proves nothing, or the request must not be signed."""
 
 
 class _ReplacedCaError(_RefusedError):
-    """A message of the robot itself, with a certificate of an identity CA that was replaced."""
+    """The robot itself sent the message, but its certificate is by a replaced identity CA."""
 
 
 def _shortened(reason: str) -> str:
-    """Return a reason that is not too long: it may have names that the robot chose."""
+    """Return a reason cut to the maximum length, as it may contain names that the robot chose."""
     return reason if len(reason) <= LONGEST_REASON else f"{reason[: LONGEST_REASON - 3]}..."
 
 
 class _File(NamedTuple):
-    """The content of a message, and when its file was written."""
+    """The content of a message's file, and when the file was written."""
 
     data: bytes
     written: datetime
 
 
 def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_ReceivedMessage]:
-    """Yield the message of each robot of the fleet, verified."""
+    """Yield the verified message of each robot of the fleet."""
     try:
         folder = Folder(inbox)
     except OSError as error:
@@ -382,7 +387,7 @@ def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_Rec
 
 
 def _add_signed_by_others(received: _ReceivedMessage, message: bytes) -> None:
-    """Add the CA-signed parts of a message that does not count: revocation list, certificate."""
+    """Add the signer's certificate and the revocation list of a message that is not accepted."""
     with suppress(SrosError):
         signed = smime.parse_new(message)
         received.stranger = signed.signer()
@@ -390,10 +395,10 @@ def _add_signed_by_others(received: _ReceivedMessage, message: bytes) -> None:
 
 
 def _read_message(inbox: Folder, robot: str) -> _File | None:
-    """Return the message of a robot, without following a link; None if there is none.
+    """Return a robot's message, without following links; None if there is no message.
 
     Raises:
-        _RefusedError: the message is no regular file, is too large, or cannot be read.
+        _RefusedError: the message is not a regular file, is too large, or cannot be read.
     """
     path = f"{robot}/{MESSAGE_FILE}"
     try:
@@ -409,15 +414,15 @@ def _read_message(inbox: Folder, robot: str) -> _File | None:
         if error.errno in (errno.ELOOP, errno.EINVAL, errno.ENXIO, errno.EISDIR):
             raise _RefusedError("it is not a regular file") from error
         raise _RefusedError(f"it cannot be read: {os.strerror(error.errno or 0)}") from error
-    except KeystoreError as error:  # a link or file in place of the robot's folder
+    except KeystoreError as error:  # the robot's folder is a link or a file
         raise _RefusedError(error.what) from error
     return _File(data, time_of_file(state.st_mtime))
 
 
 def _unknown_file_notes(inbox: Path, fleet: Fleet) -> Iterator[Note]:
-    """Yield a note on files in the inbox that are not named after a robot."""
+    """Yield a note on names in the inbox that are not names of robots."""
     names: list[str] = []
-    with suppress(OSError), os.scandir(inbox) as entries:  # others can move the folder
+    with suppress(OSError), os.scandir(inbox) as entries:  # others can move the folder at any time
         names = sorted(entry.name for entry in islice(entries, _MOST_NAMES))
     unknown = [ascii(name)[1:-1] for name in names if name not in fleet.robots]
     if unknown:
@@ -431,7 +436,7 @@ def _unknown_file_notes(inbox: Path, fleet: Fleet) -> Iterator[Note]:
 
 
 def _older_message_notes(inbox: Path, messages: Iterable[_ReceivedMessage]) -> Iterator[Note]:
-    """Yield a note on messages that are older than the last known messages of their robots."""
+    """Yield a note on messages that are older than the last collected messages of their robots."""
     robots = [message.robot.name for message in messages if message.outcome == "older"]
     if robots:
         messages_text = "an older message" if len(robots) == 1 else "older messages"
@@ -447,7 +452,7 @@ def _older_message_notes(inbox: Path, messages: Iterable[_ReceivedMessage]) -> I
 
 
 class _Verifier:
-    """Verifier of messages against the CAs, the ledger and the fleet of a keystore."""
+    """A verifier of messages, by the CAs, the ledger and the fleet of a keystore."""
 
     def __init__(
         self, keystore: OpenedKeystore, fleet: Fleet, now: datetime, restored: Collection[str]
@@ -460,7 +465,7 @@ class _Verifier:
         self._authorities = keystore.authority(IDENTITY)
 
     def take(self, robot: Robot, file: _File) -> _ReceivedMessage:
-        """Return a robot's message, verified, and what to keep of it.
+        """Return a robot's message after verifying it, with the confirmation to keep.
 
         Raises:
             _RefusedError: the message proves nothing.
@@ -478,7 +483,8 @@ class _Verifier:
         except _ReplacedCaError as error:
             if not (before and before.sha256 == sha256):
                 raise
-            remarks.append(error.what)  # the message was verified before the CA was replaced
+            # The message was verified before, when the CA was not yet replaced.
+            remarks.append(error.what)
             return _ReceivedMessage(
                 robot,
                 "unchanged",
@@ -493,7 +499,7 @@ class _Verifier:
             return _ReceivedMessage(robot, "unchanged", verified=verified, remarks=remarks)
         is_restored = robot.name in self._restored
         is_older = before is not None and sequence < before.sequence and not is_restored
-        # One that came later may be of a robot whose disk was restored, or was sent again.
+        # A message that came later may be from a robot with a restored disk, or may be replayed.
         if is_older and last and file.written < last.time:
             return _ReceivedMessage(robot, "older", crl=verified.confirmation.crl, remarks=remarks)
         if before and sequence <= before.sequence and not is_restored:
@@ -523,9 +529,9 @@ class _Verifier:
         )
 
     def _arrival(self, file: _File, last: Received | None) -> datetime:
-        """Return when the file of a message was written, but not before the last message.
+        """Return when the file of a message was written, but no earlier than the last message.
 
-        Messages may lie in the inbox for a long time before somebody takes them in.
+        Messages may have been in the inbox for a long time before they are collected.
         """
         earliest = last.time if last else file.written
         return min(max(file.written, earliest), self._now).replace(microsecond=0)
@@ -553,7 +559,7 @@ class _Verifier:
         return _Verified(confirmation, enclave, signer)
 
     def was_revoked(self, robot: Robot) -> bool:
-        """Return whether all enclaves that a robot had were revoked."""
+        """Return whether all enclaves of a robot were revoked."""
         return bool(
             self._revoked
             and not enclaves_of_robot(self._keystore, self._fleet, robot)
@@ -562,7 +568,7 @@ class _Verifier:
 
     @cached_property
     def _revoked_names(self) -> frozenset[str]:
-        """The enclaves with a certificate that was revoked, and not only replaced."""
+        """The enclaves that had a certificate revoked for another reason than its replacement."""
         entries = self._keystore.ledger_with("what", "revocation").entries
         return frozenset(
             entry.enclave
@@ -571,11 +577,11 @@ class _Verifier:
         )
 
     def _enclave(self, robot: Robot, signer: x509.Certificate) -> str:
-        """Return the robot's enclave that the keystore issued the certificate to.
+        """Return the robot's enclave to which the keystore issued the certificate.
 
         Raises:
-            _RefusedError: the certificate is not from this keystore, was revoked, or is not the
-                robot's.
+            _RefusedError: the keystore did not issue the certificate, it was revoked, or it belongs
+                to no enclave of the robot.
         """
         validity = validity_of(signer)
         moment = min(max(self._now, validity.not_before), validity.not_after)
@@ -585,7 +591,8 @@ class _Verifier:
                     "its certificate is of an identity CA that was replaced: it missed the rotation"
                 )
             why = "no identity CA of the keystore issued its certificate"
-            if restored_at(self._keystore):  # first: the sender chose the words of the fault
+            # This comes first, because the sender chose the words of the fault.
+            if restored_at(self._keystore):
                 why += " (perhaps the CA was replaced after the backup of the keystore: see "
                 why += "docs/howto/keystore_is_lost.md)"
             raise _RefusedError(f"{why}: {fault}")
@@ -612,10 +619,10 @@ class _Verifier:
         return issued.enclave
 
     def _was_of_replaced_ca(self, robot: Robot, signer: x509.Certificate) -> bool:
-        """Return whether a CA that was replaced issued the certificate to an enclave of the robot.
+        """Return whether a replaced CA issued the certificate to an enclave of the robot.
 
-        The certificate was not revoked, and its digest is in the ledger: whoever has a copy of the
-        replaced CA's key cannot make another one.
+        The certificate must not be revoked, and its digest must be in the ledger.  So a copy of the
+        replaced CA's key is not enough to make such a certificate.
         """
         if any(issued_by(signer, authority) for authority in self._authorities):
             return False
@@ -627,17 +634,17 @@ class _Verifier:
         )
 
     def _has_key_of(self, enclave: str, signer: x509.Certificate) -> bool:
-        """Return whether a certificate is for the key that an enclave has now.
+        """Return whether a certificate is for the current key of an enclave.
 
-        An earlier key may be on a computer that nobody watches any more.
+        An earlier key may be on a computer that nobody looks after any more.
         """
-        with suppress(SrosError):  # no such enclave, or a file of it is broken
+        with suppress(SrosError):  # the enclave does not exist, or a file of it is broken
             present = self._keystore.certificate_of(enclave)
             return present.public_key() == signer.public_key()
         return False
 
     def _issued(self, sha256: str) -> Entry | None:
-        """Return the ledger's entry of a certificate (SHA-256 of its DER), or None."""
+        """Return the ledger's entry for a certificate (SHA-256 of the DER), or None."""
         if self._searched < _FEW or self._keystore.ledger_file.is_indexed:
             self._searched += 1
             entries: Sequence[Entry] = self._keystore.ledger_with("sha256", sha256).entries
@@ -647,7 +654,7 @@ class _Verifier:
 
     @cached_property
     def _certificates(self) -> Mapping[str, Sequence[Entry]]:
-        """The entries of all certificates, by the SHA-256 of the certificate."""
+        """Maps the SHA-256 of each certificate to the ledger's entries for it."""
         by_digest: dict[str, list[Entry]] = {}
         for entry in self._keystore.ledger_with("what", "certificate").entries:
             by_digest.setdefault(entry.sha256, []).append(entry)
@@ -655,7 +662,7 @@ class _Verifier:
 
     @cached_property
     def _revoked(self) -> Collection[int]:
-        """Serial numbers of revoked certificates, by the ledger and the revocation lists."""
+        """The serial numbers that the ledger or the revocation lists revoke."""
         return revoked_serials(self._keystore)
 
     def _expiry_clauses(self, certificate: x509.Certificate) -> Iterator[str]:
@@ -668,7 +675,7 @@ class _Verifier:
 
 
 def _proves_issue(entry: Entry, sha256: str) -> bool:
-    """Return whether a line of the ledger shows that the keystore issued a certificate."""
+    """Return whether a ledger entry shows that the keystore issued a certificate."""
     is_issued = entry.what == "certificate" and entry.reason != REPORTED
     return is_issued and entry.sha256 == sha256 and bool(entry.enclave)
 
@@ -678,7 +685,7 @@ def _proves_issue(entry: Entry, sha256: str) -> bool:
 
 @dataclass(slots=True)
 class _DecidedRequest:
-    """A request for renewal; ``request`` is None unless it is to be signed."""
+    """A request for renewal and the decision on it; ``request`` is None if it is not signed."""
 
     result: CollectedRequest
     request: SigningRequest | None = None
@@ -686,13 +693,13 @@ class _DecidedRequest:
     """Serial numbers of the certificates that vouch for the request."""
 
     def set_outcome(self, outcome: str, why: str = "") -> None:
-        """Say what was done with the request, which is not signed."""
+        """Set the outcome of a request that is not signed."""
         self.result = self.result._replace(outcome=outcome, why=why)
         self.request = None
 
 
 class _Renewals:
-    """Decides which requests of robots may be signed: none that changes who has which rights."""
+    """Decides which requests of robots may be signed: only those that change nobody's rights."""
 
     def __init__(self, keystore: OpenedKeystore, fleet: Fleet, now: datetime) -> None:
         self._keystore = keystore
@@ -700,7 +707,7 @@ class _Renewals:
         self._now = now
 
     def judge(self, robot: Robot, message: _Verified) -> list[_DecidedRequest]:
-        """Return the requests of a message, and whether each one may be signed."""
+        """Return the requests of a message, each with the decision on it."""
         judged: list[_DecidedRequest] = []
         names: set[str] = set()
         for text in message.confirmation.requests or ():
@@ -729,7 +736,7 @@ class _Renewals:
     def _decide_request(
         self, robot: Robot, message: _Verified, request: SigningRequest
     ) -> tuple[str, str]:
-        """Return the outcome of a request, and why; a "renewed" one still has to be signed.
+        """Return the outcome of a request, and the reason; "renewed" means that it may be signed.
 
         Raises:
             SrosError: the request must not be signed.
@@ -750,9 +757,11 @@ class _Renewals:
         )
         is_there = digest(present) in on_robot
         if same_key and not is_there and validity_of(present).contains(self._now):
-            # Also if it is due again: the robot has to fetch what was signed before.
+            # Even if it is due again, the robot first has to fetch the certificate that was signed
+            # before.
             return "answered", "its new certificate comes with the next release"
-        # Robots ask in the last third; the rest is for clocks that are wrong.
+        # Robots ask in the last third of the validity; half of it is accepted, because clocks may
+        # be wrong.
         due = min(
             validity.not_after - validity.lifetime(made) / 2
             for validity, made in self._issued(name)
@@ -779,9 +788,9 @@ class _Renewals:
         return "renewed", ""
 
     def _issued(self, name: str) -> Iterator[tuple[Window, datetime | None]]:
-        """Yield the validity of certificate and permissions of an enclave, and when they were made.
+        """Yield the validities of an enclave's certificate and permissions, with their issue times.
 
-        None if the ledger does not have them, such as for files that it has taken over.
+        The time is None for files that the ledger does not have, such as files of ros2/sros2.
         """
         credentials = read_credentials(self._keystore, name)
         lifetime = credentials.lifetime()
@@ -794,7 +803,7 @@ class _Renewals:
             yield validity, parse_iso(times[0]) if times else None
 
     def _check_grace(self, robot: Robot, validity: Window) -> None:
-        """Raise `_Refused` if a certificate expired longer ago than the fleet file accepts."""
+        """Raise `_RefusedError` if a certificate expired longer ago than the fleet file accepts."""
         overdue = self._now - validity.not_after
         if overdue.total_seconds() <= 0:
             return
@@ -820,11 +829,11 @@ def _revoke_again(
     keyring: Keyring,
     dry_run: bool,
 ) -> tuple[str, list[Note], list[FileChange]]:
-    """Revoke enclaves that only lists of robots revoke, and refuse the requests that they signed.
+    """Revoke what only lists of robots revoke, and refuse requests signed with such certificates.
 
-    Certificates that the ledger lacks are recorded.  If the lists cannot be signed, nothing is
-    signed; but if they are lists of a CA service, which alone can sign another one and knows its
-    certificates, there is only a note.  Return the same as `_sign`.
+    Returns the same as `_sign`.  Certificates that the ledger lacks are recorded.  If the lists
+    cannot be signed, no request is signed.  But for lists of a CA service there is only a note,
+    because this service alone signs its lists and knows its certificates.
     """
     if not (forgotten_lists.lists or forgotten_lists.unknown_certificates(OpenedKeystore(root))):
         return "", [], []
@@ -837,7 +846,7 @@ def _revoke_again(
         f"{first_few(robots_with_lists, _SHOWN)} {'has' if len(robots_with_lists) == 1 else 'have'}"
     )
     if keyring.ca_service(root, IDENTITY, OpenedKeystore(root).template):
-        # Its list is for all sites, and everybody can have it: nobody else has to wait.
+        # The list is for all sites, and everybody can get it, so this does not delay other robots.
         text = (
             f"{have} a revocation list of the CA service that the keystore lacks: import it "
             f"with `sros crl {quote(str(root))} --refresh --crl FILE`"
@@ -868,11 +877,11 @@ def _sign(
     messages: Sequence[_ReceivedMessage],
     **options: Unpack[ChangeOptions],
 ) -> tuple[str, list[Note], list[FileChange]]:
-    """Sign the requests that may be signed, all in one change of the keystore if that is possible.
+    """Sign the requests that may be signed, if possible all in one change of the keystore.
 
-    Otherwise it is tried with half of the robots each time, so that one robot neither stops nor
-    slows down the others.
-    Return why the CAs cannot sign ("" if they can), the notes, and the files that changed.
+    If this fails, each half of the robots is tried by itself, and so on, so that one robot neither
+    stops nor slows down the others.  Returns why the CAs cannot sign ("" if they can), notes, and
+    the changed files.
     """
     by_robot = [
         [request for request in message.requests if request.request] for message in messages
@@ -882,7 +891,7 @@ def _sign(
     changes: list[FileChange] = []
 
     def sign(robots: Sequence[Sequence[_DecidedRequest]]) -> SrosError | None:
-        """Sign the requests of robots; return the error if that fails."""
+        """Sign the requests of some robots; return the error if this fails."""
         requests = [request.request for judged in robots for request in judged if request.request]
         try:
             signed = certify_requests(
@@ -920,7 +929,7 @@ def _sign(
 
 
 def _cannot_sign(root: Path, **options: Unpack[ChangeOptions]) -> str:
-    """Return why the CAs of the keystore cannot sign, whatever is requested; "" if they can."""
+    """Return why the keystore's CAs can sign nothing now, as a clause; "" if they can sign."""
     try:
         with KeystoreChange(root, **options | {"dry_run": True}) as change:
             change.open_authorities()

@@ -82,7 +82,7 @@ _SHOWN = 5
 
 @dataclass(frozen=True, slots=True)
 class Export:
-    """The result of an export: the exported enclaves, and the changed files below ``target``."""
+    """The exported enclaves, and the changed files below ``target``."""
 
     target: Path
     enclaves: tuple[str, ...]
@@ -92,9 +92,9 @@ class Export:
 
 @dataclass(frozen=True, slots=True)
 class ExportSelection:
-    """The enclaves to export, and the enclaves that an export has to leave out.
+    """The enclaves to export, and those that the export has to leave out.
 
-    The enclaves in ``left_out`` match the selection, too, but their keys are on their robots.
+    The enclaves in ``left_out`` match the selection, but their keys are on their robots.
     """
 
     names: tuple[str, ...]
@@ -106,11 +106,11 @@ def with_keys_here(
 ) -> ExportSelection:
     """Return the enclaves to export.
 
-    Unless ``keyless`` is set, enclaves whose keys are on their robots are left out, but for those
-    that are ``given`` by their names, which `distribute` refuses.
+    Unless ``keyless`` is set, enclaves whose keys are on their robots are left out.  Those that are
+    ``given`` by name stay, so that `distribute` refuses them.
 
     Raises:
-        KeystoreError: this is no keystore, or all enclaves have their keys on robots.
+        KeystoreError: this is not a keystore, or the keys of all selected enclaves are on robots.
     """
     keystore.check()
     chosen: list[str] = []
@@ -140,8 +140,8 @@ def distribute(
 ) -> Export:
     """Export enclaves to ``target``: an archive if its name ends with ``.tar.gz``, else a folder.
 
-    The same enclaves always give the same bytes.  In the folder of an earlier export, other
-    enclaves stay.  With ``keyless``, enclaves whose keys are on their robots are exported, too,
+    The same enclaves always give the same bytes.  In a folder from an earlier export, other
+    enclaves stay.  With ``keyless``, enclaves whose keys are on their robots are also exported,
     without keys.
 
     Raises:
@@ -159,7 +159,7 @@ def distribute(
 
 
 def _key_notes(files: Mapping[str, bytes], keyless: bool) -> Iterator[Note]:
-    """Yield notes on private keys that are exported with ``keyless``, or that are on tokens."""
+    """Yield notes on private keys in a ``keyless`` export, and on keys on tokens."""
     if keyless and (keys := [path for path in files if path.endswith(f"/{KEY_FILE}")]):
         their = "its private key" if len(keys) == 1 else "their private keys"
         yield Note(
@@ -180,7 +180,7 @@ def _key_notes(files: Mapping[str, bytes], keyless: bool) -> Iterator[Note]:
 
 
 def _readable_key_notes(target: Path, names: Sequence[str]) -> Iterator[Note]:
-    """Yield a note for each private key that others can read in an export that did not change."""
+    """Yield a note for each private key in an unchanged export that other users can read."""
     for name in names:
         with suppress(OSError):
             key = enclave_path(target, name) / KEY_FILE
@@ -222,12 +222,12 @@ def _notes(keystore: OpenedKeystore, target: Path, names: Sequence[str]) -> Iter
 
 
 def _enclave_removal(target: Path, names: Sequence[str], present: Sequence[str]) -> str:
-    """Return the command that removes enclaves from a folder, and no other enclave below them."""
+    """Return the command that removes enclaves from a folder, but not enclaves nested in them."""
     nested = any(
         other.startswith(f"{name}/") for name in names for other in {*present}.difference(names)
     )
     folders = (quote(str(enclave_path(target, name))) for name in names)
-    # Only files have a dot in their names.
+    # Only names of files have a dot, so nested enclaves stay.
     return "rm " + " ".join(f"{folder}/*.*" if nested else f"-r {folder}" for folder in folders)
 
 
@@ -243,7 +243,7 @@ class PackedEnclaves:
 def pack_enclaves(
     keystore: OpenedKeystore, names: Sequence[str], *, now: datetime, keyless: bool = False
 ) -> PackedEnclaves:
-    """Return the export of enclaves as an archive in memory; ``keyless`` as in `distribute`.
+    """Return an archive of enclaves in memory; ``keyless`` is as in `distribute`.
 
     Raises:
         KeystoreError: an enclave does not exist, or cannot run.
@@ -255,7 +255,7 @@ def pack_enclaves(
 def exported_files(
     keystore: OpenedKeystore, names: Sequence[str], now: datetime, *, keyless: bool = False
 ) -> dict[str, bytes]:
-    """Map the paths of the exported files to their content; ``keyless`` as in `distribute`.
+    """Map the paths of the files to export to their content; ``keyless`` is as in `distribute`.
 
     Raises:
         KeystoreError: an enclave does not exist, or cannot run.
@@ -283,10 +283,10 @@ def exported_files(
 
 
 class ReleasedEnclave(NamedTuple):
-    """The files of an enclave without its key, and what was found when they were evaluated.
+    """The files of an enclave without its key, and the result of evaluating them.
 
-    ``not_valid`` is a clause on what is not valid now, or "".  Until ``until``, these files also
-    work with another revocation list, if that list is valid and does not revoke the enclave.
+    ``not_valid`` is a clause on what is not valid now, or "".  Until the time ``until``, the files
+    also work with another revocation list that is valid and does not revoke the enclave.
     """
 
     files: Mapping[str, bytes]
@@ -297,8 +297,8 @@ class ReleasedEnclave(NamedTuple):
 def released_enclave(keystore: OpenedKeystore, name: str, now: datetime) -> ReleasedEnclave:
     """Return the files of an enclave for its robot, after evaluating them.
 
-    If the only reason why an enclave cannot run is a date (expired, or not valid yet), it is still
-    released: its robot may have other enclaves that can run, and needs the revocation list.
+    An enclave that cannot run only because of a date (expired, or not valid yet) is released
+    nevertheless: its robot may have other enclaves that can run, and needs the revocation list.
 
     Raises:
         KeystoreError: the enclave cannot run for another reason.
@@ -318,19 +318,22 @@ def released_enclave(keystore: OpenedKeystore, name: str, now: datetime) -> Rele
 
 
 def released_files(keystore: OpenedKeystore, name: str) -> dict[str, bytes]:
-    """Map the paths of all files of an enclave, except its key, to their content, not evaluated.
+    """Map the paths of all files of an enclave, except its key, to their content.
+
+    The files are not evaluated.
 
     Raises:
-        KeystoreError: a file has a private key.
+        KeystoreError: a file contains a private key.
     """
     return _read_files(keystore, name, (file for file in _FILES if file not in KEY_FILES))
 
 
 def _evaluated_until(files: Mapping[str, bytes], state: OpenedEnclave, now: datetime) -> datetime:
-    """Return until when files without a problem need no other evaluation: the first expiry.
+    """Return until when files without problems need no new evaluation: their first expiry.
 
-    Revocation lists are evaluated separately.  It is ``now`` for files that depend on them in other
-    ways: there are lists in the file of a CA, or Zenoh configurations.
+    Revocation lists are not considered, because they are evaluated separately.  If the files also
+    depend on lists in other ways (a list in the file of a CA, or Zenoh configurations), the result
+    is ``now``.
     """
     by_name = {path.rpartition("/")[2]: data for path, data in files.items()}
     authorities = [by_name[file] for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)]
@@ -387,8 +390,8 @@ def _files_of(
     """Map the paths of all files of an enclave to their content.
 
     Raises:
-        KeystoreError: a file has a private key of something else, or a Zenoh configuration cannot
-            be used.
+        KeystoreError: another file than the enclave's key has a private key, or a Zenoh
+            configuration cannot be used.
     """
     _check_zenoh(keystore, name, evaluation.state)
     _check_not_ca_key(keystore.folder(name), evaluation.state)
@@ -401,10 +404,10 @@ _FILES = (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES, *ZENOH_FILES)
 def _read_files(
     keystore: OpenedKeystore, name: str, wanted_files: Iterable[str]
 ) -> dict[str, bytes]:
-    """Map the paths of an enclave's ``wanted_files`` to their content; skip missing files.
+    """Map the paths of an enclave's ``wanted_files`` to their content; missing files are left out.
 
     Raises:
-        KeystoreError: a file other than that of the key has a private key.
+        KeystoreError: another file than the enclave's key has a private key.
     """
     files: dict[str, bytes] = {}
     with Folder(keystore.root) as opened:
@@ -422,7 +425,7 @@ def _read_files(
 
 
 def _check_list(keystore: OpenedKeystore, now: datetime) -> None:
-    """Raise `KeystoreError` if the revocation list lacks what the ledger records as revoked."""
+    """Raise `KeystoreError` if the revocation list lacks revocations that the ledger records."""
     if names := unlisted_revocations(keystore, now):
         raise KeystoreError(
             f"the revocation list of keystore '{keystore.root}' lacks revoked certificates of "
@@ -435,7 +438,7 @@ def _check_list(keystore: OpenedKeystore, now: datetime) -> None:
 
 
 def _check_authorities(keystore: OpenedKeystore, role: str, path: Path, data: bytes) -> None:
-    """Raise `KeystoreError` if a CA file has a CA that a sound ledger does not know."""
+    """Raise `KeystoreError` if a CA file has a CA that is not in the ledger, unless it has gaps."""
     known = known_authorities(keystore, role)
     if known is None or keystore.ledger_with("what", "ca").gaps:
         return
@@ -448,12 +451,12 @@ def _check_authorities(keystore: OpenedKeystore, role: str, path: Path, data: by
 
 
 def _check_last(keystore: OpenedKeystore, name: str, path: Path, data: bytes) -> None:
-    """Raise `KeystoreError` if the ledger has a later document than a signed one of an enclave.
+    """Raise `KeystoreError` if a signed document is not the last one that the ledger records.
 
-    What ros2/sros2 signed is not in the ledger, and exported as it is.
+    Documents that ros2/sros2 signed are not in the ledger, and are exported as they are.
     """
     kind = path.name.partition(".")[0]
-    if kind == "governance":  # that of all enclaves
+    if kind == "governance":  # the governance is shared by all enclaves
         entries = keystore.ledger_with("what", kind).entries
     else:
         entries = keystore.ledger_file.with_values("enclave", (name,)).entries
@@ -481,7 +484,7 @@ def _check_not_ca_key(folder: Path, state: OpenedEnclave) -> None:
 
 
 def _check_zenoh(keystore: OpenedKeystore, name: str, state: OpenedEnclave) -> None:
-    """Raise `KeystoreError` if `sros run` on the robot would refuse the Zenoh configurations."""
+    """Raise `KeystoreError` for Zenoh configurations that `sros run` would refuse on the robot."""
     zenoh = open_zenoh(keystore.folder(name), name, state)
     if zenoh.files and zenoh.problems:
         raise KeystoreError(
@@ -500,7 +503,7 @@ def _ca_key_error(path: Path) -> KeystoreError:
 
 
 def _real_path(path: Path) -> Path:
-    # Unlike Path.resolve, realpath does not fail at a loop of links.
+    # Unlike Path.resolve, realpath does not fail for circular links.
     return Path(os.path.realpath(path))
 
 
@@ -554,12 +557,12 @@ def _write_folder(
 
 
 def _check_robot(keystore: OpenedKeystore, target: Path, files: Mapping[str, bytes]) -> None:
-    """Raise `KeystoreError` if the agent in ``target`` is of another robot than an enclave."""
+    """Raise `KeystoreError` if the agent in ``target`` belongs to another robot than an enclave."""
     settings = target / AGENT / "agent.toml"
     if not settings.is_file() or not (fleet := load_fleet(keystore)):
         return
     owner = None
-    with suppress(SrosError, ValueError):  # the agent refuses these settings itself
+    with suppress(SrosError, ValueError):  # the agent itself refuses such settings
         owner = tomllib.loads(read_bytes(settings, "settings").decode()).get("robot")
     for name in sorted({enclave_of(path) for path in files}):
         robot = robot_of(fleet, name)
@@ -572,11 +575,11 @@ def _check_robot(keystore: OpenedKeystore, target: Path, files: Mapping[str, byt
 
 
 def _stale_paths(target: Path, files: dict[str, bytes]) -> list[str]:
-    """Return the paths in ``target`` of files that the enclaves no longer have.
+    """Return the paths of files in ``target`` that the exported enclaves no longer have.
 
-    These are Zenoh files, keys, and revocation lists of other CAs, with which nothing starts
-    (`check_rollback` refuses to lose a list of the enclave's own CA).  An enclave that is exported
-    without a key keeps the key in ``target``: no other copy exists.
+    These are Zenoh files, keys, and revocation lists of other CAs, with which no process starts.
+    (Losing a list of the enclave's own CA is refused by `check_rollback`.) If an enclave is
+    exported without a key, its key in ``target`` stays, because there is no other copy.
     """
     folders = {path.rpartition("/")[0] for path in files}
     keyed = {folder for folder in folders for file in KEY_FILES if f"{folder}/{file}" in files}
@@ -626,7 +629,8 @@ def _unpacked(target: Path) -> Mapping[str, bytes]:
     """Map the paths in an archive to the content of its files.
 
     Raises:
-        KeystoreError: it cannot be read: it may have a later CA, or a newer revocation list.
+        KeystoreError: the archive cannot be read, so it may have a later CA or a newer revocation
+            list.
     """
     try:
         return unpack(read_bytes(target, "archive", max_bytes=OF_ONE_ROBOT.packed), OF_ONE_ROBOT)
@@ -659,7 +663,7 @@ class ExportedEnclaves(NamedTuple):
     ]
     """The exported enclaves."""
     left_out: Sequence[str]
-    """Enclaves that ``--all`` or ``--match`` selects, but whose key was made on the robot."""
+    """Enclaves that ``--all`` or ``--match`` selects, but whose keys were made on their robots."""
     changes: FileChanges
     notes: Notes
 

@@ -1,8 +1,8 @@
-"""Publish the releases of a fleet's robots in a folder for any web server or USB stick.
+"""Publish the releases of a fleet's robots in a folder, for any web server or USB stick.
 
-What robots see is whole at every moment, by the order of writing: new archives, which nothing
-names yet; the keystore's transaction with ledger, keys and the list of what is published; the
-metadata, whose timestamp comes last.
+Robots find complete files at every moment, because of the order of writing.  First come the new
+archives, which no metadata names yet.  Then the keystore's transaction writes ledger, keys and the
+list of what is published.  The metadata comes last, and in it the timestamp.
 """
 
 from __future__ import annotations
@@ -112,21 +112,22 @@ if TYPE_CHECKING:
 
 _ROLES = ("root", "targets", "snapshot", "timestamp")
 _ONLINE = _ROLES[1:]
-"""The roles whose keys have to be in the keystore."""
+"""The roles whose keys must be in the keystore."""
 _METADATA, _TARGETS, _ARCHIVES = "metadata", "targets", "targets/robots"
 _MOST_NAMES = 3
 """Maximum number of enclaves that a message names."""
 _KEPT = timedelta(days=2)
-"""How long unused files stay: robots may be in the middle of an update."""
+"""How long unused files are kept, because robots may be in the middle of an update."""
 _OURS = re.compile(
     r"metadata/[0-9]+\.(?:targets|snapshot|robots-[0-9a-f]+)\.json"
     r"|targets/robots/[0-9a-f]{64}\.[A-Za-z0-9_]+\.tar\.gz"
     r"|(?:metadata|targets/robots)/\.[^/]+\.new"
 )
-"""Paths in a publishing folder that are removed once they are unused."""
+"""Matches paths in a publishing folder that are removed when they have become unused."""
 _MOST_SUPERSEDED = 500_000
-"""Maximum number of unused paths that are remembered: anyone who can write to the folder can make
-many.
+"""Maximum number of unused paths that are remembered.
+
+There is a limit because anyone who can write to the folder can make many.
 """
 _BEFORE = "before"
 _LIST_PATHS = tuple(f"/{file}" for file in LIST_FILES)
@@ -134,17 +135,19 @@ _LIST_PATHS = tuple(f"/{file}" for file in LIST_FILES)
 
 
 class RobotRelease(NamedTuple):
-    """What was done with the release of a robot."""
+    """The outcome of publishing for one robot."""
 
     robot: str
     """Name of the robot."""
     outcome: Annotated[str, Words(("published", "kept", "removed", "refused"))]
-    """``published``: a new release; ``kept``: nothing has changed; ``removed``: it has no enclaves
-    any more, or left the fleet; ``refused``: its earlier release stays, if there is one."""
+    """``published``: a new release; ``kept``: nothing has changed; ``removed``: the robot has no
+    enclaves any more, or left the fleet; ``refused``: the robot keeps its earlier release, if it
+    has one.
+    """
     number: int | None
-    """Number of the release that is published; null if none is."""
+    """Number of the release that is now published for the robot; null if none is."""
     why: str
-    """Why it was refused; else empty."""
+    """Why the release was refused; empty for other outcomes."""
 
 
 class PublishedFleet(NamedTuple):
@@ -153,28 +156,28 @@ class PublishedFleet(NamedTuple):
     keystore: NamedKeystore
     dry_run: DryRun
     folder: Path
-    """The publishing folder, as it was named."""
+    """The publishing folder, as given by the user."""
     robots: Sequence[RobotRelease]
     """The robots of the fleet, and those whose releases were removed, sorted by name."""
     rotated: Sequence[str]
-    """Roles that got a new key."""
+    """Roles that have a new key."""
     versions: Mapping[str, int]
-    """Versions of the metadata by name; the bins are ``robots-0`` and so on."""
+    """Versions of the metadata by name; the bins are named ``robots-0`` and so on."""
     expires: Mapping[str, datetime]
-    """Expiry of the metadata by name, also of ``root``, in UTC."""
+    """Expiry of the metadata by name, including ``root``, in UTC."""
     root: Path
-    """The root metadata that robots are to pin, in the publishing folder."""
+    """File in the publishing folder with the root metadata that robots should pin."""
     root_sha256: str
     """SHA-256 of the root metadata, in hexadecimal."""
     changes: FileChanges
     notes: Notes
 
     def names(self, outcome: str) -> list[str]:
-        """Return the robots with this outcome."""
+        """Return the robots with an outcome."""
         return [robot.robot for robot in self.robots if robot.outcome == outcome]
 
     def is_complete(self, now: datetime) -> bool:
-        """Return whether no robot was refused, and robots accept what was published."""
+        """Return whether no release was refused, and robots accept the metadata at ``now``."""
         return not self.names("refused") and all(end > now for end in self.expires.values())
 
 
@@ -195,10 +198,11 @@ def publish(
 
     Args:
         root: the keystore.
-        folder: the publishing folder, which is made if it is missing.
+        folder: the publishing folder; it is made if it is missing.
         now: the current time.
         expiry: how long new metadata is valid.
-        root_key: the file of the root key; None: in the keystore.  It is made if there is none yet.
+        root_key: the file of the root key, or None for a key in the keystore.  A missing key is
+            made when nothing was published yet.
         rotate: the roles that get new keys.
         restored: go on although the folder has later releases than the keystore knows.
         new_folder: go on although the folder has nothing of what the keystore published before.
@@ -206,9 +210,9 @@ def publish(
         dry_run: write nothing.
 
     Raises:
-        KeystoreError: the keystore has no fleet, ``folder`` is not its own or is in the way, or
-            it has later releases (without ``restored``) or nothing of what was published before
-            (without ``new_folder``), or a key is missing.
+        KeystoreError: the keystore has no fleet; a key is missing; ``folder`` cannot be used, or
+            belongs to another keystore; it has later releases than the keystore knows (without
+            ``restored``); or it has nothing of what was published before (without ``new_folder``).
         UnavailableError: the package ``tuf`` is not installed.
     """
     check_tuf()
@@ -226,7 +230,8 @@ def publish(
     with ExitStack() as stack:
         if not dry_run:
             made = make_folders(folder)
-            stack.callback(remove_folders, made)  # of these, the empty ones
+            # Of the folders that were made, only the empty ones.
+            stack.callback(remove_folders, made)
             opened = stack.enter_context(Folder(folder))
             for part in (_METADATA, _TARGETS, _ARCHIVES):
                 if not opened.is_folder(part):
@@ -257,7 +262,7 @@ def publish(
         if not dry_run:
             try:
                 run.write(keys)
-            except OSError as error:  # such as of a full disk
+            except OSError as error:  # for example if the disk is full
                 raise KeystoreError(
                     f"not all files could be written in '{folder}'",
                     f"{error.strerror}. Robots find either all earlier files or all new files.",
@@ -267,10 +272,10 @@ def publish(
 
 
 def later_in_folder(keystore: OpenedKeystore) -> str:
-    """Return a clause with evidence that the publishing folder is newer than the keystore.
+    """Return a clause with evidence that the publishing folder is newer than the keystore, or "".
 
-    "" if the folder is not newer, or if this is unknown here.  Only metadata that keys of the
-    keystore signed counts.
+    The result is also "" if this cannot be determined here.  Only metadata that the keystore's own
+    keys signed counts.
     """
     with suppress(SrosError, ValueError, OSError, KeyError, TypeError):
         if may_have_later_releases(keystore):
@@ -285,7 +290,7 @@ def later_in_folder(keystore: OpenedKeystore) -> str:
 
 
 def is_all_published(root: Path, published: PublishedRobot, enclaves: Sequence[str]) -> bool:
-    """Return whether the files of a robot are as they were when they were published last."""
+    """Return whether the files of a robot are unchanged since they were last published."""
     return published.files == _state(root, enclaves)
 
 
@@ -301,7 +306,7 @@ def _check_apart(root: Path, folder: Path) -> None:
 
 
 class _Keys:
-    """The keys of the roles, and the versions of the root metadata that name them."""
+    """The keys of the metadata roles, and the versions of the root metadata that name them."""
 
     def __init__(self, roots: Roots, root: Path, root_key: Path | None) -> None:
         """Prepare the keys of the keystore ``root``, whose root key may be at ``root_key``."""
@@ -317,9 +322,9 @@ class _Keys:
         self._new_elsewhere = b""
 
     def recover(self, dry_run: bool) -> None:
-        """Complete or undo a killed rotation of a root key that is outside of the keystore.
+        """Complete or undo an interrupted rotation of a root key outside of the keystore.
 
-        The root metadata of the keystore tells whether the new key counts already.
+        The root metadata in the keystore tells whether the new key is already in use.
         """
         if not self._elsewhere or not self.roots.versions:
             return
@@ -334,7 +339,7 @@ class _Keys:
             remove_file(spare)
 
     def _is_root_key(self, path: Path) -> bool | None:
-        """Return whether a file has the key that robots trust; None if it has no key."""
+        """Return whether a file has the root key that robots trust; None if it has no key."""
         from sros_tool.keystore.delivery.repository import load_signer
 
         try:
@@ -347,7 +352,7 @@ class _Keys:
         """Open or make the key of each role, and add a version of the root if a key changes.
 
         Raises:
-            KeystoreError: a key is missing, or is not the one that the root metadata names.
+            KeystoreError: a key is missing, or differs from the key that the root metadata names.
         """
         first = not self.roots.versions
         if first and (roles := [role for role in _ROLES if self._path(role).exists()]):
@@ -379,7 +384,7 @@ class _Keys:
         return self._root / fleet_key(role)
 
     def _online_signers(self, role: str, *, new: bool) -> list[CryptoSigner]:
-        """Return the signer of a role, and the previous signer while robots may still need it."""
+        """Return the signer of a role, and the previous one while robots may still need it."""
         from sros_tool.keystore.delivery.repository import load_signer, new_key, replaced_key
 
         path, before = self._path(role), self._path(f"{role}.{_BEFORE}")
@@ -400,7 +405,7 @@ class _Keys:
         return signers
 
     def _sign_root(self, expires: datetime, *, new: bool, is_required: bool) -> None:
-        """Add a version of the root, if its key is here; ``new`` makes another root key."""
+        """Add a version of the root, if its key is here; ``new`` also makes a new root key."""
         from sros_tool.keystore.delivery.repository import load_signer, new_key
 
         path = self._root_file
@@ -429,7 +434,7 @@ class _Keys:
         self.has_new_root = True
 
     def stage_elsewhere(self) -> None:
-        """Write a new root key that is not in the keystore, next to the one that it replaces."""
+        """Write a new root key outside of the keystore next to the key that it will replace."""
         if self._new_elsewhere and self._elsewhere:
             exists = self._elsewhere.exists()
             path = self._new_key_path(self._elsewhere) if exists else self._elsewhere
@@ -443,7 +448,7 @@ class _Keys:
                 put_in_place()
 
     def finish(self) -> None:
-        """Put a new root key outside of the keystore in its place, and remove the replaced keys."""
+        """Put the new root key outside of the keystore in its place, and remove replaced keys."""
         if self._new_elsewhere and self._elsewhere:
             with Folder(self._elsewhere.parent) as folder:
                 spare = self._new_key_path(self._elsewhere).name
@@ -455,12 +460,12 @@ class _Keys:
 
     @staticmethod
     def _new_key_path(path: Path) -> Path:
-        """Return where a new root key is until robots know it."""
+        """Return where a new root key is kept until robots know it."""
         return path.with_name(f"{path.name}.new")
 
 
 class _Changed(NamedTuple):
-    """A robot whose files may have changed: its enclaves, and a digest of its files' state."""
+    """A robot with possibly changed files: its enclaves, and a digest of the state of its files."""
 
     robot: str
     enclaves: Sequence[str]
@@ -468,10 +473,11 @@ class _Changed(NamedTuple):
 
 
 class _ReleaseOutcome(NamedTuple):
-    """Outcome of publishing a robot's release.
+    """The outcome of publishing a robot's release.
 
-    ``why`` says why it was refused, else it is empty.  ``published`` is the release that the robot
-    has from now on; None if it has none, because the first or the only archive is not there.
+    ``why`` says why the release was refused; otherwise it is empty.  ``published`` is the release
+    that the robot has now.  It is None if the robot has none, because its first or only archive is
+    missing.
     """
 
     robot: str
@@ -482,7 +488,7 @@ class _ReleaseOutcome(NamedTuple):
 
 
 class _RobotFiles(NamedTuple):
-    """The files of a robot's release by path, sorted, and what their evaluation found."""
+    """The files of a robot's release, sorted by path, and the result of their evaluation."""
 
     files: Mapping[str, bytes]
     not_valid: str
@@ -490,11 +496,11 @@ class _RobotFiles(NamedTuple):
 
 
 class _Evaluator:
-    """Evaluator of the files of releases.
+    """An evaluator for the files of releases.
 
-    A revocation changes one file of each enclave.  Where the others were evaluated before, it is
-    enough to evaluate the new list with one enclave of each kind, and to look for the certificates
-    of the others in the list.
+    A revocation changes only one file of each enclave.  If the other files were evaluated before,
+    two checks are enough: the new list is evaluated with one enclave of each kind, and the
+    certificates of the other enclaves are looked up in the list.
     """
 
     def __init__(self, keystore: OpenedKeystore, now: datetime) -> None:
@@ -503,9 +509,9 @@ class _Evaluator:
         self._lists: dict[object, bool] = {}
 
     def files(self, enclaves: Sequence[str], before: Evaluated | None) -> _RobotFiles:
-        """Return the files of a robot with these enclaves.
+        """Return the files of a robot with the given enclaves, evaluated.
 
-        ``before`` are the files that were evaluated for its last release.
+        ``before`` is the evaluation of its last release.
 
         Raises:
             SrosError: an enclave cannot run, or its files cannot be read.
@@ -525,9 +531,10 @@ class _Evaluator:
         return _RobotFiles(files, "; ".join(not_valid), evaluated if until > self._now else None)
 
     def _is_list_good(self, name: str, files: Mapping[str, bytes]) -> bool:
-        """Return whether an enclave of this kind accepts the revocation list and is not on it.
+        """Return whether an enclave accepts the revocation list, and is not on it.
 
-        False also where only the whole evaluation can tell.
+        The list is evaluated once for each kind of enclave.  The result is also False if only a
+        whole evaluation can tell.
         """
         folder = enclave_folder(name)
         data = files.get(f"{folder}/{CRL_FILE}")
@@ -562,7 +569,7 @@ def _sorted_by_path(enclaves: Iterable[Mapping[str, bytes]]) -> dict[str, bytes]
 
 
 def _digest_without_lists(files: Mapping[str, bytes]) -> str:
-    """Return a digest of files without revocation lists, and of the version that evaluates them."""
+    """Return a digest of files other than revocation lists, and of the evaluating version."""
     others = {path: data for path, data in files.items() if not path.endswith(f"/{CRL_FILE}")}
     return hashlib.sha256(__version__.encode() + b"\n" + listed_digests(others)).hexdigest()
 
@@ -578,7 +585,7 @@ class _Run:
         expiry: MetadataExpiry,
         dry_run: bool,
     ) -> None:
-        """Read what was published, and what is in the folder."""
+        """Read what was published before, and what is in the folder now."""
         from sros_tool.keystore.delivery.repository import Roots, read_present
 
         self.keystore = keystore
@@ -618,7 +625,7 @@ class _Run:
 
     @contextmanager
     def reporting_restore(self) -> Iterator[None]:
-        """Say in an error what `check_restored` has changed in the keystore before."""
+        """Add to an error what `check_restored` has already changed in the keystore."""
         try:
             yield
         except SrosError as error:
@@ -631,11 +638,11 @@ class _Run:
     def check_restored(self, restored: bool, new_folder: bool, keyring: Keyring) -> None:
         """Refuse a folder that has, or may have had, later releases than the keystore knows.
 
-        With ``restored`` (the keystore comes from a backup), later releases are not refused, and
-        the enclaves that they revoke are revoked again.  A folder without any release is refused
-        without ``new_folder``, and another folder than last time as long as that one has later
-        releases.  In both cases, numbers and versions go on from the seconds since
-        1970, because the numbers that the earlier keystore gave are not known.
+        With ``restored`` (the keystore comes from a backup), later releases are accepted, and the
+        enclaves that they revoke are revoked again.  A folder without releases is refused unless
+        ``new_folder`` is set.  Another folder than last time is refused as long as the last folder
+        has later releases.  With ``restored`` or ``new_folder``, the next numbers and versions are
+        the seconds since 1970, because the numbers that were given before are not known.
 
         Raises:
             DocumentError: the list of published releases has numbers that were never given.
@@ -672,14 +679,14 @@ class _Run:
                 self._notes.append(self._not_shown_note())
             self._restore(forgotten, keyring)
             self._check_replaced_keys()
-        if not (is_later and self._dry_run):  # which has not revoked again
+        if not (is_later and self._dry_run):  # a dry run has not revoked the enclaves again
             self._check_removed()
         if is_lost or restored:
             self._least = int(self._now.timestamp())
             self.list.robots.clear()
 
     def _shows_restore(self) -> bool:
-        """Return whether PUB, the ledger or a robot shows that the keystore was restored."""
+        """Return whether the folder, the ledger or a robot shows that the keystore was restored."""
         known, present = self.list.versions, self._present.versions()
         if self._has_later_root or any(present.get(name, 0) > known[name] for name in known):
             return True
@@ -708,13 +715,13 @@ class _Run:
 
     @property
     def _is_other_folder(self) -> bool:
-        """Whether the keystore published to another folder last."""
+        """Whether the keystore last published to another folder."""
         return self._earlier_folder not in ("", self.list.folder)
 
     def _check_earlier_folder(self) -> None:
-        """Refuse another folder while the one of the last publication has later releases.
+        """Refuse another folder while the folder of the last publication has later releases.
 
-        From then on, nothing would look there, and publishing there would be no evidence any more.
+        Once the keystore records another folder, the later releases would no longer be noticed.
         """
         if evidence := later_in_folder(self.keystore):
             where = f"{quote(str(self.keystore.root))} {quote(self._earlier_folder)}"
@@ -738,13 +745,13 @@ class _Run:
         )
 
     def _learned_after_restore(self) -> bool:
-        """Return whether the ledger has learned since its last release what the backup lacks."""
+        """Return whether, after the last release, the ledger recorded what the backup lacked."""
         marked = self.keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
         marks = [entry.what for entry in marked if entry.what in (RESTORED, "release")]
         return marks[-1:] == [RESTORED]
 
     def _not_shown_note(self) -> Note:
-        """Return a note on revocations that neither the keystore nor PUB has."""
+        """Return a note on revocations that neither keystore nor publishing folder shows."""
         where, since = quote(str(self.keystore.root)), "the backup"
         last = self.keystore.ledger_file.last_time()
         if last and not self._learned_after_restore():
@@ -778,14 +785,15 @@ class _Run:
         )
 
     def _has_later_releases(self, restored: bool) -> bool:
-        """Return whether the folder has later releases; refuse that unless ``restored``."""
+        """Return whether the folder has later releases, which is an error unless ``restored``."""
         if self.list.number >= (unused := self.keystore.ledger_file.next_number()):
             why = f"It has release {self.list.number}, but the ledger has none after {unused - 1}."
             raise damaged_list_error(self.keystore, why)
         latest = self._latest
         if latest <= self.list.number:
             return False
-        # Not by the next number of the ledger: a restored keystore may have issued files since.
+        # The next number of the ledger does not tell: a restored keystore may have issued files
+        # since.
         entries = self.keystore.ledger_with("what", "release").entries
         if any(entry.what == "release" and entry.number == latest for entry in entries):
             return False
@@ -805,9 +813,9 @@ class _Run:
         return True
 
     def _check_removed(self) -> None:
-        """Refuse to publish for a robot that was removed after the state that the keystore has.
+        """Refuse to publish for a robot that later metadata in the folder no longer has.
 
-        The releases of other robots may not show whether it was revoked, or left the fleet.
+        The other releases do not show whether the robot was revoked or left the fleet.
         """
         from sros_tool.keystore.delivery.repository import RENEWED_ALONE
 
@@ -833,13 +841,13 @@ class _Run:
 
     @property
     def _latest(self) -> int:
-        """The highest number of a release in the folder; 0 without one."""
+        """The highest number of a release in the folder; 0 without a release."""
         return max((release.number for release in self._there.values()), default=0)
 
     def _last_read(self) -> Release:
-        """Return a last release in the folder: its CAs and its revocation list are the last ones.
+        """Return a release with the highest number, which has the last CAs and revocation list.
 
-        Robots without a last release may have been refused since, and still have earlier files.
+        Robots without such a release may have been refused since, and still have earlier files.
         """
         problem = ""
         last = (robot for robot in self._there.items() if robot[1].number == self._number)
@@ -864,11 +872,11 @@ class _Run:
         )
 
     def _check_authorities(self, last: Release) -> None:
-        """Refuse to bring back CAs that were replaced after the backup.
+        """Refuse to publish with CAs that were replaced after the backup.
 
         Raises:
-            KeystoreError: the keystore has a CA that a later one in the release ``last`` replaced,
-                or lacks the newest CA.
+            KeystoreError: the keystore has a CA that the release ``last`` shows as replaced, or
+                lacks the newest CA.
         """
         replaced: dict[str, x509.Certificate] = {}
         for role, file in ((IDENTITY, IDENTITY_CA_FILE), (PERMISSIONS, PERMISSIONS_CA_FILE)):
@@ -910,7 +918,7 @@ class _Run:
         )
 
     def _restore(self, forgotten_lists: Forgotten, keyring: Keyring) -> None:
-        """Record that the keystore was restored, and revoke again what ``forgotten_lists`` have.
+        """Record that the keystore was restored, and revoke again what ``forgotten_lists`` revoke.
 
         Certificates in releases that the keystore sealed are recorded, so that `revoke` knows them.
         """
@@ -942,9 +950,9 @@ class _Run:
         self._notes += revocation.notes
 
     def _check_replaced_keys(self) -> None:
-        """Refuse to certify the earlier key of an enclave whose last release has another one.
+        """Refuse to publish if the keystore has an earlier key of an enclave than its last release.
 
-        The seal shows it even if the keystore has lost the identity CA of that release.
+        The seal shows this even if the keystore has lost the identity CA of the release.
         """
         last = {
             release.robot: release
@@ -984,10 +992,10 @@ class _Run:
         return False
 
     def _unknown_releases(self) -> list[Release]:
-        """Return the sealed releases, by number, that the keystore does not know, or whose list.
+        """Return the sealed releases, by number, whose number or list the keystore does not know.
 
-        One that has only files that the keystore has or issued undoes nothing: publishing was
-        interrupted before the ledger got its number.
+        A release is left out if the keystore has or issued all its files, because then publishing
+        was only interrupted before the ledger recorded its number.
         """
         known = self._known_numbers()
         forgotten = Forgotten(self.keystore, self._now)
@@ -1004,7 +1012,7 @@ class _Run:
         return sorted(unknown, key=lambda release: release.number)
 
     def _issued_all_files_of(self, release: Release) -> bool:
-        """Return whether the keystore has every file of a release, or issued what is in it."""
+        """Return whether the keystore has, or has issued, every file of a release."""
         with suppress(SrosError, OSError):
             digests = {
                 path: digest(load_certificates(data, path)[0])
@@ -1028,7 +1036,7 @@ class _Run:
         return {entry.number for entry in entries if entry.what == "release"}
 
     def _check_seals(self) -> None:
-        """Refuse a folder without metadata that has later releases of a CA that is unknown here."""
+        """Refuse a folder without metadata in which an unknown CA sealed releases."""
         known, authorities = self._known_numbers(), self.keystore.authority(PERMISSIONS)
         foreign = {
             release.robot
@@ -1078,7 +1086,7 @@ class _Run:
         yield from (each for each in self._releases() if not seal_problem(each, authorities))
 
     def _releases(self) -> Iterator[Release]:
-        """Yield the releases in all archives, whoever sealed them."""
+        """Yield the releases in all archives, by any CA."""
         for path in self._paths():
             if path.startswith(f"{_ARCHIVES}/"):
                 with suppress(SrosError):
@@ -1088,9 +1096,9 @@ class _Run:
     # ── which robots ───────────────────────────────────────────────────────────────────────
 
     def changed_robots(self, among: Sequence[_Changed] | None = None) -> list[_Changed]:
-        """Return the robots that may need a new release; forget those that have no enclaves.
+        """Return the robots that may need a new release, and forget robots without enclaves.
 
-        Only the robots ``among`` are looked at; None looks at all.
+        If ``among`` is given, only these robots are examined.
         """
         root, fleet = self.keystore.root, recorded_fleet(self.keystore)
         changed_robots, wanted = [], set()
@@ -1115,7 +1123,7 @@ class _Run:
         return changed_robots
 
     def _enclaves(self, fleet: Fleet, robot: str) -> list[str]:
-        """Return the enclaves of a robot with certificates; none if it is not in the fleet."""
+        """Return a robot's enclaves that have certificates; none if it is not in the fleet."""
         if robot not in fleet.robots:
             return []
         return [
@@ -1129,7 +1137,7 @@ class _Run:
         return bool(self._read(robot, release))
 
     def _bring_files_of(self, robot: str, release: PublishedRelease) -> bool:
-        """Return whether the folder has a release; it is copied from the earlier folder if not."""
+        """Return whether the folder has a release; copy it from the earlier folder if needed."""
         if self._has_files_of(robot, release):
             return True
         data = self._earlier_folder and self._read(robot, release, Path(self._earlier_folder))
@@ -1139,9 +1147,9 @@ class _Run:
         return bool(data)
 
     def _read(self, robot: str, release: PublishedRelease, folder: Path | None = None) -> bytes:
-        """Return the archive of a release; empty if it is missing or damaged.
+        """Return the archive of a release in ``folder``; empty if missing or damaged.
 
-        ``folder`` is the publishing folder if None is given.
+        The default for ``folder`` is the publishing folder.
         """
         path = (folder or self._folder) / release.path(robot)
         try:
@@ -1153,9 +1161,9 @@ class _Run:
     # ── their releases ─────────────────────────────────────────────────────────────────────
 
     def release(self, changed_robots: Sequence[_Changed], change: KeystoreChange) -> None:
-        """Write the archives of new releases; no metadata names them yet.
+        """Write the archives of new releases, which no metadata names yet.
 
-        ``changed_robots`` are the robots that seemed changed before the keystore was locked.
+        ``changed_robots`` are those that seemed changed before the keystore was locked.
         """
         changed = self.changed_robots(changed_robots)
         unused = change.keystore.ledger_file.next_number()
@@ -1195,7 +1203,7 @@ class _Run:
     def _release_all(
         self, robots: Sequence[_Changed], number: int, authority: Authority | None
     ) -> Iterator[_ReleaseOutcome]:
-        """Yield the outcome for each robot; without ``authority`` nothing is written."""
+        """Yield the outcome for each robot; if ``authority`` is None, nothing is written."""
         evaluator = _Evaluator(self.keystore, self._now)
         new: list[tuple[_Changed, _RobotFiles, str]] = []
         for robot in robots:
@@ -1243,7 +1251,7 @@ class _Run:
     # ── metadata ───────────────────────────────────────────────────────────────────────────
 
     def compose(self, keys: _Keys) -> None:
-        """Make the metadata, and note which files it no longer names."""
+        """Compose the metadata, and note which files it no longer names."""
         from sros_tool.keystore.delivery.repository import Composer
 
         composer = Composer(
@@ -1272,9 +1280,9 @@ class _Run:
         }
 
     def _paths(self) -> Iterator[str]:
-        """Yield the paths in the folder of files that may be removed one day."""
+        """Yield the paths of files in the folder that may be removed at some time."""
         if not (self._folder / _ARCHIVES).exists():
-            return  # a dry run before anything was published
+            return  # a dry run, before anything was published
         with Folder(self._folder) as folder:
             for part in (_METADATA, _ARCHIVES):
                 paths = (f"{part}/{name}" for name in folder.names(part))
@@ -1300,15 +1308,15 @@ class _Run:
                 put_in_place()
 
     def keep_changes(self, change: KeystoreChange) -> None:
-        """Note the changes of the keystore, once they are committed."""
+        """Remember the committed changes of the keystore for the result."""
         self._changes = changes_below(self.keystore.root, change.transaction.changes)
 
     def write(self, keys: _Keys) -> None:
-        """Write the metadata, the timestamp last; then remove files long unused.
+        """Write the metadata, with the timestamp last; then remove files that are long unused.
 
-        A new root is written first if the current metadata already fits it; otherwise after the
-        new metadata, which the keys of both roots have signed.  So robots find complete metadata
-        at every moment.
+        A new root is written first if the current metadata already fits it.  Otherwise it is
+        written after the new metadata, which the keys of both roots have signed.  So robots find
+        complete metadata at every moment.
         """
         assert self._composed
         with Folder(self._folder) as folder:
@@ -1337,7 +1345,7 @@ class _Run:
     # ── the result ─────────────────────────────────────────────────────────────────────────
 
     def result(self, keys: _Keys) -> PublishedFleet:
-        """Return what was done."""
+        """Return the result of publishing."""
         outcomes = {robot: RobotRelease(robot, "removed", None, "") for robot in self._removed}
         for robot, kept in self.list.robots.items():
             outcomes[robot] = RobotRelease(robot, "kept", kept.release.number, "")
@@ -1363,7 +1371,7 @@ class _Run:
 
 
 def _state(root: Path, names: Sequence[str]) -> str:
-    """Return a digest of inode, size and times of all files in the releases of enclaves."""
+    """Return a digest of the inodes, sizes and times of all files in the releases of enclaves."""
     digest = hashlib.sha256()
     for name in names:
         folder = os.fspath(enclave_path(root, name))

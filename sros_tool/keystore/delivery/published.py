@@ -1,7 +1,7 @@
 """What was published last for a fleet, as the keystore records it in ``published.json``.
 
-The file saves work, and has the last version numbers, so that the next ones are higher.  Robots
-never rely on it.
+The file saves work, and has the last version numbers, so that the next ones are higher.  Robots do
+not depend on it.
 """
 
 from __future__ import annotations
@@ -30,18 +30,20 @@ _FORMAT = 1
 _MOST_BYTES = 128 * 1024 * 1024
 _SMALL = 64 * 1024
 _ARCHIVES_OF_FLEET, _ARCHIVES_OF_ROBOT = 500, 50
-"""How many archives a publishing folder can have for all robots, and further ones for each robot
-that the keystore knows: it keeps replaced ones for two days."""
+"""Maximum number of archives in a publishing folder: for all robots, and in addition per robot.
+
+Replaced archives are kept for two days.
+"""
 MOST_NUMBER = 10**12 - 1
-"""Highest number of a release, as a seal can state it, and highest version of metadata."""
+"""Highest number of a release that a seal can have, and highest version of metadata."""
 BEGIN_AGAIN = "Start again as after a theft of all keys: docs/fetching.md says how."
-"""Remedy if somebody has used up the numbers."""
+"""The remedy if somebody has used up the numbers."""
 _TIMESTAMP = "metadata/timestamp.json"
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 
 
 class PublishedRelease(NamedTuple):
-    """The archive of a robot's release as the metadata describes it."""
+    """The archive of a robot's release, as described by the metadata."""
 
     number: int
     """Number of the release."""
@@ -56,7 +58,7 @@ class PublishedRelease(NamedTuple):
         return f"targets/{folder}/{self.sha256}.{name}"
 
     def checked(self) -> PublishedRelease:
-        """Return the release; raise `ValueError` if a value is one that sros never publishes."""
+        """Return this release; raise `ValueError` if it has a value that sros never publishes."""
         for value, most in ((self.number, MOST_NUMBER), (self.length, OF_ONE_ROBOT.packed)):
             check_count(value, most)
         if not (isinstance(self.sha256, str) and _DIGEST.match(self.sha256)):
@@ -65,16 +67,16 @@ class PublishedRelease(NamedTuple):
 
 
 def check_count(value: object, maximum: int = MOST_NUMBER) -> int:
-    """Return the number of a release or a version; raise `ValueError` for any other value."""
+    """Return a number of a release or version; raise `ValueError` for any other value."""
     if type(value) is not int or not 1 <= value <= maximum:
         raise ValueError("a release number or version is no number, or is too high")
     return value
 
 
 class Evaluated(NamedTuple):
-    """For how long the files of a robot, in which no problem was found, need no new evaluation.
+    """Until when the files of a robot, which have no problems, need no new evaluation.
 
-    ``files`` is a digest of the files, except revocation lists, and of the version of sros.
+    ``files`` is a digest of the files without revocation lists, and of the version of sros.
     """
 
     files: str
@@ -82,15 +84,16 @@ class Evaluated(NamedTuple):
     until: datetime
 
     def holds(self, files: str, now: datetime) -> bool:
-        """Return whether the files with the digest ``files`` need no evaluation at ``now``."""
+        """Return whether files with the digest ``files`` need no new evaluation at ``now``."""
         return self.files == files and self.since <= now < self.until
 
 
 class PublishedRobot(NamedTuple):
-    """What was published last for a robot, and what it was made from.
+    """What was published last for a robot, and from which files.
 
-    ``content`` is the SHA-256 of the list of its files.  ``files`` is a digest of the inodes, sizes
-    and times of these files in the keystore: if it is the same, nothing changed for the robot.
+    ``content`` is the SHA-256 of the list of the release's files.  ``files`` is a digest of the
+    inodes, sizes and times of these files in the keystore: if it is the same, nothing has changed
+    for the robot.
     """
 
     release: PublishedRelease
@@ -121,7 +124,7 @@ class Published:
 
     @property
     def number(self) -> int:
-        """The highest number of a release; 0 without one."""
+        """The highest number of a release; 0 without a release."""
         return max((robot.release.number for robot in self.robots.values()), default=0)
 
     def paths(self) -> Iterator[str]:
@@ -130,9 +133,9 @@ class Published:
         yield from (robot.release.path(name) for name, robot in sorted(self.robots.items()))
 
     def lacking(self) -> str:
-        """Return the first file that is missing in the publishing folder; "" if none is.
+        """Return the first file that is missing in the publishing folder, or "".
 
-        Also "" if the folder is not here, such as one on a disk that is not mounted.
+        The result is also "" if the folder is not here, for example on a disk that is not mounted.
         """
         paths = (_TIMESTAMP, *self.paths())
         with suppress(OSError):
@@ -141,7 +144,7 @@ class Published:
         return ""
 
     def document(self, now: datetime) -> bytes:
-        """Return the content of the file."""
+        """Return the content of ``published.json``."""
         robots = {name: _as_json(robot) for name, robot in sorted(self.robots.items())}
         superseded = {path: iso(time) for path, time in sorted(self.superseded.items())}
         value = {
@@ -157,7 +160,7 @@ class Published:
 
 
 def read_published(keystore: OpenedKeystore) -> Published:
-    """Return what was published last; empty if nothing was.
+    """Return what was published last; an empty value if nothing was published.
 
     Raises:
         DocumentError: the file is damaged.
@@ -185,8 +188,8 @@ def read_published(keystore: OpenedKeystore) -> Published:
 def may_have_later_releases(keystore: OpenedKeystore) -> bool:
     """Return whether the publishing folder has later metadata than the keystore recorded.
 
-    If so, the keystore was restored from a backup, or somebody else wrote the metadata, which is
-    not verified here.
+    If so, the keystore was restored from a backup, or somebody else wrote the metadata, which this
+    function does not verify.
     """
     with suppress(SrosError, ValueError, OSError, KeyError, TypeError):
         known = read_published(keystore)
@@ -200,11 +203,11 @@ def may_have_later_releases(keystore: OpenedKeystore) -> bool:
 
 
 def later_revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
-    """Return the serials that the keystore's lists in a folder with later releases revoke.
+    """Return the serial numbers that the keystore's lists in later releases revoke.
 
     Raises:
-        KeystoreError: the folder has more archives than the fleet can need: whoever has the web
-            server could else keep the keystore busy forever.
+        KeystoreError: the folder has more archives than the fleet can need.  Without this limit,
+            whoever runs the web server could keep the keystore busy forever.
     """
     serials: set[int] = set()
     read_lists: set[bytes] = set()
@@ -233,7 +236,7 @@ def later_revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
 
 
 def damaged_list_error(keystore: OpenedKeystore, why: str = "") -> DocumentError:
-    """Return the error for a damaged list of published releases; ``why`` is its reason."""
+    """Return the error for a damaged list of published releases; ``why`` is the reason."""
     return DocumentError(
         f"'{keystore.root / PUBLISHED}' is damaged",
         why,

@@ -8,9 +8,9 @@ with the seal ``release.p7s``: a signed message of the lines ::
     number N
     SHA-256  PATH      (a line for each file, sorted)
 
-The number rises with each new content, so that a robot notices an older release.  Whoever carries
-a release, or has the keys of the metadata that lead to it, can therefore neither change it, nor
-give it to another robot, nor bring back an earlier one.
+The number rises with each new content, so that a robot notices an older release.  Therefore nobody
+who carries a release, or has the keys of the metadata, can change a release, give it to another
+robot, or bring back an earlier release.
 """
 
 from __future__ import annotations
@@ -40,8 +40,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.issuing.authority import Authority
 
 RELEASE_FILES = frozenset({*REQUIRED_FILES, *OPTIONAL_FILES, *ZENOH_FILES} - {KEY_FILE})
-"""The files of an enclave that a release can have: neither the key nor the file that names its
-token."""
+"""The files of an enclave that a release can have: neither ``key.pem`` nor ``key.p11``."""
 _SEALED = re.compile(rb"sros release 1\nrobot ([^\n]{1,255})\nnumber ([1-9][0-9]{0,11})\n")
 
 
@@ -50,9 +49,9 @@ class Release:
     """What the security folder of ``robot`` has to contain.
 
     ``number`` is higher than those of all earlier releases of the robot.  ``files`` maps paths
-    (``enclaves/r1/base/cert.pem``) to contents, without private keys; an enclave of which it has no
-    file is no longer one of this robot.  ``seal`` is the signed message with robot, number and the
-    digests of all files; `seal_problem` verifies it.
+    (``enclaves/r1/base/cert.pem``) to contents, without private keys.  An enclave without files in
+    the release no longer belongs to the robot.  ``seal`` is the signed message with robot, number
+    and the digests of all files; `seal_problem` verifies it.
     """
 
     robot: str
@@ -61,7 +60,7 @@ class Release:
     seal: bytes
 
     def enclaves(self) -> dict[str, dict[str, bytes]]:
-        """Map the names of the enclaves to their files, by file name."""
+        """Map the names of enclaves to their files (contents by file name)."""
         enclaves: dict[str, dict[str, bytes]] = {}
         for path, data in self.files.items():
             name, file = _enclave_and_file(path)
@@ -87,7 +86,7 @@ def release_target(robot: str) -> str:
 
 
 class SealedRobot(NamedTuple):
-    """Robot and number in a seal, which is not verified."""
+    """The robot and the number in a seal that is not verified."""
 
     robot: str
     number: int
@@ -96,24 +95,24 @@ class SealedRobot(NamedTuple):
 def seal_releases(
     releases: Sequence[tuple[str, int, Mapping[str, bytes]]], authority: Authority
 ) -> list[bytes]:
-    """Return the seals (S/MIME) of releases, each given as robot, number and files, in order."""
+    """Return the seals (S/MIME) of releases, each given as (robot, number, files), in order."""
     documents = [_text(robot, number, files) for robot, number, files in releases]
     return authority.sign_all(documents, "the file list of a release")
 
 
 def pack_release(release: Release) -> bytes:
-    """Return the archive of a release; the same release always gives the same bytes."""
+    """Return the archive of a release; equal releases give equal bytes."""
     return pack({**release.files, RELEASE_SEAL: release.seal})
 
 
 def read_release(data: bytes) -> Release:
-    """Return the release in an archive, whose files are exactly those that its seal lists.
+    """Return the release in an archive whose files are exactly those that its seal lists.
 
-    Who signed the seal is not verified: `seal_problem` does that.
+    The signer of the seal is not verified; `seal_problem` does that.
 
     Raises:
         DocumentError: the archive is damaged or too large; it has a file that does not belong to an
-            enclave, such as a private key; or its files differ from the list in the seal.
+            enclave's release, such as a private key; or its files differ from the list in the seal.
     """
     try:
         files = unpack(data, OF_ONE_ROBOT)
@@ -131,10 +130,10 @@ def read_release(data: bytes) -> Release:
 
 
 def sealed_robot(seal: bytes) -> SealedRobot:
-    """Return robot and number in a seal, without verifying it.
+    """Return the robot and the number in a seal, without verifying the seal.
 
     Raises:
-        DocumentError: it is not the seal of a release.
+        DocumentError: the message is not the seal of a release.
     """
     head = _SEALED.match(smime.parse(seal).text)
     robot = head[1].decode("ascii", "replace") if head else ""
@@ -164,10 +163,10 @@ def _text(robot: str, number: int, files: Mapping[str, bytes]) -> bytes:
 
 
 def _enclave_and_file(path: str) -> tuple[str, str]:
-    """Return the enclave and the file name in the path of a file in a release.
+    """Return the enclave and the file name for a path in a release.
 
     Raises:
-        SrosError: the path is not that of a file which a release can have.
+        SrosError: a release cannot have a file at this path.
     """
     folder, _, file = path.rpartition("/")
     if file not in RELEASE_FILES or not f"{folder}/".startswith(f"{ENCLAVES}/"):

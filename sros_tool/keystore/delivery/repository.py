@@ -1,9 +1,9 @@
 """The metadata of The Update Framework (TUF) in a publishing folder: reading and writing it.
 
-Top-level targets delegates to bins, each with the releases of about 32 robots, so that a robot
-transfers little.  All files but the timestamp have their version in the name and are never changed;
-robots read the timestamp first, so it is written last: if the writing is interrupted, robots still
-find the earlier metadata.
+The top-level targets role delegates to bins, each with the releases of about 32 robots, so that a
+robot transfers little.  All metadata files except the timestamp have their version in the name and
+never change.  Robots read the timestamp first, so it is written last: if writing is interrupted,
+robots still find the earlier metadata.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from sros_tool.xml import read_bytes
 
 _ROOT, _TARGETS, _SNAPSHOT, _TIMESTAMP = Root.type, Targets.type, Snapshot.type, Timestamp.type
 RENEWED_ALONE = frozenset({_TIMESTAMP, _SNAPSHOT})
-"""The metadata that is renewed when nothing new is published."""
+"""The metadata that is renewed even if nothing new is published."""
 _METADATA = "metadata"
 """The folder of the metadata in a publishing folder."""
 _BINS = "robots"
@@ -70,7 +70,7 @@ def new_key() -> bytes:
 
 
 def load_signer(data: bytes, label: str) -> CryptoSigner:
-    """Return the signer with an Ed25519 key (PEM); ``label`` names its file in errors."""
+    """Return a signer for an Ed25519 key (PEM); ``label`` names the file of the key in errors."""
     try:
         key = serialization.load_pem_private_key(data, None)
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
@@ -81,7 +81,7 @@ def load_signer(data: bytes, label: str) -> CryptoSigner:
 
 
 def replaced_key(role: str) -> str:
-    """Return the remedy for a lost key of this role, as a sentence."""
+    """Return the remedy for a lost key of a role, as a sentence."""
     return (
         "Restore it from a backup, or make another with --rotate-key "
         f"{role} of `sros fleet publish`."
@@ -98,16 +98,16 @@ _NAME_ROOT = (
 
 
 class Roots:
-    """The versions of the root metadata, oldest first; the keys of each version sign the next.
+    """The versions of the root metadata, oldest first; the keys of each version sign the next one.
 
-    A robot that has any version can verify the last version.
+    A robot that has any version can verify the last one.
     """
 
     def __init__(self, documents: Sequence[Mapping[str, object]] = ()) -> None:
-        """Read the versions from their JSON values.
+        """Read the versions from JSON values.
 
         Raises:
-            DocumentError: they are not a chain of root metadata.
+            DocumentError: the values are not a chain of root metadata.
         """
         self.versions: list[Metadata[Root]] = []
         try:
@@ -122,9 +122,9 @@ class Roots:
             raise DocumentError("it is not a chain of root metadata", f"{error}.") from error
 
     def follow(self, folder: Path) -> None:
-        """Add the later versions in a publishing folder that the last version's key signed.
+        """Add later versions in a publishing folder, verified by the last version's keys.
 
-        A keystore that was restored from a backup does not know them, but robots do.
+        A keystore that was restored from a backup does not have these versions, but robots do.
         """
         while self.versions:
             path = folder / _METADATA / f"{self.last.version + 1}.{_ROOT}.json"
@@ -144,14 +144,14 @@ class Roots:
         return [version.to_dict() for version in self.versions]
 
     def files(self) -> Iterator[tuple[str, bytes]]:
-        """Yield path in the publishing folder and content of each version."""
+        """Yield the path in the publishing folder and the content of each version."""
         for version in self.versions:
             yield f"{_METADATA}/{version.signed.version}.{_ROOT}.json", _bytes(version)
 
     def add(
         self, signers: Mapping[str, CryptoSigner], keys: Sequence[CryptoSigner], expires: datetime
     ) -> None:
-        """Add a version that names the keys of ``signers`` by role, signed by ``keys``."""
+        """Add a version that names the keys of ``signers``, by role, and is signed by ``keys``."""
         number = self.last.version + 1 if self.versions else 1
         root = Root(version=number, expires=expires, consistent_snapshot=True)
         for role, signer in signers.items():
@@ -162,11 +162,11 @@ class Roots:
         self.versions.append(version)
 
     def has_key(self, role: str, signer: CryptoSigner) -> bool:
-        """Return whether the current root metadata names the key of ``signer`` for ``role``."""
+        """Return whether the current root metadata names the key of ``signer`` for a role."""
         return signer.public_key.keyid in self.last.roles[role].keyids
 
     def check_signer(self, role: str, signer: CryptoSigner, path: Path) -> None:
-        """Raise `KeystoreError` unless ``signer``, read from ``path``, has the key of ``role``."""
+        """Raise `KeystoreError` unless ``signer``, read from ``path``, has the key of a role."""
         if not self.has_key(role, signer):
             raise KeystoreError(
                 f"'{path}' is not the {role} key with which this keystore publishes",
@@ -177,7 +177,7 @@ class Roots:
     def verify(
         self, role: str, metadata: Metadata[Timestamp] | Metadata[Snapshot] | Metadata[Targets]
     ) -> None:
-        """Raise `RepositoryError` unless the keys of any version signed ``metadata``."""
+        """Raise `RepositoryError` unless the keys of some root version signed ``metadata``."""
         for version in reversed(self.versions):
             if _is_signed(version.signed, role, metadata):
                 return
@@ -209,7 +209,7 @@ def _is_signed(
 
 @dataclass
 class Present:
-    """The metadata in a publishing folder, as its timestamp names it; empty without a timestamp."""
+    """The metadata in a publishing folder that its timestamp names; empty without a timestamp."""
 
     timestamp: Metadata[Timestamp] | None = None
     snapshot: Metadata[Snapshot] | None = None
@@ -218,7 +218,7 @@ class Present:
     bins: dict[str, Metadata[Targets]] = field(default_factory=dict)
 
     def versions(self) -> dict[str, int]:
-        """Map the names of all metadata to their versions."""
+        """Map the names of all metadata to versions."""
         if not (self.timestamp and self.snapshot):
             return {}
         parts = {_TIMESTAMP: self.timestamp.signed.version, _SNAPSHOT: self.snapshot.signed.version}
@@ -237,17 +237,17 @@ class Present:
         }
 
     def follows(self, root: Root) -> bool:
-        """Return whether a robot that knows ``root`` accepts the metadata."""
+        """Return whether a robot that has ``root`` accepts the metadata."""
         parts = ((_TIMESTAMP, self.timestamp), (_SNAPSHOT, self.snapshot), (_TARGETS, self.targets))
         return all(part is not None and _is_signed(root, role, part) for role, part in parts)
 
 
 def read_present(folder: Path, roots: Roots) -> Present:
-    """Return the metadata in a publishing folder, after verifying it by any version of the root.
+    """Return the metadata in a publishing folder, verified by any version of the root.
 
     Raises:
-        KeystoreError: the folder has metadata that the keys of this keystore did not sign, or that
-            is damaged.
+        KeystoreError: the folder has metadata that the keys of this keystore did not sign, or
+            damaged metadata.
     """
     try:
         with Folder(folder) as opened:
@@ -327,10 +327,10 @@ def _read(
 
 
 class Composed(NamedTuple):
-    """New metadata: the files in the order in which they have to be written.
+    """New metadata: the files in the order in which to write them.
 
-    ``versions`` and ``expires`` map the names of all metadata, also of unchanged metadata, to
-    version and expiry.
+    ``versions`` and ``expires`` map the names of all metadata, changed or not, to version and
+    expiry.
     """
 
     files: Sequence[tuple[str, bytes]]
@@ -339,10 +339,10 @@ class Composed(NamedTuple):
 
 
 class Composer:
-    """Makes the metadata for releases, and keeps existing metadata that still fits.
+    """A composer of the metadata for releases, which keeps existing metadata that still fits.
 
-    ``signers`` has the signers of each role: the current one, and during a rotation of its key also
-    the previous one: robots that do not know the new root yet ask for its signature.
+    ``signers`` has the signers of each role.  While a key is rotated, this includes the previous
+    signer, because robots that do not have the new root yet demand its signature.
     """
 
     def __init__(
@@ -358,10 +358,10 @@ class Composer:
         """Prepare to compose.
 
         Args:
-            present: what is in the publishing folder.
-            signers: by role, the current one first.
+            present: the metadata in the publishing folder.
+            signers: the signers of each role, the current one first.
             known: the versions that were published before, as far as the keystore knows.
-            least: a number that new versions have to exceed.
+            least: a number that new versions must exceed.
             expiry: how long new metadata is valid.
             now: the current time.
         """
@@ -377,7 +377,7 @@ class Composer:
         self._expires: dict[str, datetime] = {}
 
     def compose(self, releases: Mapping[str, PublishedRelease]) -> Composed:
-        """Return the metadata for ``releases``, by robot."""
+        """Return the metadata for ``releases``, which maps robots to releases."""
         roles = self._roles(len(releases))
         targets: dict[str, dict[str, TargetFile]] = {name: {} for name in roles.get_roles()}
         for robot, release in sorted(releases.items()):
@@ -405,9 +405,9 @@ class Composer:
         return Composed(self._files, self.versions, self._expires)
 
     def _roles(self, robots: int) -> SuccinctRoles:
-        """Return the bins (TUF); their number is a power of two that grows with the fleet.
+        """Return the bins (TUF); their number is a power of two, and grows with the fleet.
 
-        The current number stays until four times as many are wanted.
+        The number only changes when four times as many bins are needed.
         """
         bits = max(1, ceil(log2(max(1, robots / _ROBOTS_OF_A_BIN))))
         before = self._present.targets and self._present.targets.signed.delegations
@@ -417,16 +417,16 @@ class Composer:
         return SuccinctRoles([self._signers[_TARGETS][0].public_key.keyid], 1, bits, _BINS)
 
     def _is_current(self, name: str, metadata: Metadata[_Content]) -> bool:
-        """Return whether this is the last version of ``name``, and half of its validity is left.
+        """Return whether metadata is the last version of ``name``, with half of its validity left.
 
-        The last version may be in another folder, to which the keystore has published since.
+        The last version can be in another folder, if the keystore published there since.
         """
         signed = metadata.signed
         lasts = signed.expires - self._now > self._expiry.of(signed.type) / 2
         return lasts and signed.version == self.versions[name]
 
     def _can_be_kept(self, metadata: Metadata[_Content]) -> bool:
-        """Return whether top-level metadata can stay: also each signer has signed it."""
+        """Return whether top-level metadata can stay: it is current, and each signer signed it."""
         signers = self._signers[metadata.signed.type]
         signed = all(signer.public_key.keyid in metadata.signatures for signer in signers)
         return signed and self._is_current(metadata.signed.type, metadata)
@@ -449,9 +449,9 @@ class Composer:
         self._expires[name] = content.expires
 
     def _add_snapshot(self) -> None:
-        """Add snapshot and timestamp, which is always new."""
+        """Add the snapshot if it changes, and always a new timestamp."""
         parts = sorted(self.versions.keys() - {_TIMESTAMP, _SNAPSHOT})
-        # Names of bins that are no longer used stay: robots refuse a snapshot that lacks any.
+        # Names of unused bins stay, because robots refuse a snapshot in which a name is missing.
         meta = {f"{name}.json": MetaFile(self.versions[name]) for name in parts}
         before = self._present.snapshot
         if before and before.signed.meta == meta and self._can_be_kept(before):

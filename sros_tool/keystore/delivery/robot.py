@@ -103,7 +103,7 @@ from sros_tool.xml import read_bytes
 class Requested:
     """A new signing request for the enclave ``name``; ``key`` is the SHA-256 of its public key.
 
-    ``token`` is the place of the key on a PKCS#11 token, None for a key in a file.
+    ``token`` is the place of the key on a PKCS#11 token; None for a key in a file.
     """
 
     name: str
@@ -125,10 +125,10 @@ def create_request(
 ) -> Requested:
     """Create an enclave's private key in ``folder``, and a signing request for the key.
 
-    ``folder`` becomes a keystore without CAs.  With ``again`` the request is made for the existing
-    key; a key is never replaced.  With ``key``, a ``pkcs11:`` URI, the key is on that token: it is
-    created there if it does not exist, and ``folder`` gets a file with the URI.  ``secrets`` is
-    asked for the PIN.
+    ``folder`` becomes a keystore without CAs.  With ``again``, the request is made for the existing
+    key; a key is never replaced.  With ``key``, a ``pkcs11:`` URI, the key is on a token: it is
+    created there if it does not exist, and ``folder`` gets a file with the URI.  ``secrets``
+    returns the PIN.
 
     Raises:
         KeystoreError: the enclave has a key already (without ``again``), or a certificate without
@@ -171,7 +171,7 @@ def create_request(
             )
         elif place_of_key and dry_run:
             transaction.write(f"{place}/{KEY_URI_FILE}", token_file(place_of_key))
-            made = generate_key()  # a dry run opens no token
+            made = generate_key()  # a dry run does not open the token
         elif place_of_key:
             made = make_enclave_key(place_of_key, secrets)
             remedy = "Name another object of the token."
@@ -181,7 +181,7 @@ def create_request(
             made = generate_key()
             transaction.write(f"{place}/{KEY_FILE}", key_pem(made), private=True)
         request = make_request(made, name)
-        # Report an unsupported kind of key here, not later at the keystore.
+        # This reports an unsupported kind of key now, and not later at the keystore.
         load_request(request, f"of enclave {name}")
         transaction.write(f"{place}/{REQUEST}", request)
         transaction.commit()
@@ -198,8 +198,8 @@ def create_request(
 def read_pin(text: str) -> frozenset[str]:
     """Return the SHA-256 of the CA certificates that ``text`` pins, in lower-case hexadecimal.
 
-    ``text`` is a SHA-256 fingerprint or the path of a certificate file.  A fingerprint can have
-    colons and capital letters, as in the output of ``openssl x509 -fingerprint -sha256``.
+    ``text`` is a SHA-256 fingerprint or the path of a certificate file.  Colons and capital letters
+    are allowed, as in the output of ``openssl x509 -fingerprint -sha256``.
 
     Raises:
         UsageError: ``text`` is neither a fingerprint nor a certificate file.
@@ -218,7 +218,7 @@ def read_pin(text: str) -> frozenset[str]:
 
 
 def _trusted_certificates(folder: Path, file: str) -> list[x509.Certificate]:
-    """Return the distinct certificates in the ``file`` files of all enclaves in ``folder``."""
+    """Return the distinct certificates in all files named ``file`` of enclaves in ``folder``."""
     certificates: dict[str, x509.Certificate] = {}
     for path in sorted((folder / ENCLAVES).rglob(file)):
         if path.exists():
@@ -231,7 +231,7 @@ def _trusted_certificates(folder: Path, file: str) -> list[x509.Certificate]:
 def check_same_authority(target: Path, files: Mapping[str, bytes]) -> None:
     """Check that the enclaves in ``target`` and the new files trust the same identity CA.
 
-    Enclaves of two keystores in one folder could not communicate.
+    Enclaves of two keystores in one folder could not communicate with each other.
 
     Args:
         target: the security folder of a robot.
@@ -276,7 +276,7 @@ _OPTIONAL = (*OPTIONAL_FILES, *ZENOH_FILES)
 _REQUIRED = tuple(file for file in REQUIRED_FILES if file != KEY_FILE)
 _AGAIN = "Have the request signed again, and import the new answer."
 _SEALED = re.compile(rb"sros answer (?:1|2\nnumber ([1-9][0-9]{0,12}))\n")
-"""First lines of a seal; earlier versions of sros wrote no number."""
+"""Matches the first lines of a seal; earlier versions of sros wrote no number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,10 +300,10 @@ class RequestAnswer:
 class ImportedEnclave(Changed):
     """The result of installing the answer to a signing request.
 
-    ``changes`` is empty if the answer was installed already.  ``first`` says whether the folder
-    trusted no CA before, so that nothing verified the CAs of the answer.  ``until`` is the first
-    expiry of certificate and permissions.  ``restart`` has the name of the enclave if its running
-    processes on Zenoh keep the old rules until they are restarted, and is empty otherwise.
+    ``changes`` is empty if the answer was already installed.  ``first`` says whether the folder
+    trusted no CA before, so that the CAs of the answer could not be verified.  ``until`` is the
+    first expiry of certificate and permissions.  ``restart`` has the name of the enclave if its
+    running processes on Zenoh keep the old rules until they are restarted, and is empty otherwise.
     """
 
     name: str
@@ -323,17 +323,16 @@ def seal(files: dict[str, bytes], number: int, authority: Authority) -> bytes:
 
 
 def _number_of(message: bytes) -> int:
-    """Return the number in a seal; 0 for the seal of an earlier version of sros, without number."""
+    """Return the number in a seal; 0 if an earlier version of sros wrote no number."""
     head = _SEALED.match(smime.parse(message).text)
     return int(head[1] or 0) if head else 0
 
 
 def _read_answer(data: bytes) -> RequestAnswer:
-    """Read an answer from its archive (``.tar.gz``), without verifying it.
+    """Return the answer in an archive (``.tar.gz``), without verifying it.
 
     Raises:
-        DocumentError: the archive is damaged, or its content is not exactly the files of one
-            enclave.
+        DocumentError: the archive is damaged, or has other content than the files of one enclave.
     """
     try:
         files = unpack(data)
@@ -360,8 +359,8 @@ def _read_answer(data: bytes) -> RequestAnswer:
 def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> OpenedEnclave:
     """Return the enclave in an answer, after checking that DDS would load it.
 
-    Its Zenoh configurations have to be signed, and to fit its permissions.  ``key`` is the public
-    key of the enclave, which has to be the key of the certificate.
+    The Zenoh configurations in the answer must be signed and fit the permissions.  The certificate
+    must be for ``key``, the public key of the enclave.
 
     Raises:
         PkiError: the answer has problems; the error lists all of them, such as a certificate for
@@ -388,13 +387,13 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
 def evaluate_delivered(
     name: str, files: Mapping[str, bytes], key: PublicKey, *, now: datetime
 ) -> tuple[OpenedEnclave, list[str]]:
-    """Return the enclave ``name`` made of delivered files, and clauses on why it cannot be used.
+    """Return the enclave with the delivered files, and clauses on why it cannot be used.
 
     Args:
         name: the name of the enclave.
-        files: its files by their names, without its key.
-        key: the public key of the enclave, which has to be the key of the certificate.
-        now: the time at which it has to be valid.
+        files: the files by name, without the enclave's key.
+        key: the public key of the enclave, which must be the key of the certificate.
+        now: the time at which the enclave must be valid.
     """
     with tempfile.TemporaryDirectory(prefix="sros-") as folder:
         for file, data in files.items():
@@ -415,7 +414,7 @@ def evaluate_delivered(
 
 
 def _broken_seal(answer: RequestAnswer, authorities: Iterable[x509.Certificate]) -> str:
-    """Return why no CA in ``authorities`` signed the file list of an answer; "" if a CA did."""
+    """Return why no CA in ``authorities`` signed the file list of an answer; "" if one did."""
     try:
         signed = smime.parse(answer.seal)
     except SrosError as error:
@@ -448,8 +447,8 @@ def import_answer(
     Raises:
         DocumentError: ``data`` is not an answer.
         PkiError: the answer is not valid, see `check_answer`.
-        KeystoreError: the key is missing, was revoked or is the key of another enclave; only
-            ``force`` accepts the answer; no vendor would accept the enclave; or a vendor that
+        KeystoreError: the key is missing, was revoked or is the key of another enclave; the answer
+            is accepted only with ``force``; no vendor would accept the enclave; or a vendor that
             accepts it today would no longer do so.
     """
     answer = _read_answer(data)
@@ -534,7 +533,7 @@ def _check_pinned(
 
 
 def _check_key(folder: Path, answer: RequestAnswer, key: PublicKey) -> None:
-    """Raise `KeystoreError` if the answer revokes ``key``, or another enclave here has it."""
+    """Raise `KeystoreError` if the answer revokes ``key``, or if another enclave here has it."""
     remedy = f"Make a new key with `sros create_request {answer.name}` in another folder."
     path = folder / enclave_folder(answer.name) / "cert.pem"
     present = read_certificate(path) if path.exists() else None
@@ -606,13 +605,16 @@ def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certifica
 def _lists_here_and_sent(
     place: Path, answer: RequestAnswer
 ) -> tuple[dict[str, bytes], dict[str, bytes]]:
-    """Return the files that may have revocation lists, installed and in the answer."""
+    """Return the files that may have revocation lists: those here, and those in the answer."""
     present = {f: read_bytes(place / f, "file") for f in LIST_FILES if (place / f).exists()}
     return present, {f: data for f in LIST_FILES if (data := answer.file(f)) is not None}
 
 
 def _lost_revocation_notes(place: Path, answer: RequestAnswer) -> Iterator[Note]:
-    """Yield a note if the answer's revocation list lacks something, which may have expired."""
+    """Yield a note if the answer's revocation list lacks certificates of the one here.
+
+    They may have expired since.
+    """
     if lost := lost_serials(*_lists_here_and_sent(place, answer)):
         text = (
             f"the revocation list until now revokes {counted(len(lost), 'certificate')} that the "
@@ -625,12 +627,12 @@ def _lost_revocation_notes(place: Path, answer: RequestAnswer) -> Iterator[Note]
 
 
 def _check_number(path: Path, answer: RequestAnswer, remedy: str) -> bool:
-    """Return whether both answers have numbers, which decide that the new answer is not older.
+    """Return whether both answers have numbers, so that the new answer is not older.
 
     Without numbers, the caller has to compare times.  ``path`` is the seal of the installed answer.
 
     Raises:
-        KeystoreError: the number of the new answer is not higher than the installed one's.
+        KeystoreError: the number of the new answer is not higher than that of the installed answer.
     """
     if not path.exists():
         return False
@@ -660,13 +662,13 @@ class RequestedEnclave(NamedTuple):
     name: str
     """Name of the enclave."""
     outcome: Annotated[str, Words(("requested", "requested_again"))]
-    """``requested``: for a new key; ``requested_again``: for the existing key."""
+    """``requested``: the request is for a new key; ``requested_again``: for the existing key."""
     folder: Path
     """Folder of the enclave."""
     request: Path
     """File with the signing request."""
     key_sha256: str | None
-    """SHA-256 of the enclave's public key (DER), in hexadecimal; null if a dry run made none."""
+    """SHA-256 of the enclave's public key (DER), in hexadecimal; null if a dry run made no key."""
 
 
 class MadeRequest(NamedTuple):
@@ -685,7 +687,7 @@ def shown_request(folder: Path, requested: Requested, *, again: bool, dry_run: b
     """Return the value that ``--json`` prints for a new signing request."""
     key = (
         requested.key if again or not dry_run else None
-    )  # a dry run does not keep the key it makes
+    )  # a dry run does not keep the key that it makes
     outcome = "requested_again" if again else "requested"
     enclave = RequestedEnclave(requested.name, outcome, requested.file.parent, requested.file, key)
     return MadeRequest(

@@ -1,7 +1,8 @@
 """Whether files would take a robot back to earlier CAs, revocation lists or keys: a rollback.
 
-Signatures and numbers do not show one: a keystore that was restored from a backup signs as before,
-and may have issued more since than the lost one.  Files of another keystore are refused, too.
+Signatures and numbers do not show a rollback: a keystore that was restored from a backup signs as
+before, and may meanwhile have given higher numbers than the lost one.  Files of another keystore
+are refused, too.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ ROLES_OF_FILES = {IDENTITY_CA_FILE: IDENTITY, PERMISSIONS_CA_FILE: PERMISSIONS}
 def retired_authorities(
     trusted: Sequence[x509.Certificate], sent: Iterable[x509.Certificate]
 ) -> list[x509.Certificate]:
-    """Return the CAs in ``sent`` that a later CA in ``trusted`` replaced, told by key and date."""
+    """Return the CAs in ``sent`` that a later CA in ``trusted`` replaced, by key and date."""
     keys = {authority_key(authority) for authority in trusted}
     newest = max((validity_of(authority).not_before for authority in trusted), default=None)
     return [
@@ -80,10 +81,10 @@ def retired_authorities(
 def older_list(
     present: Mapping[str, bytes], sent: Mapping[str, bytes]
 ) -> tuple[Revocations, Revocations] | None:
-    """Return two lists of a CA, in the ``present`` and the ``sent`` files, if the latter is older.
+    """Return the revocation lists of a CA in ``present`` and ``sent`` if the sent list is older.
 
-    Both map the files of an enclave to their content.  A list with the number of another one that
-    revokes something else is older, too.
+    ``present`` and ``sent`` map names of an enclave's files to content.  A sent list with the same
+    number but other revocations also counts as older.
     """
     for here, new in _lists(present, sent):
         if here != new and here.number >= new.number:
@@ -92,7 +93,7 @@ def older_list(
 
 
 def lost_serials(present: Mapping[str, bytes], sent: Mapping[str, bytes]) -> frozenset[int]:
-    """Return the serial numbers on lists in the ``present`` files that those ``sent`` lack."""
+    """Return the serial numbers on lists in the ``present`` files that lists in ``sent`` lack."""
     return frozenset[int]().union(
         *(here.serials - new.serials for here, new in _lists(present, sent))
     )
@@ -101,7 +102,7 @@ def lost_serials(present: Mapping[str, bytes], sent: Mapping[str, bytes]) -> fro
 def _lists(
     present: Mapping[str, bytes], sent: Mapping[str, bytes]
 ) -> Iterator[tuple[Revocations, Revocations]]:
-    """Yield the lists of each CA that the ``sent`` files trust, in both files.
+    """Yield the lists of each CA that the ``sent`` files trust: in ``present``, and in ``sent``.
 
     In a rotation, the list of the second CA is in the file of the CAs.
     """
@@ -126,8 +127,8 @@ def check_rollback(
 ) -> None:
     """Raise `KeystoreError` if an export would undo a revocation or a rotation in ``target``.
 
-    It is also refused if the enclaves in ``target`` trust only CAs of another keystore.
-    ``present`` maps paths in ``target`` to the content of files, at least of CAs and lists.
+    An export is also refused if enclaves in ``target`` trust only CAs of another keystore.
+    ``present`` maps paths in ``target`` to the content of files, including all CAs and lists.
     """
     if later := _later_authorities(keystore, present, files):
         path, authority = next(iter(later.items()))
@@ -167,7 +168,10 @@ def check_rollback(
 
 
 def trusted_in(target: Path, files: Mapping[str, bytes]) -> dict[str, bytes]:
-    """Map paths in a folder, of all its enclaves and of ``files``, to CAs and revocation lists."""
+    """Map the paths of CA files and revocation lists in a folder to their content.
+
+    These are the files of all enclaves in the folder, and those at the places of ``files``.
+    """
     folders = {path.rpartition("/")[0] for path in files}
     if (target / ENCLAVES).is_dir():
         folders.update(map(enclave_folder, search_enclaves(target)[0]))
@@ -193,8 +197,9 @@ def _foreign_authorities(
 ) -> Mapping[str, x509.Certificate]:
     """Map paths of CA files in ``present`` to a CA in them, for enclaves of another keystore.
 
-    Such an enclave trusts, in both roles, only CAs that are neither in the ledger nor in ``files``.
-    A role alone does not show it: the keystore may be a backup whose CA was replaced since.
+    In both roles, such an enclave trusts only CAs that are neither in the ledger nor in ``files``.
+    One role alone does not show this, because the keystore may be a backup whose CA was replaced
+    since.
     """
     entries = keystore.ledger_with("what", "ca").entries
     recorded = {entry.sha256 for entry in entries if entry.what == "ca"}
@@ -204,7 +209,7 @@ def _foreign_authorities(
         folder, _, file = path.rpartition("/")
         if file in ROLES_OF_FILES:
             keys.update(map(authority_key, load_certificates(data, path)))
-            with suppress(SrosError):  # a damaged file trusts nobody
+            with suppress(SrosError):  # a damaged file trusts no CA
                 trusted[folder][path] = load_certificates(present.get(path, b""), path)
     return {
         path: authorities[0]
@@ -221,11 +226,11 @@ def _foreign_authorities(
 def _later_authorities(
     keystore: OpenedKeystore, present: Mapping[str, bytes], files: Mapping[str, bytes]
 ) -> Mapping[str, x509.Certificate]:
-    """Map paths of CA files in ``present`` to a CA in them that replaced the keystore's.
+    """Map the paths of CA files in ``present`` to a CA in them that replaced the keystore's CA.
 
-    The keystore is from before a stage of a rotation.  If the ledger has both CAs, it says which
-    replaced which; a CA that the ledger does not have is the later one if it is not older than all
-    CAs in ``files``.
+    Then the keystore is from before a stage of a rotation.  If the ledger has both CAs, their order
+    there says which one is later.  A CA that is not in the ledger counts as later if it is not
+    older than any CA in ``files``.
     """
     entries = [e for e in keystore.ledger_with("what", "ca").entries if e.what == "ca"]
     place_in_ledger = {entry.sha256: place for place, entry in enumerate(entries)}
@@ -235,7 +240,7 @@ def _later_authorities(
             continue
         sent = load_certificates(data, path)
         newest = max(validity_of(authority).not_before for authority in sent)
-        with suppress(SrosError):  # a damaged file trusts nobody
+        with suppress(SrosError):  # a damaged file trusts no CA
             trusted = load_certificates(present[path], path)
             keys, kept = set(map(authority_key, trusted)), set(map(authority_key, sent))
             added = [
@@ -261,12 +266,13 @@ def _lost_revocations(
     files: Mapping[str, bytes],
     now: datetime,
 ) -> Mapping[str, tuple[str, str]]:
-    """Map paths in ``present`` to what shows that the keystore lacks their revocation list.
+    """Map paths of lists in ``present`` to evidence that the keystore's list is older.
 
-    Lists of all enclaves in the folder count: a new enclave there has none yet.  Only lists count
-    that a CA in ``files`` signed.  The list of the same CA in ``files`` has to have a number as
-    high, and every certificate on it, but for those that the ledger knows to have expired; and
-    those of a CA service, which knows more certificates than the ledger.
+    All lists in the folder count, because a new enclave does not have one yet, but only if a CA in
+    ``files`` signed them.  The list of the same CA in ``files`` must have at least the same number.
+    It must also have every certificate of the list here, with two exceptions: certificates that
+    have expired by the ledger, and certificates of a CA service, which knows more certificates than
+    the ledger.
     """
     places: dict[bytes, list[str]] = defaultdict(list)
     for path, data in present.items():
@@ -305,9 +311,9 @@ def _lost_revocations(
 
 
 def check_own_keys(target: Path, files: Mapping[str, bytes]) -> None:
-    """Raise `KeystoreError` if a certificate is not for the key that stays in ``target``.
+    """Raise `KeystoreError` if a certificate does not belong to the key that stays in ``target``.
 
-    The key on a token is that of the signing request.
+    A key on a token is the one of the signing request.
     """
     for path, data in files.items():
         folder, _, file = path.rpartition("/")
@@ -319,7 +325,7 @@ def check_own_keys(target: Path, files: Mapping[str, bytes]) -> None:
         ):
             continue
         key: object = None
-        with suppress(SrosError):  # the key is not in the folder, or damaged
+        with suppress(SrosError):  # the key is not in the folder, or is damaged
             key = public_key_of(target / folder, folder) if has_key(target / folder) else None
         if key and key != load_certificate(data, path).public_key():
             raise KeystoreError(
@@ -336,7 +342,7 @@ def public_key_of(place: Path, name: str) -> PublicKey:
     A key on a token has no file, but it signed the request.
 
     Raises:
-        SrosError: key and request are missing, or the file cannot be read.
+        SrosError: both are missing, or the file cannot be read.
     """
     path = place / KEY_FILE
     if path.exists():

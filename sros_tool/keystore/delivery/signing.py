@@ -1,4 +1,4 @@
-"""Signing of requests from robots, and the answers: the files of an enclave, except its key."""
+"""Signing the requests of robots, and making the answers: an enclave's files except its key."""
 
 from __future__ import annotations
 
@@ -93,9 +93,9 @@ class Signed(Changed):
     """The result of signing requests.
 
     ``keys`` maps each enclave to the SHA-256 of its public key (DER, hexadecimal).  ``outcomes``
-    maps each enclave to "created", "renewed", or "kept": its key had a certificate already.
+    maps each enclave to "created", "renewed", or "kept" (its key already had a certificate).
     ``identity_ca`` and ``permissions_ca`` are the CAs that robots will trust.  ``archive`` is the
-    answer for the robot (``.tar.gz``), empty if no answer was made.
+    answer for the robot (``.tar.gz``); empty if no answer was made.
     """
 
     keys: Mapping[str, str]
@@ -121,20 +121,20 @@ def sign_request(
 
     The keystore gets all files of the enclave except the key.  The rights come from ``policy``;
     without a policy, from the current permissions if ``renew`` is set, otherwise from the
-    keystore's template.  If ``policy`` is for a fleet, the keystore's fleet records the enclave's
-    path with its placeholders.
+    keystore's template.  If ``policy`` is for a fleet, the enclave's path with placeholders is
+    recorded in the keystore's fleet.
 
     Args:
         root: the keystore.
         data: the request (PEM).
-        only_enclaves: the name of the enclave that the request has to be for; empty for any.  A
-            robot can write any name into its request.
+        only_enclaves: the only enclave for which a request is accepted; empty for any.  A robot can
+            write any name into its request.
         refuse_revoked: refuse a revoked enclave even if ``only_enclaves`` names it.
-        renew: the enclave has to exist; it gets a new certificate.
+        renew: the enclave must exist, and gets a new certificate.
         answer: the path for the answer, which is written after the keystore has changed.
         force: replace ``answer`` if it exists.
-        domain: the ROS domain that the keystore has to be for.
-        options: those of every change of a keystore.
+        domain: a ROS domain that the keystore must have.
+        options: the options of every change of a keystore.
 
     Raises:
         PkiError: the request is not valid.
@@ -177,9 +177,9 @@ def sign_request(
 
 
 class _Stated(NamedTuple):
-    """The rights that a policy states for an enclave; None: the policy states none.
+    """The rights that a policy states for an enclave; None if the policy states none.
 
-    ``path`` is the enclave's path in the policy, if it has placeholders of a fleet, else "".
+    ``path`` is the enclave's path in the policy if it has placeholders of a fleet, or else "".
     """
 
     enclave: Enclave | None = None
@@ -219,11 +219,11 @@ def certify_requests(
 ) -> Signed:
     """Certify the keys of several requests (PEM, one after the other), all or none.
 
-    As `sign_request`, but no answers are made: an export without keys brings the enclaves to their
-    robots.  Unless ``renew`` is set, an enclave whose key is certified already stays as it is.
-    ``only_enclaves`` has the names of the enclaves that the requests have to be for; empty for any.
-    With ``replace_keys``, the private key of an enclave in the keystore is removed if the request
-    has another key: the enclave's key is on its robot from then on.
+    The arguments are those of `sign_request`, but no answers are made: an export without keys
+    brings the enclaves to their robots.  Unless ``renew`` is set, an enclave whose key is already
+    certified stays as it is.  ``only_enclaves`` are the enclaves for which there must be requests;
+    empty for any.  With ``replace_keys``, an enclave's private key in the keystore is removed if
+    the request has another key: from then on, the enclave's key is on its robot.
 
     Raises:
         PkiError: a request is not valid.
@@ -267,9 +267,9 @@ _END = b"-----END CERTIFICATE REQUEST-----"
 
 
 def _split_requests(data: bytes) -> list[bytes]:
-    """Return the PEM requests in ``data``; text after the last request counts as a request, too.
+    """Return the PEM requests in ``data``; text after the last one counts as a request, too.
 
-    `load_request` reports parts that are no request.
+    `load_request` reports parts that are not requests.
     """
     *parts, rest = data.split(_END)
     return [part + _END + b"\n" for part in parts] + ([rest] if rest.strip() else [])
@@ -345,7 +345,7 @@ class _Signer:
     def _record_paths(self) -> None:
         """Add the policy's paths with placeholders to the fleet of the keystore.
 
-        The robots of that fleet stay the same, even if the policy was expanded for another fleet.
+        The robots of the keystore's fleet stay, even if the policy was expanded for another fleet.
         """
         change, root, stated = self._change, self._root, self._stated_rights
         fleet = change.fleet
@@ -372,8 +372,8 @@ class _Signer:
 
         Args:
             request: the request whose key is certified.
-            renew: the enclave exists; it keeps its current rights unless the policy states others.
-            named: whether the operator named the enclave, and not the request alone.
+            renew: the enclave exists, and keeps its current rights unless the policy states others.
+            named: whether the operator named the enclave, not only the request.
         """
         change, root, name = self._change, self._root, request.name
         known, authority = change.known, change.permissions.certificate
@@ -421,9 +421,9 @@ class _Signer:
         return issued
 
     def _keep_only_key_of(self, request: SigningRequest) -> bool:
-        """Remove the enclave's private key if it is not the key of the request.
+        """Remove the enclave's private key in the keystore unless it is the key of the request.
 
-        Return whether the keystore has such a file.
+        Returns whether the keystore had a key file.
         """
         keystore, name = self._change.keystore, request.name
         path = keystore.folder(name) / KEY_FILE
@@ -452,7 +452,7 @@ class _Signer:
         change.entries += self._writer.entries
 
     def name_notes(self) -> Iterator[Note]:
-        """Yield notes on the names of new enclaves that vendors or users may confuse."""
+        """Yield notes on names of new enclaves that vendors or users may confuse."""
         if not self._new or self._change.template.unique_subject:
             return iter(())
         recorded = self._change.keystore.ledger_file.recorded_enclaves()
@@ -467,7 +467,7 @@ class _Signer:
         kept: Collection[str] = (),
         archive: bytes = b"",
     ) -> Signed:
-        """Return the result for ``requests``; enclaves in ``kept`` had a certificate already."""
+        """Return the result; the enclaves in ``kept`` already had a certificate for their key."""
         done = "renewed" if renew else "created"
         return self._change.result(
             Signed,
@@ -521,7 +521,7 @@ def _check_name(keystore: OpenedKeystore, request: SigningRequest, renew: bool) 
 def _check_key(
     request: SigningRequest, known_keys: KnownKeys, present_certificate: x509.Certificate | None
 ) -> None:
-    """Raise `KeystoreError` if the key of a request was revoked, or another enclave has it.
+    """Raise `KeystoreError` if a request's key was revoked, or if another enclave has it.
 
     An enclave that already shares its key with another enclave is renewed, with a note.
     """
@@ -540,7 +540,7 @@ def _check_key(
 def _check_same_key(
     keystore: OpenedKeystore, request: SigningRequest, present_certificate: x509.Certificate | None
 ) -> None:
-    """Raise `KeystoreError` if the keystore has another key for the enclave of a request."""
+    """Raise `KeystoreError` if the keystore has another private key for a request's enclave."""
     root, folder = keystore.root, keystore.folder(request.name)
     path, fits = folder / KEY_FILE, True
     if path.exists():
@@ -593,7 +593,7 @@ def _new_key_note(old: x509.Certificate, request: SigningRequest) -> list[Note]:
 def _lost_rights_notes(
     change: KeystoreChange, earlier_permissions: EarlierPermissions, issued: Issued
 ) -> list[Note]:
-    """Return a note on the rights that the enclave loses, and how long its old files work."""
+    """Return notes on rights that the enclave loses, and on how long its old files still work."""
     (grant,) = issued.permissions.grants
     replaced = replaced_rights(issued.issuance.name, earlier_permissions, grant, change.now)
     (replaced,) = with_ledger(change.keystore, (replaced,), change.now)
@@ -672,7 +672,7 @@ class SignedRequest(NamedTuple):
     keystore: NamedKeystore
     dry_run: DryRun
     answer: Path | None
-    """File with the answer; ``-`` is standard output; null with ``--no-answer``."""
+    """File with the answer; ``-`` for standard output; null with ``--no-answer``."""
     enclaves: Sequence[CertifiedKey]
     """The certified enclave; with ``--no-answer``, all certified enclaves."""
     authorities: Sequence[AuthorityFacts]
