@@ -846,10 +846,10 @@ def other_node_notes(
 def _other_node_note(
     enclave: str, known: tuple[NodeName, ...], ns: str, name: str, *, all_known: bool
 ) -> Note | None:
-    """Return a note if ``known``, the nodes of an enclave, lack a node.
+    """Return a note if a node is not among ``known``, the nodes of an enclave.
 
-    "" stands for any namespace or name.  Unless ``known`` are all nodes of the enclave, the note
-    is only for a name that they have in another namespace.
+    "" stands for any namespace or name.  If ``known`` may not be all nodes of the enclave, there is
+    a note only if a known node has this name in another namespace.
     """
     from sros_tool.names import is_expression
     from sros_tool.policy.patterns import overlap

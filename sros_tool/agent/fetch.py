@@ -260,7 +260,7 @@ def _number(target: TargetFile | None, source: str, robot: str) -> int:
     """Return the number of the release that the metadata describes.
 
     Raises:
-        FetchError: no release is published for the robot, or it is too large.
+        FetchError: no release is published for the robot, or the release is too large.
     """
     if target is None:
         raise FetchError(

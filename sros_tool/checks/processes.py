@@ -118,8 +118,8 @@ PROCESS_LOCAL_TIME = FindingKind(
     'found the identity subject name in permissions file".',
     "Fast DDS 2.6 to 3.6 (mktime); tested.",
     "Start the process with TZ=UTC, or renew the enclave (`sros renew KEYSTORE ENCLAVE`). If its "
-    "permissions are valid for less than a day, lengthen that first, with `sros update_keystore "
-    "KEYSTORE --set permissions.validity=2d --allow-looser`.",
+    "permissions are valid for less than a day, first lengthen this time with `sros "
+    "update_keystore KEYSTORE --set permissions.validity=2d --allow-looser`.",
     vendors=FAST_DDS,
 )
 PROCESS_REPLACEABLE = FindingKind(

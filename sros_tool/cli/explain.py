@@ -422,7 +422,7 @@ def _notes_on_past(moment: datetime, keystore: OpenedKeystore | None) -> Iterato
             changes = sum(entry.time > iso(moment) for entry in keystore.ledger.entries)
     text = "the current files decide for that time: they do not show what was allowed then"
     if changes:
-        text += f"; {counted(changes, 'entry', 'entries')} of ledger.jsonl are later"
+        text += f"; {counted(changes, 'entry', 'entries')} of ledger.jsonl are from after that time"
     yield Note("explain.past", text)
 
 

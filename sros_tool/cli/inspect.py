@@ -68,8 +68,8 @@ _INDENT = "  "
 @click.option(
     "--policy",
     type=PATH,
-    help="With --history: only permissions that were signed from this policy file, with the files "
-    "that it includes, as they are now.",
+    help="With --history: list only permissions that were signed from the present content of this "
+    "policy file and of the files that it includes.",
 )
 @json_option
 def inspect(

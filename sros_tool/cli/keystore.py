@@ -366,9 +366,9 @@ def _next_step_hints(result: Creation, as_json: bool) -> Iterator[str]:
 
     if published and has_robot(result.created):
         yield (
-            "no release brings the keys of new enclaves, also to robots that fetch: "
-            f"`sros distribute_key {quote(str(result.root))} --robot NAME FOLDER --force`, and "
-            "bring FOLDER to the robot"
+            "no release has the keys of new enclaves; bring them by hand, also to robots that "
+            f"fetch: run `sros distribute_key {quote(str(result.root))} --robot NAME FOLDER "
+            "--force`, and bring FOLDER to the robot"
         )
     elif len(result.created) > MAX_NAMES and not (as_json or result.dry_run):
         selection = "--robot NAME" if (result.root / FLEET).exists() else "ENCLAVE..."

@@ -897,7 +897,7 @@ def _new_node_text(new: NewNode) -> str:
 
 
 def _renamed_lines(renamed: Mapping[str, str], fleet: Fleet | None) -> Iterator[str]:
-    """Yield a line for each enclave that has another name; lines of robots are merged."""
+    """Yield a line for each renamed enclave; equal lines of several robots are merged."""
     from sros_tool.fleet.robots import folded
 
     lines = ((new, f"~ {_renamed_text(old, new)}") for old, new in sorted(renamed.items()))

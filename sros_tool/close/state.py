@@ -61,7 +61,7 @@ class SecuredProcess(NamedTuple):
 
 
 class RunningRobot:
-    """The processes of this machine at one moment, as the robot's folder knows them."""
+    """The processes of this machine at one moment, compared with the robot's folder."""
 
     def __init__(self, robot: LocalRobot, processes: RunningProcesses | None = None) -> None:
         self.robot = robot

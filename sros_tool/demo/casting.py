@@ -577,7 +577,7 @@ def _is_denied(grant: Grant, topic: str) -> bool:
 
 
 def _expressions_of(grant: Grant, right: str, name: str) -> tuple[str, ...]:
-    """Return the expression of `_allowing` for each DDS topic that a right on a ROS name needs."""
+    """Return what `_allowing` returns for each DDS topic that a right on a ROS name needs."""
     topics = dds_names(right, name)
     return (
         *(_allowing(grant, "publish", topic) for topic in topics.publish),

@@ -277,7 +277,7 @@ class AskedPolicy:
         return enclave.removesuffix(path) if path else "", path
 
     def enclave(self, enclave: str) -> Enclave | None:
-        """Return an enclave as the robot has it, or None if the policy has none for it."""
+        """Return an enclave as the robot has it, or None if no enclave of the policy fits."""
         ns, path = self.place(enclave)
         stated = self.policy.enclave(path) if path else None
         if stated is None:
@@ -531,8 +531,8 @@ def _lines_naming(
 ) -> Mapping[Denial, list[tuple[int, str]]]:
     """Map denials to the numbers and texts of lines that name their topic.
 
-    If a process was denied a topic for several causes, a line that is no denial itself belongs to
-    the denial before it; a denial with an unknown direction may belong to any of these causes.
+    If a process was denied a topic for several causes, a line that reports no denial belongs to the
+    last denial before it.
     """
     of_topic = defaultdict[tuple[str, str], list[Denial]](list)
     for denial in denials:
@@ -1077,8 +1077,8 @@ class _Examiner:
 def _keystore_with(path: str) -> Path | None:
     """Return the keystore that has the enclave folder named in a log; None if there is none.
 
-    The check is strict, because the log chooses the path, and the remedy gives the keystore to
-    another user.
+    The check is strict, because the log chooses the path, and the remedy changes the owner of the
+    keystore.
     """
     place, _, name = path.rpartition("/enclaves/")
     with suppress(OSError, ValueError, SrosError):

@@ -303,7 +303,7 @@ def _criteria(endpoints: Iterable[Endpoint], direction: str) -> tuple[Criteria, 
 
 
 def groups_of(rights: Iterable[NodeRight], ns: str, node: str) -> tuple[Group, ...]:
-    """Return a group of rights for topics, services and actions each, in this order.
+    """Return three groups of rights: for topics, for services, and for actions.
 
     Names in a group are sorted, and relative to the node where that is shorter.
     """

@@ -385,7 +385,7 @@ def resolve(sighting: Sighting) -> Observation:
 def _enclaves(
     sighting: Sighting, processes: dict[str, frozenset[_Name]]
 ) -> dict[str, frozenset[str]]:
-    """Map each process to the enclaves in which, by the listed nodes, it may run.
+    """Map each process to the enclaves in which it may run, according to its listed nodes.
 
     ``processes`` maps participants to the names of their nodes.
     """

@@ -333,7 +333,7 @@ def limits_crossing(side: AccessSource) -> bool:
 
 
 def states_routers(side: AccessSource) -> bool:
-    """Return whether settings or fleet of a side name the Zenoh routers, and what may pass."""
+    """Return whether a side's settings or fleet state the routers, and what may pass them."""
     return _network(side, side) is not None
 
 

@@ -208,7 +208,7 @@ class RightsChange:
 
 @dataclass(frozen=True, slots=True)
 class DroppedRequirements:
-    """Findings on requirements of BASE that HEAD drops or weakens, and how many they are.
+    """Findings on requirements of BASE that HEAD drops or weakens, and their number.
 
     Each such requirement has one finding, and another one if HEAD breaks the requirement.
     """

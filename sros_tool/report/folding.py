@@ -397,7 +397,7 @@ class _Draft:
         return tuple(sorted([*names, *chain.from_iterable(unread)], key=name_order))
 
     def _parts_by_unit(self) -> list[Counter[_Part]]:
-        """Return the parts of the picture that name each unit, with symbols in place of units."""
+        """Return for each unit the parts of the picture that name it, with symbols for units."""
         parts: list[Counter[_Part]] = [Counter() for _ in self._units]
         for kind, units, _what in self._seen:
             for unit in set(units):

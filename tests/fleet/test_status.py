@@ -558,7 +558,7 @@ def test_new_enclaves_of_a_fleet_that_fetches_need_their_keys(field: Field) -> N
         file.write("[robots.r4]\n")
     said = field.run("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
     assert "\ncreated enclave /r4/base\n" in f"\n{said.out}"
-    assert "no release brings the keys of new enclaves, also to robots that fetch" in said.err
+    assert "no release has the keys of new enclaves; bring them by hand, also to robots" in said.err
 
 
 def test_a_robot_that_was_off_during_a_rotation_has_missed_it(field: Field) -> None:

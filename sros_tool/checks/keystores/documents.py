@@ -139,7 +139,7 @@ TIME_WINDOW = FindingKind(
     "Fast DDS 2.6 to 3.6 (mktime); tested in Los Angeles and Tokyo.",
     "Let the hosts run in UTC, or renew the enclave at least 14 hours before its permissions "
     "expire (`sros renew KEYSTORE ENCLAVE`). If its permissions are valid for less than a day, "
-    "lengthen that first, with `sros update_keystore KEYSTORE --set permissions.validity=2d "
+    "first lengthen this time with `sros update_keystore KEYSTORE --set permissions.validity=2d "
     "--allow-looser`.",
     vendors=FAST_DDS,
 )
@@ -151,8 +151,8 @@ LOCAL_TIME = FindingKind(
     'subject name in permissions file".',
     "Fast DDS 2.6 to 3.6 (mktime); tested.",
     "Let the host run in UTC, or renew the enclave (`sros renew KEYSTORE ENCLAVE`). If its "
-    "permissions are valid for less than a day, lengthen that first, with `sros update_keystore "
-    "KEYSTORE --set permissions.validity=2d --allow-looser`.",
+    "permissions are valid for less than a day, first lengthen this time with `sros "
+    "update_keystore KEYSTORE --set permissions.validity=2d --allow-looser`.",
     vendors=FAST_DDS,
 )
 CHARACTER_CLASS = FindingKind(
