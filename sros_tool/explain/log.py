@@ -48,7 +48,6 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import RightsSource, load_rights
 from sros_tool.keystore.selection import likely_names as likely_enclaves
 from sros_tool.names import (
-    ACTION_PARTS,
     action_part,
     check_enclave_name,
     is_expression,
@@ -58,6 +57,7 @@ from sros_tool.names import (
 from sros_tool.pki.certificates import IDENTITY_DIGITS
 from sros_tool.policy.model import ALLOW, PEER_RIGHT, Enclave, Policy, policy_in_namespace
 from sros_tool.policy.patterns import Names, covers
+from sros_tool.policy.remapping import Remapping, renamed_action_text
 from sros_tool.policy.rights import Right
 from sros_tool.runtime.log_texts import (
     LET_ENTER_EXPORT,
@@ -979,24 +979,28 @@ class _Examiner:
         is_used = self._keystore.has_other_side(denied) if self._keystore else None
         # A name that peers have a right to is no mistake.
         names = () if is_used else likely_names(asked)
-        if not names and is_used is False and self._keystore:
+        own = [right.name for right in named_rights(asked) if right.right == denied.right]
+        meant = names[0] if names else own[0] if len(own) == 1 else "NEW"
+        rule = Remapping("", name, meant)
+        add, renamed = f", add `--ros-args -r {quote(str(rule))}`.", ""
+        if question.type == "action" and not is_used:
+            add = f": {renamed_action_text(rule)}"
+            renamed = f"If the node's command renames the action{add} "
+        if names:
+            is_meant = f"{' and '.join(names)}: perhaps that is meant"
+            return [f"the enclave may {question.word} {is_meant}"], (
+                f"If the node lacks a remapping{add} If the policy lacks one that the node has, "
+                f"write {name} in place of {meant}, or merge it with `--remap "
+                f"{quote(meant)}:={quote(name)}`. Otherwise, {remedy}"
+            )
+        if is_used is False and self._keystore:
             place = self._keystore.place
             return [f"no enclave of the {place} may {PEER_RIGHT[denied.right]} {name}"], (
                 "If another name is meant, the node perhaps lacks a remapping: compare its command "
                 "with the one that the robot starts (after `sros close`: start/commands.txt). "
-                f"Otherwise, {remedy}"
+                f"{renamed}Otherwise, {remedy}"
             )
-        if not names:
-            return [], ""
-        rules = (
-            f"-r {quote(name + part)}:={quote(names[0] + part)}"
-            for _, part in ACTION_PARTS.get(question.right, (("", ""),))
-        )
-        return [f"the enclave may {question.word} {' and '.join(names)}: perhaps that is meant"], (
-            f"If the node lacks a remapping, add `--ros-args {' '.join(rules)}`. If the policy "
-            f"lacks one that the node has, write {name} in place of {names[0]}, or merge it with "
-            f"`--remap {quote(names[0])}:={quote(name)}`. Otherwise, {remedy}"
-        )
+        return [], f"{renamed}Otherwise, {remedy}" if renamed else ""
 
     def _how_to_ask(self, denial: Denial, name: str) -> str:
         """Return the commands that show which rights a policy lacks for the topic of a denial."""

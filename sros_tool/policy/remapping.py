@@ -154,6 +154,18 @@ def has_new_name(rule: Remapping, names: Iterable[str], namespaces: Iterable[str
     )
 
 
+def renamed_action_text(rule: Remapping) -> str:
+    """Return a sentence on which nodes rename an action by a rule, and how the others do."""
+    parts = (
+        f"-r {quote(str(rule._replace(old=rule.old + part, new=rule.new + part)))}"
+        for _, part in ACTION_PARTS["call"]
+    )
+    return (
+        f"nodes rename an action with `-r {quote(str(rule))}` only since Kilted, and on Jazzy "
+        f"since rcl_action 9.2.8. Start earlier versions with `--ros-args {' '.join(parts)}`."
+    )
+
+
 def remapped_policies(
     policies: Iterable[Policy], texts: Iterable[str], file: Policy = _EMPTY
 ) -> tuple[list[Policy], list[Note]]:
@@ -188,14 +200,7 @@ def remapped_policies(
             )
             notes.append(Note("merge.remapped-nodes", text))
         if any(use.kind == "actions" for use in uses):
-            parts = (
-                f"-r {quote(str(rule._replace(old=rule.old + part, new=rule.new + part)))}"
-                for _, part in ACTION_PARTS["call"]
-            )
-            text = (
-                f"--remap {rule} renames an action. Nodes do so since Kilted, and on Jazzy since "
-                f"rcl_action 9.2.8: start earlier versions with `--ros-args {' '.join(parts)}`."
-            )
+            text = f"--remap {rule} renames an action: {renamed_action_text(rule)}"
             notes.append(Note("merge.remapped-action", text))
     result = [policy for policy, _ in remapped]
     notes += _notes_on_requirements(policies, rules)

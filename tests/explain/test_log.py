@@ -1235,7 +1235,10 @@ def test_a_topic_without_a_ros_name_is_not_asked_about_in_ros_terms(topic: str) 
 
 
 def test_an_action_is_no_service(keystore: Path, tmp_path: Path) -> None:
-    """Neither the advised command nor a proposed name is about a service."""
+    """Neither the advised command nor a proposed name is about a service.
+
+    A name that the node remaps may be denied, since not every rcl_action remaps it.
+    """
     log, policy = tmp_path / "robot.log", tmp_path / "robot.xml"
     log.write_text(
         "rr/arm/_action/send_goalReply topic not found in allow rule. "
@@ -1247,8 +1250,8 @@ def test_an_action_is_no_service(keystore: Path, tmp_path: Path) -> None:
     )
     for group, name, told in (
         ("services request", "arm", "the policy has it as a service (request), but /arm is an"),
-        ("services request", "inspect", ""),
-        ("actions call", "base/arm", f"add `--ros-args {rules}`"),
+        ("services request", "inspect", f"`--ros-args {rules.replace('/base/arm', 'NEW')}`."),
+        ("actions call", "base/arm", f"Start earlier versions with `--ros-args {rules}`."),
     ):
         kind = group.partition("s ")[0]
         rights = f'<{group}="ALLOW"><{kind}>/{name}</{kind}></{kind}s>'
@@ -1256,6 +1259,7 @@ def test_an_action_is_no_service(keystore: Path, tmp_path: Path) -> None:
         found = sros("explain", policy, ENCLAVE, "--log", log).out
         assert f"`sros explain {policy} {ENCLAVE} call /arm --type action` shows" in found
         assert told in found and "may call /inspect" not in found
+        assert ("Kilted, and on Jazzy since rcl_action 9.2.8. Start" in found) is (name != "arm")
 
 
 def test_an_expired_enclave_is_renewed(keystore: Path, tmp_path: Path) -> None:
