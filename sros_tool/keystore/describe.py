@@ -1,4 +1,4 @@
-"""Descriptions of keystores, enclaves, certificates and signed documents, and of their history."""
+"""Descriptions of keystores, enclaves, certificates, signed documents, and of their history."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ Problems = Annotated[Sequence[str], "Problems that keep a process from running i
 
 
 class CertificateFacts(NamedTuple):
-    """A certificate: the parts that matter to DDS Security."""
+    """The parts of a certificate that matter to DDS Security."""
 
     subject: str
     """Subject of the certificate."""
@@ -96,7 +96,7 @@ class CertificateFacts(NamedTuple):
     serial: str
     """Serial number, in hexadecimal."""
     is_ca: bool
-    """Whether it is the certificate of a CA."""
+    """Whether the certificate is that of a CA."""
     key: str
     """Kind of the public key, such as ``EC secp256r1``."""
     signature: str
@@ -112,7 +112,7 @@ class CertificateFacts(NamedTuple):
 
 
 class ListFacts(NamedTuple):
-    """A revocation list; with an expired one DDS refuses all certificates of its CA."""
+    """A revocation list; once it has expired, DDS refuses all certificates of its CA."""
 
     issuer: str
     """Subject of the CA that signed the list."""
@@ -137,7 +137,7 @@ class CertificateFile(NamedTuple):
     further: Sequence[CertificateFacts] | None
     """The other certificates in the file: the chain, or the other CA during a rotation."""
     crl: ListFacts | None
-    """The revocation list in the file; left out if the file has none."""
+    """The revocation list in the file; left out if there is none."""
 
 
 @shows(spread=("file",))
@@ -165,7 +165,7 @@ class TokenPlace(NamedTuple):
     object: str
     """Label of the key."""
     pin_source: str | None
-    """File with the PIN; null if none is named."""
+    """File with the PIN; null if the URI names none."""
 
 
 RightNames = Mapping[str, Mapping[str, Sequence[str]]]
@@ -178,12 +178,12 @@ class RuleFacts(NamedTuple):
     qualifier: Annotated[str, Words(("ALLOW", "DENY"))]
     """Whether the rule allows or denies."""
     domains: str
-    """The DDS domains that the rule applies to."""
+    """The DDS domains to which the rule applies."""
     rights: RightNames
     """Names by kind (``topics``, ``services``, ``actions``, ``dds``) and by right, such as
     ``publish``."""
     partitions: Sequence[str]
-    """The DDS partitions that the rule applies to."""
+    """The DDS partitions to which the rule applies."""
 
 
 @shows(optional=("valid_now",))
@@ -193,21 +193,21 @@ class GrantFacts(NamedTuple):
     name: str
     """Name of the grant."""
     subject: str
-    """Certificate subject that the grant is for."""
+    """The certificate subject for which the grant is."""
     not_before: str
-    """Start of the validity, as the document writes it."""
+    """Start of the validity, as written in the document."""
     not_after: str
-    """Expiry, as the document writes it."""
+    """Expiry, as written in the document."""
     valid_now: bool | None
     """Whether the grant is valid now."""
     rules: Sequence[RuleFacts]
-    """Rules of the grant, in order; the first that matches decides."""
+    """Rules of the grant, in order; the first one that matches decides."""
     default: Annotated[str, Words(("ALLOW", "DENY"))]
     """The decision if no rule matches."""
 
 
 class EnclaveFacts(NamedTuple):
-    """The files of an enclave; a value is null if the file is missing or cannot be read."""
+    """The files of an enclave; the value for a missing or unreadable file is null."""
 
     loadable: bool
     """Whether a process can run in the enclave now."""
@@ -279,7 +279,7 @@ class RouterFacts(NamedTuple):
     enclaves: Sequence[str]
     """The enclaves whose sessions connect to the router, perhaps with wildcards."""
     crossing: Sequence[str]
-    """Names that may pass between this router and others; empty for all that may in the network."""
+    """Names that may pass between this router and others; empty for all names of the network."""
 
 
 def router_facts(router: ZenohRouter) -> RouterFacts:
@@ -293,7 +293,7 @@ class NetworkFacts(NamedTuple):
     """The Zenoh network of a keystore."""
 
     router: str
-    """Name of the router's enclave."""
+    """The enclave of the first router."""
     endpoints: Sequence[str]
     """Endpoints at which sessions connect to the router, as HOST:PORT."""
     listen: Sequence[str]
@@ -301,9 +301,9 @@ class NetworkFacts(NamedTuple):
     mode: Mode
     """Whether sessions also connect to each other (``peer``), or only to the router."""
     routers: Sequence[RouterFacts]
-    """Further routers, of robots or hosts."""
+    """Further routers, on robots or other hosts."""
     crossing: Sequence[str]
-    """The names that may pass between routers; empty for all that enclaves have rights to."""
+    """The names that may pass between routers; empty for all to which enclaves have rights."""
 
 
 class SignerFacts(NamedTuple):
@@ -328,7 +328,7 @@ class SignatureFacts(NamedTuple):
     signed: bool
     """Whether the document is signed."""
     signature_verified: bool | None
-    """Whether the signature is valid; null if no permissions CA is known."""
+    """Whether the signature is valid; null if the permissions CA is not known."""
     signer: SignerFacts | None
     """The signature; null if the document is not signed."""
 
@@ -338,11 +338,11 @@ class DomainRuleFacts(NamedTuple):
     """A domain rule of a governance."""
 
     domains: str
-    """The DDS domains that the rule applies to."""
+    """The DDS domains to which the rule applies."""
     rule: DomainRule
     """Attributes of the rule."""
     topic_rules: Sequence[TopicRule]
-    """Topic rules, in order; the first that matches a topic decides."""
+    """Topic rules, in order; the first one that matches a topic decides."""
 
 
 class AccessControlFacts(NamedTuple):
@@ -359,15 +359,16 @@ class AccessControlFacts(NamedTuple):
 
 
 class RemoteFacts(NamedTuple):
-    """The rights that a Zenoh configuration gives a remote enclave."""
+    """The rights that a Zenoh configuration gives to a remote enclave."""
 
     enclave: str
     """Name of the remote enclave."""
     own_rights_by_router: bool
     """Whether the remote is the router of a client: ``may`` then has the client's own rights."""
     may: RightNames
-    """Names by kind (``topics``, ``services``) and by right, such as ``publish``; with wildcards,
-    as Zenoh writes them."""
+    """Names by kind (``topics``, ``services``) and by right, such as ``publish``; wildcards are
+    written as in Zenoh.
+    """
 
 
 class DescribedKeystore(NamedTuple):
@@ -381,8 +382,9 @@ class DescribedKeystore(NamedTuple):
     authorities: Mapping[str, AuthorityFile | UnreadableFile]
     """CAs of the keystore, by role (``identity``, ``permissions``)."""
     unknown_authorities: Sequence[str]
-    """CAs in CA files, of the keystore or of an enclave, that the keystore does not know, as text:
-    somebody added them."""
+    """CAs in CA files of the keystore or of an enclave that the keystore does not know, as text;
+    somebody else added them.
+    """
     governance: DescribedGovernance | UnreadableFile | None
     """Governance of the keystore, or null."""
     zenoh: NetworkFacts | None
@@ -402,7 +404,7 @@ class DescribedEnclave(NamedTuple):
 
     path: NamedPath
     key_on_robot: bool
-    """Whether the key was made on the robot and is not here."""
+    """Whether the key was made on the robot, and is not in this folder."""
     facts: EnclaveFacts
     """The enclave's files."""
     zenoh: ZenohFiles | None
@@ -483,7 +485,7 @@ class DescribedConfiguration(NamedTuple):
     mode: Mode
     """How the process takes part in the network."""
     connect: Sequence[str]
-    """Endpoints that the process connects to, such as ``tls/localhost:7447``."""
+    """Endpoints to which the process connects, such as ``tls/localhost:7447``."""
     listen: Sequence[str]
     """Endpoints on which the process listens."""
     access_control: AccessControlFacts
@@ -491,11 +493,11 @@ class DescribedConfiguration(NamedTuple):
     made_by_sros: bool
     """Whether the configuration is exactly as sros writes it."""
     domains: Sequence[int]
-    """The ROS domains that the rules apply to; empty for a configuration not made by sros."""
+    """The ROS domains to which the rules apply; empty if sros did not write the configuration."""
     rights: Sequence[RemoteFacts]
-    """The rights of remote enclaves; empty for a configuration not made by sros."""
+    """The rights of remote enclaves; empty if sros did not write the configuration."""
     problems: Sequence[str]
-    """How the configuration differs from its signed document, or contradicts its enclave."""
+    """How the configuration differs from its signed document or contradicts its enclave."""
     signature: SignatureFacts
     """Signature of the configuration."""
     kind: Annotated[Literal["Zenoh configuration"], "What PATH is."] = "Zenoh configuration"
@@ -520,7 +522,7 @@ _NOT_SIGNED = SignatureFacts(signed=False, signature_verified=False, signer=None
 
 
 def _remedy_naming_enclaves(folder: Path) -> str:
-    """Return a remedy that names the enclaves in a folder of enclaves, "" if it has none."""
+    """Return a remedy that names the enclaves in a folder, or "" if the folder has none."""
     with suppress(SrosError):
         root, name = locate_enclave(folder)
         if enclaves := enclaves_below(root, name):
@@ -540,15 +542,15 @@ def describe(
     """Describe the content of ``path``.
 
     Args:
-        path: a keystore, the folder of an enclave, or a file of one.
-        now: the moment for which validity is reported.
-        authority: file of the permissions CA certificate that verifies a signed document; by
-            default the file next to the document.
-        files: files that were read before.
-        keystore: the keystore at ``path``, if it is opened already.
+        path: a keystore, the folder of an enclave, or a file in them.
+        now: the time for which validity is reported.
+        authority: the file of the permissions CA's certificate, to verify a signed document; by
+            default, the file next to the document.
+        files: files that were already read.
+        keystore: the keystore at ``path``, if it is already opened.
 
     Raises:
-        DocumentError: ``path`` is none of these kinds, or cannot be read.
+        DocumentError: ``path`` is something else, or cannot be read.
     """
     files = files or FilesReadOnce()
     if path.is_dir():
@@ -577,7 +579,7 @@ def describe(
 
 
 def problems_of(described: Described) -> Sequence[str]:
-    """Return the problems of a keystore, an enclave or a Zenoh configuration; else nothing."""
+    """Return the problems of a keystore, enclave or Zenoh configuration; () for anything else."""
     if isinstance(described, DescribedEnclave):
         zenoh = described.zenoh
         return (*described.facts.problems, *(zenoh.problems if zenoh else ()))
@@ -589,7 +591,7 @@ def problems_of(described: Described) -> Sequence[str]:
 def _describe_file(
     path: Path, data: bytes, now: datetime, authority: Path | None, files: FilesReadOnce
 ) -> Described:
-    """Describe a file; its content decides the kind, not its name."""
+    """Describe a file by its content, not by its name."""
     if b"-----BEGIN CERTIFICATE-----" in data:
         return DescribedCertificates(path, _describe_certificates(data, "in it", now))
     if CRL_MARK in data:
@@ -649,7 +651,7 @@ def _describe_keystore(keystore: OpenedKeystore, now: datetime) -> DescribedKeys
     problems += [f"ledger: {gap}" for gap in gaps]
     strangers: list[str] = []
     for role in authorities:
-        with suppress(SrosError):  # of the ledger, or of its file, as above
+        with suppress(SrosError):  # a damaged ledger or CA file is reported elsewhere
             strangers += _unknown_authorities(keystore, role, names, now)
     return DescribedKeystore(
         path=keystore.root,
@@ -668,7 +670,7 @@ def _describe_keystore(keystore: OpenedKeystore, now: datetime) -> DescribedKeys
 def _unknown_authorities(
     keystore: OpenedKeystore, role: str, names: Iterable[str], now: datetime
 ) -> Iterator[str]:
-    """Yield, as text, CAs that the ledger does not record, and CAs in the file of an enclave alone.
+    """Yield the CAs that the ledger does not record, and those only in an enclave's file, as text.
 
     Raises:
         SrosError: the ledger or the CA file of the keystore cannot be read.
@@ -686,7 +688,7 @@ def _unknown_authorities(
 def _describe_governance(
     keystore: OpenedKeystore, now: datetime
 ) -> DescribedGovernance | UnreadableFile | None:
-    """Describe the governance that the enclaves of a keystore share; None without a governance."""
+    """Describe the governance that a keystore's enclaves share; None if there is none."""
     if not keystore.has(GOVERNANCE_P7S):
         return None
     try:
@@ -730,7 +732,7 @@ def _describe_enclave(keystore: OpenedKeystore, name: str, now: datetime) -> Key
 
 
 def _facts_in_keystore(evaluation: EvaluatedEnclave, state: OpenedEnclave) -> EnclaveFacts:
-    """Describe the files of an enclave; a key that is only on its robot is no problem there.
+    """Describe an enclave's files; a key that is only on its robot is not a problem there.
 
     ``state`` also has the problems that some vendors accept.
     """
@@ -739,7 +741,7 @@ def _facts_in_keystore(evaluation: EvaluatedEnclave, state: OpenedEnclave) -> En
 
 
 def _enclave_facts(evaluation: EvaluatedEnclave) -> EnclaveFacts:
-    """Describe the files of an enclave; ``problems`` has the ones that matter on this machine."""
+    """Describe the files of an enclave; ``problems`` are those that matter on this machine."""
     state = evaluation.state
     domains, problems = state.domains(), list(evaluation.problems_here)
     identity, identity_sha256 = _subject_and_digest(state.identity_ca)
@@ -766,7 +768,7 @@ def _describe_token(place: TokenUri) -> TokenPlace:
 
 
 def _subject_and_digest(certificate: x509.Certificate | None) -> tuple[str | None, str | None]:
-    """Return the subject and the SHA-256 of a CA's certificate; (None, None) without one.
+    """Return subject and SHA-256 of a CA's certificate, or (None, None).
 
     Two CAs can have the same subject, so the SHA-256 tells them apart.
     """
@@ -839,7 +841,7 @@ def _describe_signature(
 def _describe_signature_next_to(
     path: Path, data: bytes, now: datetime, authority: Path | None, files: FilesReadOnce
 ) -> SignatureFacts:
-    """Describe the signature of a Zenoh configuration, from the signed document next to it."""
+    """Describe the signature of a Zenoh configuration, by the signed document next to it."""
     signed = path.with_name(ZENOH_SIGNED.get(path.name, path.name))
     if signed == path or not signed.exists():
         return _NOT_SIGNED
@@ -894,7 +896,7 @@ def _describe_grant(grant: Grant, now: datetime | None) -> GrantFacts:
 
 
 def _rights_by_kind(rights: Iterable[tuple[str, str, str]]) -> RightNames:
-    """Return names grouped by kind and right, from triples of kind, right and name."""
+    """Group names by kind and right, from (kind, right, name)."""
     table: dict[str, dict[str, list[str]]] = {}
     for kind, right, name in rights:
         table.setdefault(kind, {}).setdefault(right, []).append(name)
@@ -915,12 +917,12 @@ _ABOUT_THE_CONTENT = (
 def _describe_configuration(
     path: Path, document: bytes, signature: SignatureFacts, now: datetime
 ) -> DescribedConfiguration:
-    """Describe a Zenoh configuration; ``rights`` and ``domains`` only if sros wrote it.
+    """Describe a Zenoh configuration; ``rights`` and ``domains`` are empty unless sros wrote it.
 
     Raises:
-        DocumentError: Zenoh would not accept the configuration.
+        DocumentError: Zenoh would refuse the configuration.
     """
-    # A signed document is JSON5 whatever the file with it is called.
+    # A signed document is JSON5, whatever the name of the configuration is.
     yaml = path.suffix in (".yaml", ".yml")
     read = parse_configuration(document, f"its content{path.suffix if yaml else ''}")
     own: Configuration | None = None
@@ -947,10 +949,10 @@ def _describe_configuration(
 
 
 def _describe_remote_rights(configuration: Configuration) -> list[RemoteFacts]:
-    """Return the rights that a configuration gives remote enclaves.
+    """Return the rights that a configuration gives to remote enclaves.
 
-    In client mode, the remote is the router.  Its rules mirror those of the client: it may send
-    what the client may receive.  So its entry shows the rights of the client's own enclave.
+    In client mode, the remote enclave is the router.  Its rules mirror those of the client: it may
+    send what the client may receive.  So its entry shows the rights of the client's own enclave.
     """
     is_client = configuration.mode is Mode.CLIENT
     remotes = []
@@ -962,7 +964,7 @@ def _describe_remote_rights(configuration: Configuration) -> list[RemoteFacts]:
 
 
 def _opened_at(folder: Path, now: datetime) -> OpenedZenoh | None:
-    """Return the Zenoh configurations of the enclave in ``folder``; None if there is no enclave."""
+    """Return the Zenoh configurations of the enclave in ``folder``; None if it is no enclave."""
     if not all((folder / file).exists() for file in (CERTIFICATE_FILE, PERMISSIONS_FILE)):
         return None
     state = open_enclave(folder, now=now)
@@ -971,10 +973,10 @@ def _opened_at(folder: Path, now: datetime) -> OpenedZenoh | None:
 
 
 def _content_problems(path: Path, now: datetime) -> list[str]:
-    """Return how the Zenoh configuration at ``path`` contradicts the enclave that it belongs to.
+    """Return how the Zenoh configuration at ``path`` contradicts its enclave.
 
-    ``path`` can be the signed document, too.  A configuration that differs from its signed document
-    is left out here: `describe` reports it with the signature.
+    ``path`` can also be the signed document.  A difference between a configuration and its signed
+    document is not included, because `describe` reports it with the signature.
     """
     reported = {ZenohFault.OTHER_DOCUMENT} if path.name in ZENOH_SIGNED else set()
     names = [pair for pair in ZENOH_SIGNED.items() if path.name in pair]
@@ -1001,31 +1003,31 @@ class HistoryStatus(StrEnum):
     CURRENT = "current"
     """The certificate or document is in the keystore, and has not expired."""
     SUPERSEDED = "superseded"
-    """The keystore has another one now; DDS still accepts this one (not revoked, not expired)."""
+    """The keystore has a later one, but DDS still accepts this one (not revoked, not expired)."""
     REPLACED = "replaced"
     """Earlier settings of the keystore, which DDS does not read."""
     REVOKED = "revoked"
     RETIRED = "retired"
-    """A CA that was replaced, and is no longer trusted."""
+    """A replaced CA, which is no longer trusted."""
     EXPIRED = "expired"
     DAMAGED = "damaged"
-    """Lines of the ledger were missing or changed when the entry was made."""
+    """Lines of the ledger were missing or changed when this entry was made."""
     SENT = "sent"
     """Sent to a robot; the keystore keeps no copy."""
     SEALED = "sealed"
-    """A part of the ledger that is never written again."""
+    """A part of the ledger that will not be written again."""
 
 
 @shows(spread=("entry",))
 class HistoryItem(NamedTuple):
-    """An entry of the ledger, and the current state of the recorded item."""
+    """An entry of the ledger, and the present state of what it records."""
 
     entry: Entry
     """Entry of the ledger."""
     status: HistoryStatus
     """Present state of the certificate or document."""
     path: str
-    """File of the item in the keystore; empty if it has no file."""
+    """File of the certificate or document in the keystore; empty if there is none."""
 
 
 class History(NamedTuple):
@@ -1042,14 +1044,14 @@ class History(NamedTuple):
 
 
 def history(keystore: OpenedKeystore, *, now: datetime) -> History:
-    """Return the entries of a keystore's ledger, with the current state of the recorded items."""
+    """Return the entries of a keystore's ledger, each with the present state of what it records."""
     issued = _files(keystore, _active_paths(keystore))
     revoked_files = _files(keystore, _revoked_paths(keystore))
     retired = _files(keystore, _retired_paths(keystore))
     ledger = keystore.ledger
     entries = ledger.entries
-    # A new CA starts with an empty revocation list, and lists drop expired certificates, so the
-    # ledger is asked too.
+    # Lists do not tell everything: a new CA begins with an empty list, and expired certificates are
+    # dropped from lists.  So the ledger counts, too.
     revoked = {entry.serial for entry in entries if entry.what == "revocation"}
     revoked |= {f"{entry.serial:x}" for crl in keystore.revocation_lists for entry in crl.revoked}
     moment = iso(now)
@@ -1074,7 +1076,7 @@ def history(keystore: OpenedKeystore, *, now: datetime) -> History:
 
     known = {entry.sha256 for entry in entries}
     for role in ROLES:
-        with suppress(SrosError):  # its file is not known then
+        with suppress(SrosError):  # the CAs in an unreadable file are not known
             known |= known_authorities(keystore, role) or set()
     present_files = {**retired, **revoked_files, **issued}
     places = {**present_files, **settings}
@@ -1097,10 +1099,7 @@ def history(keystore: OpenedKeystore, *, now: datetime) -> History:
 
 
 def _active_paths(keystore: OpenedKeystore) -> Iterator[str]:
-    """Yield the paths from which DDS loads certificates and signed documents.
-
-    The files may be missing.
-    """
+    """Yield the paths from which DDS loads certificates and signed documents, existing or not."""
     authorities = sorted((keystore.root / PUBLIC).glob("*.cert.pem"))
     yield from (f"{PUBLIC}/{path.name}" for path in authorities)
     yield from (GOVERNANCE_P7S, CRL)
@@ -1119,7 +1118,7 @@ def _retired_paths(keystore: OpenedKeystore) -> Iterator[str]:
 
 
 def _files(keystore: OpenedKeystore, paths: Iterator[str]) -> dict[str, list[str]]:
-    """Map the SHA-256 digests that the ledger uses to the existing files among ``paths``."""
+    """Map the SHA-256 that the ledger uses to those of ``paths`` that have it."""
     paths_by_digest: dict[str, list[str]] = {}
     for path in paths:
         file = keystore.root / path
@@ -1130,9 +1129,10 @@ def _files(keystore: OpenedKeystore, paths: Iterator[str]) -> dict[str, list[str
 
 
 def _digests(path: Path) -> list[str]:
-    """Return the digests that the ledger uses for a file; a CA file can have several certificates.
+    """Return the digests that the ledger uses for a file: several for a CA file of several CAs.
 
-    The digest of a certificate is the SHA-256 of its DER, of other files that of the bytes.
+    The digest of a certificate is the SHA-256 of its DER; for other files, it is the SHA-256 of the
+    bytes.
     """
     data = read_bytes(path, "file")
     if not path.name.endswith("cert.pem"):

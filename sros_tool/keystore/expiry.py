@@ -28,18 +28,18 @@ ONE_BY_ONE = (
     "restart the processes one by one; restarted processes communicate with all others, as long as "
     f"the files that they loaded are valid. {IF_EXPIRED}"
 )
-"""Which processes to restart together.
+"""Text that says which processes to restart together.
 
-A process that loaded expired files communicates, if at all, with peers that it met before: these
-and restarted ones refuse each other (Fast DDS 2.14.6 and 3.6.2, tested).
+A process that loaded expired files communicates, if at all, only with peers that it met before;
+restarted processes and this process refuse each other (Fast DDS 2.14.6 and 3.6.2, tested).
 """
 
 
 class Threshold(NamedTuple):
-    """The limit from which an enclave is due for renewal.
+    """The threshold at which an enclave is due for renewal.
 
-    At most one field is set: ``remaining``, the time until expiry, or ``elapsed``, the fraction of
-    the validity (0 to 1) that is over.  With neither, an enclave is due when one of its files
+    At most one field is set: ``remaining``, the time until expiry, or ``elapsed``, the elapsed
+    fraction of the validity (0 to 1).  If neither is set, an enclave is due when one of its files
     expires soon (`Window.expires_soon_from`).
     """
 
@@ -48,7 +48,7 @@ class Threshold(NamedTuple):
 
 
 def renewal_command(root: Path, *names: str) -> str:
-    """Return the command that renews what expires soon in a keystore: ``names``, or all."""
+    """Return the command that renews ``names``, or everything in a keystore that expires soon."""
     words = ("sros", "renew", str(root), *names, "--all-expiring", "soon")
     return " ".join(map(quote, words))
 
@@ -60,7 +60,10 @@ class Lifetime(NamedTuple):
     certificate: Window
     permissions: Window
     came: datetime | None = None
-    """When the certificate was written here: a CA may not back-date its certificates."""
+    """When the certificate was written here; an elapsed validity counts from then.
+
+    A CA service may date certificates differently from sros, which back-dates them.
+    """
 
     def expires(self) -> datetime:
         """Return the earlier expiry of certificate and permissions."""
@@ -80,10 +83,10 @@ class Lifetime(NamedTuple):
 
 
 class Credentials(NamedTuple):
-    """The certificate of an enclave and the grant that DDS reads, both not verified yet.
+    """The certificate of an enclave, and the grant that DDS reads; neither is verified.
 
-    ``signed`` is the permissions document with the grant, ``digest`` the SHA-256 of
-    ``permissions.p7s`` in hexadecimal; ``came`` is when the certificate was written here.
+    ``signed`` is the permissions document with the grant.  ``digest`` is the SHA-256 of
+    ``permissions.p7s`` in hexadecimal.  ``came`` is when the certificate was written here.
     """
 
     name: str
@@ -99,14 +102,14 @@ class Credentials(NamedTuple):
 
 
 class UnreadableEnclave(NamedTuple):
-    """An enclave whose certificate or permissions cannot be read, and why."""
+    """An enclave whose certificate or permissions cannot be read, and the reason."""
 
     name: str
     error: SrosError
 
 
 class DueEnclave(NamedTuple):
-    """An enclave that is due for renewal."""
+    """An enclave that is due for renewal, and when its files expire."""
 
     enclave: str
     """The enclave."""
@@ -133,7 +136,7 @@ class ExpiringEnclaves(NamedTuple):
     unreadable: Sequence[EnclaveProblem]
     """Enclaves whose expiry cannot be read."""
     short_lived: Sequence[DueEnclave]
-    """Short-lived enclaves, which are renewed only if named, with their expiry."""
+    """Short-lived enclaves with their expiry; they are only renewed if they are named."""
 
 
 def expiring_enclaves(renewals: ExpiryCheck) -> ExpiringEnclaves:
@@ -194,13 +197,13 @@ class ExpiryCheck(NamedTuple):
     due: tuple[Lifetime, ...]
     unreadable: tuple[UnreadableEnclave, ...]
     lasting: int
-    """Number of the readable enclaves that are not short-lived."""
+    """Number of readable enclaves that are not short-lived."""
     short_lived: tuple[Lifetime, ...]
-    """Enclaves that the settings let expire earlier than others, and that are renewed by name."""
+    """Enclaves that expire earlier than others, by the settings, and are only renewed if named."""
     moment: datetime
 
     def short_lived_text(self) -> str:
-        """Return a clause that names the short-lived enclaves and their expiry; "" without any."""
+        """Return a clause that names short-lived enclaves and their expiry; "" without any."""
         shown = [describe_lifetime(lifetime, self.moment) for lifetime in self.short_lived]
         enclaves = counted(len(shown), "short-lived enclave")
         return f"{enclaves}, renewed only if named: {first_few(shown, 3)}" if shown else ""
@@ -209,7 +212,7 @@ class ExpiryCheck(NamedTuple):
 def due_enclaves(
     keystore: OpenedKeystore, threshold: Threshold, moment: datetime, settings: Template
 ) -> ExpiryCheck:
-    """Return the enclaves of a keystore, by whether they are due for renewal."""
+    """Return the enclaves of a keystore, grouped by whether they are due for renewal."""
     lifetimes, unreadable = survey(keystore)
     is_short = {
         lifetime.name: settings.longest_validity(lifetime.name) is not None
@@ -226,8 +229,8 @@ def refuse_unreadable(
 ) -> None:
     """Raise an error that names all ``unreadable`` enclaves; return if there are none.
 
-    ``verb`` is the past participle for the message, such as "renewed".  ``takes_names`` says
-    whether the command could name the other enclaves alone.
+    ``verb`` is a past participle for the message, such as "renewed".  ``takes_names`` says whether
+    the user could run the command for the other enclaves alone.
     """
     if len(unreadable) == 1:
         raise unreadable[0].error
@@ -287,5 +290,5 @@ def describe_lifetime(lifetime: Lifetime, now: datetime) -> str:
 
 
 def _elapsed(validity: Window, now: datetime, made_at: datetime | None) -> float:
-    """Return the elapsed fraction of a validity, without its back-dating; above 1 after expiry."""
+    """Return the elapsed fraction of a validity without its back-dating; above 1 after expiry."""
     return 1 - (validity.not_after - now) / validity.lifetime(made_at)

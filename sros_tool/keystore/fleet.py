@@ -1,6 +1,6 @@
 """The fleet that a keystore records: its robots, their enclaves, and their ROS domains.
 
-The ledger has the SHA-256 of the fleet file as sros wrote it last, so that an edit is noticed.
+The ledger has the SHA-256 of the fleet file that sros wrote last, so that edits are noticed.
 """
 
 from __future__ import annotations
@@ -64,9 +64,9 @@ def load_fleet(keystore: OpenedKeystore) -> Fleet | None:
 
 
 def stated_distributions(keystore: OpenedKeystore, enclave: str) -> tuple[str, ...]:
-    """Return the ROS 2 distributions that an enclave is for; () if they are not stated.
+    """Return the ROS 2 distributions for which an enclave is; () if they are not stated.
 
-    The fleet file can state the distribution of a robot; otherwise the keystore's settings count.
+    The fleet file can state the distribution of a robot; otherwise, the keystore's settings apply.
 
     Raises:
         SrosError: the fleet or the settings cannot be read.
@@ -81,7 +81,7 @@ def stated_distributions(keystore: OpenedKeystore, enclave: str) -> tuple[str, .
 def enclaves_of_several_distributions(keystore: OpenedKeystore) -> dict[tuple[str, ...], list[str]]:
     """Map tuples of several ROS 2 distributions to the enclaves that are for all of them.
 
-    Enclaves whose settings or fleet cannot be read are left out: another finding reports that.
+    Enclaves whose settings or fleet cannot be read are left out; another finding reports them.
     """
     enclaves: dict[tuple[str, ...], list[str]] = {}
     for name in keystore.names:
@@ -94,8 +94,8 @@ def enclaves_of_several_distributions(keystore: OpenedKeystore) -> dict[tuple[st
 def checked_fleet(keystore: OpenedKeystore, without_it: Callable[[], str] = str) -> Fleet | None:
     """Return the fleet as `load_fleet` does, after checking that nobody edited its file.
 
-    Verbs that issue or send files by the fleet use this.  The error begins its remedy with
-    ``without_it``: sentences on how to go on without the fleet.
+    Verbs that issue or send files by the fleet use this function.  ``without_it`` returns the
+    beginning of the error's remedy: sentences on how to go on without the fleet.
 
     Raises:
         KeystoreError: the fleet file is not the file that sros wrote last.
@@ -110,7 +110,7 @@ def checked_fleet(keystore: OpenedKeystore, without_it: Callable[[], str] = str)
 
 
 def fleet_before_change(keystore: OpenedKeystore) -> Fleet | None:
-    """Return the fleet as `load_fleet` does; None also if an edit made its file unreadable.
+    """Return the fleet as `load_fleet` does, or None if an edit made its file unreadable.
 
     Raises:
         DocumentError: the fleet file cannot be read, although nobody edited it.
@@ -124,12 +124,12 @@ def fleet_before_change(keystore: OpenedKeystore) -> Fleet | None:
 
 
 def edited_fleet(keystore: OpenedKeystore, ledger: Ledger) -> str:
-    """Return a clause on how the fleet file differs from what sros wrote; "" if it does not."""
+    """Return how the fleet file differs from what sros wrote, as a clause; "" if it does not."""
     return _edit_text(ledger, _read(keystore))
 
 
 def _edit_text(ledger: Ledger, data: bytes | None) -> str:
-    # What somebody else adds to the ledger is not among the entries that are certain.
+    # Only certain entries count, because others may have been added by somebody else.
     last = next((entry for entry in reversed(ledger.certain) if entry.what == "fleet"), None)
     if last is None and any(entry.what == "fleet" for entry in ledger.entries):
         state = "is missing" if data is None else "is perhaps not the file that sros wrote"
@@ -161,7 +161,7 @@ def recorded_fleet(keystore: OpenedKeystore) -> Fleet:
     """Return the fleet of a keystore, which has to have one.
 
     Raises:
-        KeystoreError: it is not a keystore, or the keystore has no fleet.
+        KeystoreError: the folder is not a keystore, or the keystore has no fleet.
         DocumentError: the fleet file cannot be read, or is not a fleet.
     """
     keystore.check()
@@ -182,7 +182,7 @@ def enclaves_of_robot(keystore: OpenedKeystore, fleet: Fleet, robot: Robot) -> t
 
 
 def publish_command(root: Path) -> str:
-    """Return the command that brings new files to robots that fetch; "" if nothing is published."""
+    """Return the command that brings new files to robots that fetch; "" if none was published."""
     return f"`sros fleet publish {quote(str(root))} PUB`" if (root / FLEET_ROOT).exists() else ""
 
 
@@ -191,7 +191,7 @@ def unrecorded_notes(
 ) -> Iterator[Note]:
     """Yield a note for each robot whose folder has enclaves that the fleet does not record.
 
-    Neither ``--robot`` nor a release includes these enclaves.
+    Neither ``--robot`` nor the robot's release includes these enclaves.
     """
     robots = fleet.robots if fleet else {}
     found = unrecorded_enclaves(fleet, names, robots.keys()) if fleet else {}
@@ -206,14 +206,14 @@ def unrecorded_notes(
 
 
 def deliver_first(root: Path) -> str:
-    """Return a sentence on how new files get to robots, before processes restart with them."""
+    """Return a sentence on how to deliver new files to robots before restarting processes."""
     published = publish_command(root)
     before = f"Publish them first, for robots that fetch: {published}. " if published else ""
     return f"{before}If processes run from an export, export the enclaves again first."
 
 
 class EnclaveDomains(NamedTuple):
-    """The ROS domains of enclaves: the domain of their robot, else the keystore's domains."""
+    """The ROS domains of enclaves: those of the enclave's robot, or else the keystore's."""
 
     keystore: DomainSet
     fleet: Fleet | None = None
@@ -223,10 +223,10 @@ class EnclaveDomains(NamedTuple):
         return self.fleet.robots.values() if self.fleet else ()
 
     def of(self, enclave: str) -> DomainSet:
-        """Return the ROS domains that an enclave gets permissions for.
+        """Return the ROS domains for which an enclave gets permissions.
 
         Raises:
-            KeystoreError: its robot is in a domain that the keystore is not for.
+            KeystoreError: the enclave's robot is in a domain that the keystore does not have.
         """
         robot = robot_of(self.fleet, enclave) if self.fleet else None
         if robot is None or robot.domain is None:
@@ -246,10 +246,10 @@ class EnclaveDomains(NamedTuple):
 def with_routers_of_robots(
     network: ZenohNetwork, before: Fleet | None, fleet: Fleet, gone_enclaves: Collection[str] = ()
 ) -> ZenohNetwork:
-    """Return a network in which the routers of a fleet replace the routers of the fleet ``before``.
+    """Return a network with the routers of ``fleet`` in place of those of the fleet ``before``.
 
-    Where a router listens stays as it is.  Routers whose enclaves are in ``gone_enclaves`` are left
-    out.
+    The addresses at which a router listens are kept.  Routers whose enclaves are in
+    ``gone_enclaves`` are left out.
     """
     from sros_tool.zenoh.configuration import ZenohRouter  # most fleets name no routers
 
@@ -271,12 +271,12 @@ def with_routers_of_robots(
 
 
 def robot_of_router(fleet: Fleet | None, name: str) -> Robot | None:
-    """Return the robot that has the Zenoh router in the enclave ``name``; None if none has."""
+    """Return the robot whose Zenoh router is in the enclave ``name``, or None."""
     return _routers(fleet).get(name) if fleet else None
 
 
 def _routers(fleet: Fleet) -> dict[str, Robot]:
-    """Map the enclaves of the robots' Zenoh routers to their robots."""
+    """Map the enclave of each robot's Zenoh router to the robot."""
     return {router_of(fleet, robot): robot for robot in fleet.robots.values() if robot.router}
 
 
@@ -290,10 +290,11 @@ def write_fleet(
     patterns: Collection[str],
     now: datetime,
 ) -> tuple[Fleet, tuple[Entry, ...]]:
-    """Stage ``fleet`` as the fleet of the keystore; return the fleet as staged, and ledger entries.
+    """Stage ``fleet`` as the keystore's fleet, and return it as staged, with ledger entries.
 
-    The staged fleet has the enclave paths of ``fleet``, of the keystore's fleet until now, unless
-    its file was edited, and ``patterns``.  If it is the same as until now, nothing is staged.
+    The staged fleet has the enclave paths of ``fleet``, those in ``patterns``, and those of the
+    keystore's present fleet unless somebody edited its file.  If nothing differs from the present
+    fleet, nothing is staged.
     """
     from sros_tool.fleet.fleet_file import render_fleet
 
@@ -361,9 +362,9 @@ def refuse_stale_domains(
 
 
 def left_enclave_notes(keystore: OpenedKeystore, before: Fleet, after: Fleet) -> Iterator[Note]:
-    """Yield a note for each robot that no longer has enclaves, or a router, that the keystore has.
+    """Yield a note on robots that lose enclaves, or a router, that the keystore still has.
 
-    No two robots of ``after`` have an enclave in common, as `write_fleet` makes sure.
+    No two robots of ``after`` may have an enclave in common, which `write_fleet` checks.
     """
     left_enclaves: dict[str, set[str]] = {}
     for robot in before.robots.values():
@@ -377,7 +378,7 @@ def left_enclave_notes(keystore: OpenedKeystore, before: Fleet, after: Fleet) ->
         names = (name for name in enclaves_of(before, robot) if name not in kept)
         if left_names := {name for name in names if keystore.has_enclave(name)}:
             left_enclaves[robot.name] = left_names
-    # Also what an earlier change of the fleet left.
+    # Enclaves that an earlier change of the fleet left without a robot count, too.
     earlier = unrecorded_enclaves(before, keystore.names, left_enclaves) if left_enclaves else {}
     for name, enclaves in left_enclaves.items():
         enclaves.update(enclave for enclave in earlier[name].below if not robot_of(after, enclave))
@@ -403,7 +404,7 @@ def _lost_router_note(keystore: OpenedKeystore, robot: str, router: str) -> Note
 def arguments_for(keystore: OpenedKeystore, names: Sequence[str]) -> str:
     """Return the command line arguments that select exactly the enclaves ``names``.
 
-    These are ``--match 'PREFIX*'`` if that selects no others, else the names.
+    These are ``--match 'PREFIX*'`` if this pattern matches no other enclaves, or else the names.
     """
     begin = f"{os.path.commonpath(names).rstrip('/')}/"
     if len(names) > 1 and begin != "/":

@@ -1,7 +1,7 @@
 """The deployment status of a fleet: the robots' last confirmations, compared with the keystore.
 
-A robot should have the files that an export would give now.  Other files are looked up in the
-ledger, which tells when an earlier file was issued, and which enclave a foreign file belongs to.
+A robot should have the files that an export would contain now.  Other files are looked up in the
+ledger, which tells when an earlier file was issued, and to which enclave a foreign file belongs.
 """
 
 from __future__ import annotations
@@ -75,43 +75,45 @@ from sros_tool.values import NamedKeystore, Words, shows
 
 
 class State(StrEnum):
-    """State of a robot's file, compared with the keystore; a robot has the state of its worst file.
+    """State of a robot's file, compared with the keystore; a robot has the worst of its states.
 
-    The order is from good to bad.
+    The order of the members is from good to bad.
     """
 
     CURRENT = "current"
     NONE = "none"
     """The robot has no enclave in the keystore."""
     RESTART = "restart"
-    """The robot has the current files, and processes that still run with earlier ones."""
+    """The robot has the current files, but some processes still run with earlier ones."""
     UNUSABLE = "unusable"
-    """The robot has the current files, and says that no process could start in an enclave."""
+    """The robot has the current files, but reports that no process could start in an enclave."""
     EARLIER = "earlier"
     """An earlier file that the keystore issued for the same enclave."""
     DIFFERENT = "different"
     """A Zenoh file that is not the current one (the ledger does not record earlier Zenoh files), or
-    a file of another enclave of the robot."""
+    a file of another enclave of the same robot.
+    """
     MISSING = "missing"
     EXPIRED = "expired"
     """A file on the robot has expired, even if it is the current one."""
     OFFLINE = "offline"
-    """The robot has sent nothing for too long, whatever files it had then."""
+    """The robot has sent nothing for too long, whatever files it had at that time."""
     BROKEN = "broken"
-    """The file in the keystore is missing, cannot be read, or is not as its CA signed it, so no
-    export can be made."""
+    """The file in the keystore is missing, unreadable, or not as its CA signed it, so that no
+    export is possible.
+    """
     NEVER = "never"
     """The robot has sent no confirmation."""
     REFUSED = "refused"
-    """The last message of the robot was refused, so its current files are not known."""
+    """The last message of the robot was refused, so its present files are not known."""
     LATER = "later"
-    """The robot says that it has installed a later release than was ever published for it."""
+    """The robot reports a later release than was ever published for it."""
     UNKNOWN = "unknown"
     """A file that the ledger does not record as issued."""
     REVOKED = "revoked"
-    """A revoked file; a robot of which all enclaves were revoked has this state, too."""
+    """A revoked file; also the state of a robot whose enclaves were all revoked."""
     ANOTHER = "another"
-    """A file of an enclave of another robot, or of an enclave of no robot."""
+    """A file that belongs to another robot, or to an enclave without a robot."""
 
 
 _BADNESS = {state: place for place, state in enumerate(State)}
@@ -128,15 +130,16 @@ _ZENOH = "zenoh"
 FileKind = Annotated[str, Words((*_KINDS.values(), _ZENOH))]
 _AUTHORITIES = ("identity_ca", "permissions_ca")
 _EXPIRING = ("certificate", "permissions", "crl")
-"""Kinds of files for which the ledger has the expiry of a robot's file."""
+"""Kinds of files whose expiry the ledger records."""
 _SIGNED = ("permissions", "governance")
 _ISSUED = {"identity": ("certificate",), "permissions": _SIGNED}
-"""The kinds of files that the CA of each role issues."""
+"""Maps the role of a CA to the kinds of files that the CA issues."""
 _LONGEST_SILENCE = timedelta(days=1)
-"""Age of the last message from which a robot that fetches is offline, by default."""
+"""Default age of the last message from which a robot that fetches counts as offline."""
 _SILENCE = timedelta(minutes=30)
-"""How old the last message of a fetching robot must be before sros says to check whether the robot
-is on; robots fetch every five minutes by default.
+"""Age of a fetching robot's last message from which sros says to check whether the robot is on.
+
+By default, robots fetch every five minutes.
 """
 _TO_DO = {
     State.RESTART: "restart",
@@ -148,9 +151,9 @@ _TO_DO = {
     State.UNKNOWN: "find out why",
     State.ANOTHER: "find out why",
 }
-"""State of a robot → the remedy, if the state alone decides it."""
+"""Maps a state of a robot to the remedy, if the state alone decides it."""
 _SUSPICIOUS = (State.LATER, State.UNKNOWN, State.ANOTHER)
-"""States of a robot of which somebody has to find out why, before anything is brought to it."""
+"""States of a robot whose cause has to be found before anything is delivered to the robot."""
 
 
 def _kind_of(path: str) -> str:
@@ -164,7 +167,7 @@ def _kind_of(path: str) -> str:
 )
 @dataclass(frozen=True, slots=True)
 class ConfirmedFile:
-    """A file on a robot that differs from the file that an export would give now.
+    """A file on a robot that differs from the file that an export would contain now.
 
     With ``surplus``, the robot should have no file at this path.
     """
@@ -174,24 +177,25 @@ class ConfirmedFile:
     kind: FileKind
     """Kind of the file."""
     state: State
-    """The file that the robot has instead: an ``earlier`` file of the same enclave; a ``different``
-    Zenoh file (the ledger does not record earlier Zenoh files), or a file of another enclave of the
-    robot; no file (``missing``); a file that
-    the keystore did not issue (``unknown``); a ``revoked`` file; a file of ``another`` robot, or of
-    no robot. ``broken``: the file in the keystore is missing, cannot be read, or is not as its CA
-    signed it."""
+    """What the robot has instead: an ``earlier`` file of the same enclave; a ``different`` Zenoh
+    file (the ledger does not record earlier Zenoh files), or a file of another enclave of the
+    robot; no file (``missing``); a file that the keystore did not issue (``unknown``); a
+    ``revoked`` file; a file of ``another`` robot, or of no robot.  ``broken``: the file in the
+    keystore is missing, cannot be read, or is not as its CA signed it.
+    """
     since: str = ""
     """When the keystore issued the robot's file, in UTC; null if the ledger does not record it."""
     enclave: str = ""
-    """The enclave that the robot's file belongs to, if it is the file of another enclave; else
-    null."""
+    """The enclave to which the robot's file belongs, if it is another one than that of the path;
+    else null.
+    """
     robot: str = ""
-    """The robot that ``enclave`` belongs to, or null."""
+    """The robot to which ``enclave`` belongs, or null."""
     surplus: bool = False
 
     @property
     def action(self) -> Annotated[str, Words(("deliver", "remove"))]:
-        """Whether the file has to be delivered to the robot, or removed there."""
+        """Whether to deliver the file to the robot, or to remove it from the robot."""
         return "remove" if self.surplus else "deliver"
 
 
@@ -206,14 +210,14 @@ class ConfirmedFile:
 class RobotStatus:
     """The deployment status of a robot, by its last confirmation.
 
-    ``others`` are enclaves of the robot that the fleet does not record.  ``has_release`` is for a
-    robot whose files differ from the keystore's: whether its last published release has the current
-    files of the keystore.  ``short_lived`` are short-lived enclaves of which a file expires soon or
-    has expired.  ``has_list`` says whether the robot has the current revocation list, or an earlier
-    list that revokes the same, in force or not; from ``renew_from`` on, a file of the robot expires
-    soon.  From ``locked_out_from`` on, a web server with the current CA and list refuses a robot
-    that fetches.  ``lacks_key`` are enclaves whose key the keystore has and the robot lacks: no
-    release brings a key.  The other parts say of the robot:
+    ``others`` are enclaves of the robot that the fleet does not record.  ``has_release`` says
+    whether the last published release has the current files of the keystore, for a robot whose
+    files differ from these.  ``short_lived`` are short-lived enclaves with a file that expires soon
+    or has expired.  ``has_list`` says whether the robot has the current revocation list, or an
+    earlier list that revokes the same, in force or not.  From ``renew_from`` on, a file of the
+    robot expires soon.  From ``locked_out_from`` on, a web server with the current CA and list
+    refuses a robot that fetches.  ``lacks_key`` are enclaves whose key is in the keystore but not
+    on the robot; a release does not contain keys.  The other fields are about the robot:
 
     - ``is_ahead``: by its message, its files are newer than the backup of the keystore;
     - ``reads_copy``: it fetched after the publication and got an earlier release;
@@ -240,20 +244,22 @@ class RobotStatus:
     enclaves: int
     """Number of the robot's enclaves in the keystore."""
     revoked: tuple[str, ...]
-    """The robot's revoked enclaves that are no longer in the keystore, whether confirmed or not."""
+    """Revoked enclaves of the robot that are no longer in the keystore, confirmed or not."""
     others: Unrecorded
     received: datetime | None
-    """When the last confirmation was received, by the clock of the keystore's machine, in UTC, or
-    null."""
+    """When the last confirmation was received, in UTC, by the clock of the keystore's machine; or
+    null.
+    """
     clock: datetime | None
     """The time of the robot's clock in the last confirmation, in UTC, or null."""
     fetches: bool
-    """Whether the robot fetches its files: its agent has sent a message, which was verified."""
+    """Whether the robot fetches its files: its agent has sent a message that was verified."""
     release: int | None
-    """Number of the release that the robot's agent installed last, 0 for none; null if the
-    confirmation does not tell."""
+    """Number of the release that the robot's agent installed last; 0 for none, null if the
+    confirmation does not tell.
+    """
     published: int | None
-    """Number of the release that was published last for the robot; null for none."""
+    """Number of the last release that was published for the robot; null for none."""
     stage: Annotated[str, Words(("unknown", "before", "distribute", "reissue", "complete"))]
     """The stage of a CA rotation that the robot's CA files have reached; null if the robot
     confirmed no CA file. ``before``: the robot does not trust the new CA yet; ``complete``: it
@@ -261,11 +267,12 @@ class RobotStatus:
     files: Mapping[str, Mapping[State, int]]
     """Number of the robot's files, by kind and state."""
     pending: tuple[ConfirmedFile, ...]
-    """Files that differ from the keystore; empty if the robot sent no confirmation."""
+    """Files that differ from the keystore; empty if the robot has sent no confirmation."""
     restart: tuple[str, ...] | None
     """The enclaves whose processes may still run with earlier files on the robot, by its last
-    confirmation, also enclaves that the robot should not have any more; null if the confirmation
-    does not tell."""
+    confirmation, including enclaves that the robot should no longer have; null if the confirmation
+    does not tell.
+    """
     running: Mapping[str, RunningFiles] | None
     """The files that the processes of each enclave of the robot have loaded, by its last
     confirmation; null if the confirmation does not tell."""
@@ -283,11 +290,12 @@ class RobotStatus:
     problems: tuple[str, ...] | None
     """What the robot's agent could not do, or what is wrong on the robot, in the agent's words, or
     that the robot fetches from an old copy of the publication; null if the confirmation does not
-    tell."""
+    tell.
+    """
     notes: tuple[str, ...]
-    """Remarks (clauses), for example about the robot's clock."""
+    """Remarks (clauses), such as on the robot's clock."""
     to_do: str = ""
-    """What you have to do for the robot, in a few words; empty if nothing."""
+    """What you have to do for the robot, in a few words; empty if there is nothing to do."""
     has_release: bool = False
     short_lived: tuple[str, ...] = ()
     has_list: bool = False
@@ -303,29 +311,29 @@ class RobotStatus:
 
     @property
     def is_published(self) -> bool:
-        """Whether the robot reports the published release, which has the current files."""
+        """Whether the robot reports that it has the published release, with the current files."""
         return self.has_release and bool(self.release) and self.release == self.published
 
     @property
     def unrecorded(self) -> tuple[str, ...]:
-        """Enclaves in the folder of the robot that the fleet does not record, such as
-        ``/r3/spare``; ``sros revoke --robot`` revokes them, too.
+        """Enclaves in the robot's folder that the fleet does not record, such as ``/r3/spare``;
+        ``sros revoke --robot`` revokes them, too.
         """
         return self.others.below
 
     @property
     def sharing_name(self) -> tuple[str, ...]:
-        """Enclaves elsewhere that the fleet does not record, with the name of the robot as a part
-        of the path, such as ``/desk/r3``; ``sros revoke --robot`` leaves them valid and names them.
+        """Enclaves elsewhere that the fleet does not record, but with the robot's name in the path,
+        such as ``/desk/r3``; ``sros revoke --robot`` does not revoke them, but names them.
         """
         return self.others.naming
 
     @property
     def settled(self) -> bool:
-        """Whether nothing is to be done: the robot's files are current and its agent reports no
-        problem, or it has no enclaves.
+        """Whether there is nothing to do: the files are current and the agent reports no problem.
 
-        A revoked robot has no enclaves any more: only the other robots need the revocation list.
+        A robot without enclaves counts, too.  A revoked robot has no enclaves any more: only the
+        other robots need the revocation list.
         """
         if self.state is State.REVOKED:
             return not self.enclaves
@@ -333,7 +341,7 @@ class RobotStatus:
 
     @property
     def last_heard(self) -> datetime | None:
-        """The time of the last known message from the robot; None if it sent no confirmation."""
+        """The time of the robot's last known message; None if it has sent no confirmation."""
         if self.fetches and self.received and self.clock:
             return min(self.received, self.clock)
         return self.received
@@ -343,12 +351,12 @@ class RobotStatus:
         return self.locked_out_from is not None and self.locked_out_from <= now
 
     def offline(self) -> RobotStatus:
-        """Return the status after nothing was heard of the robot for too long."""
+        """Return the status of the robot after it was silent for too long."""
         state = max(self.state, State.OFFLINE, key=_BADNESS.__getitem__)
         return replace(self.without_list(), state=state)
 
     def expired(self, now: datetime) -> RobotStatus:
-        """Return the status at ``now``: `State.EXPIRED` or worse if a file has expired by then."""
+        """Return the status at ``now``: `State.EXPIRED` or worse if a file has expired."""
         if not self.enclaves or all(end > now for end in self.expiry.values()):
             return self
         status = self
@@ -357,14 +365,14 @@ class RobotStatus:
         return replace(status, state=max(self.state, State.EXPIRED, key=_BADNESS.__getitem__))
 
     def without_list(self) -> RobotStatus:
-        """Return the status of a robot on which the last list is not known to be in force."""
+        """Return the status of a robot on which the last list may not be in force."""
         crl_in_force = None if self.crl_in_force is None else False
         return replace(self, crl_in_force=crl_in_force, has_list=False)
 
     def with_to_do(self, now: datetime, *, is_accepted: bool) -> RobotStatus:
-        """Return the status with what is to be done at ``now``.
+        """Return the status with what to do for the robot at ``now``.
 
-        ``is_accepted`` says whether robots accept what was published.
+        ``is_accepted`` says whether robots accept the published metadata.
         """
         return replace(self, to_do=self._to_do(now, is_accepted))
 
@@ -415,16 +423,19 @@ class PublishedMetadata:
     """Absolute path of the publishing folder; null if it is not known."""
     expires: datetime | None
     """The first expiry of the published metadata, in UTC: from then on, robots refuse the metadata,
-    and get no new files. Null if an earlier release of sros published last, which recorded no
-    expiry."""
+    and get no new files.  Null if the last publication was by a release of sros that recorded no
+    expiry.
+    """
     root_expires: datetime | None = None
-    """Expiry of the root metadata, in UTC: only the root key renews the root metadata. Null if an
-    earlier release of sros published last, which recorded no expiry."""
+    """Expiry of the root metadata, in UTC, which only the root key can renew.  Null if the last
+    publication was by a release of sros that recorded no expiry.
+    """
     accepted: bool | None = None
     """Whether robots still accept the metadata; null if ``expires`` is null."""
     lacks: str = ""
-    """Path of a published file that is missing in ``folder``, such as the metadata or the archive
-    of a robot. Null if none is missing, or the folder is not on this machine."""
+    """Path of a published file that is missing in ``folder``, such as metadata or a robot's
+    archive.  Null if nothing is missing, or if the folder is not on this machine.
+    """
 
     @property
     def is_in_order(self) -> bool:
@@ -432,7 +443,7 @@ class PublishedMetadata:
         return bool(self.accepted and not self.lacks)
 
     def at(self, now: datetime) -> PublishedMetadata:
-        """Return the publication as robots see it at ``now``."""
+        """Return what was published, as robots see it at ``now``."""
         return replace(self, accepted=now < self.expires if self.expires else None)
 
 
@@ -451,37 +462,42 @@ class FleetStatus:
     robots: tuple[RobotStatus, ...]
     """The robots, sorted by name."""
     unassigned: int
-    """Number of enclaves that belong to no robot, so that no confirmation covers them; 0 with
-    --robot."""
+    """Number of enclaves that belong to no robot, so that no confirmation includes them; 0 with
+    --robot.
+    """
     overdue: frozenset[str] = frozenset()
     """The robots whose last confirmation is older than --max-age, sorted by name; without that
     option, the robots that fetch and have sent nothing for more than a day."""
     older: str = ""
     """Why the keystore is older than its robots, as a clause: the keystore was restored from a
-    backup, or is a copy, and has not published with ``--restored`` since. Null if nothing shows
-    this."""
+    backup, or is a copy, and has not yet published with ``--restored``.  Null if nothing shows
+    this.
+    """
     clock: str = ""
     """How far the clock of this machine is behind the last entry of the ledger, or behind the last
-    confirmation, as a clause: ages and expiry are then not known. Null if the clock is not behind.
+    confirmation, as a clause; then ages and expiry are not known.  Null if the clock is not behind.
     """
     edited: str = ""
-    """How the keystore's fleet file differs from the file that sros wrote, as a clause: the robots
-    are then perhaps not all. Null if the file does not differ."""
+    """How the keystore's fleet file differs from the file that sros wrote, as a clause; then robots
+    may be missing.  Null if the file does not differ.
+    """
     revoked_until: datetime | None = None
     """Until when robots need the revocation list, in UTC: the expiry of the last certificate on the
-    list, or of the last revoked certificate of a replaced CA, while a robot may trust this CA. Null
-    if no certificate is revoked, or if the ledger lacks one of the revoked certificates."""
+    list, or of the last revoked certificate of a replaced CA that a robot may still trust.  Null if
+    no certificate is revoked, or if the ledger lacks a revoked certificate.
+    """
     publication: PublishedMetadata | None = None
     """What robots fetch; null if nothing was published for a robot."""
     is_any_revoked: bool = False
-    """Whether the revocation list revokes a certificate, or one was revoked whose CA was replaced,
-    and a robot may trust this CA."""
+    """Whether a certificate is on the revocation list, or one of a replaced CA was revoked that a
+    robot may still trust.
+    """
     groups: Mapping[str, Sequence[str]] = field(default_factory=dict)
     """The groups of the fleet file, with their robots."""
     awaited: frozenset[str] = frozenset()
-    """The kinds of files that every robot has to have before the next stage of a rotation."""
+    """The kinds of files that every robot must have before the next stage of a rotation."""
     recorded: datetime | None = None
-    """The time of the last entry of the ledger, in UTC; None without an entry."""
+    """The time of the last entry of the ledger, in UTC; None for an empty ledger."""
 
     @property
     def names(self) -> list[str]:
@@ -498,9 +514,9 @@ class FleetStatus:
     def unconfirmed(self) -> tuple[str, ...]:
         """Names of the robots that have not confirmed the stage of the CA rotation.
 
-        First the robots have to confirm that they trust the new CA, then that they have the files
-        of the new CA.  A robot has not confirmed the stage either if its processes still run with
-        earlier files, if it fetches and is offline, if it reports a release that was never
+        In the first stage, robots have to confirm that they trust the new CA; in the second, that
+        they have the files of the new CA.  A robot is also unconfirmed if its processes still run
+        with earlier files, if it fetches and is offline, if it reports a release that was never
         published, or if its last message was refused.
         """
         return tuple(
@@ -518,10 +534,10 @@ class FleetStatus:
 
     @property
     def complete(self) -> bool:
-        """Whether every robot that has enclaves confirmed the current files in time, and reports no
-        restart that is due and no problem of its agent, robots can still fetch what was published,
-        and nothing else casts doubt on their files; if not, the exit status is 1. Robots of which
-        all enclaves were revoked do not count.
+        """Whether every robot with enclaves confirmed the current files in time, without a restart
+        that is due and without a problem of its agent, robots can still fetch what was published,
+        and nothing else casts doubt on their files; if not, the exit status is 1.  Robots whose
+        enclaves were all revoked do not count.
         """
         if (
             self.overdue
@@ -534,11 +550,11 @@ class FleetStatus:
         return all(robot.settled for robot in self.robots)
 
     def with_overdue(self, now: datetime, max_age: timedelta | None = None) -> FleetStatus:
-        """Return a copy with what is to be done, in which long-silent robots are offline.
+        """Return a copy with what to do for each robot, in which silent robots are offline.
 
-        These are the robots whose last confirmation is older than ``max_age``; without
-        ``max_age``, the robots that fetch and sent nothing for more than a day.  Messages of robots
-        that fetch are also as old as the messages say: whoever has the inbox could hold them back.
+        A robot is offline if its last confirmation is older than ``max_age``; without ``max_age``,
+        if it fetches and has sent nothing for more than a day.  The times that messages of fetching
+        robots state count, too, because whoever has the inbox could hold messages back.
         """
         overdue = frozenset(
             robot.robot
@@ -558,7 +574,7 @@ class FleetStatus:
         received = max((robot.received for robot in self.robots if robot.received), default=None)
         clock = behind_clause(now, self.recorded, "the last entry of the ledger")
         clock = clock or behind_clause(now, received, "the last confirmation")
-        if clock:  # nobody knows how old the confirmations are
+        if clock:  # the ages of the confirmations are not known
             to_do = tuple(robot.without_list() for robot in to_do)
         return replace(self, robots=to_do, overdue=overdue, clock=clock, publication=publication)
 
@@ -581,7 +597,7 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
     statuses = tuple(
         _status(robot, records, stages, unrecorded[robot.robot.name]) for robot in compared
     )
-    if older := records.age_clause:  # there may be a later list, which the keystore lacks
+    if older := records.age_clause:  # there may be a later list that the keystore lacks
         statuses = tuple(status.without_list() for status in statuses)
     may_trust_replaced = any(
         status.crl_in_force is False and (older or status.may_trust_replaced) for status in statuses
@@ -611,12 +627,11 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
 class _Difference(NamedTuple):
     """A confirmed file that differs from the keystore.
 
-    ``confirmed`` is the SHA-256 of the robot's file, "" if the robot has none, ``kept`` that of the
-    keystore's; ``certificates`` are the SHA-256 of the certificates in the robot's file,
-    ``present`` in the keystore's.
-    ``exported`` says whether an export has a
-    file at this path; None: the file in the keystore cannot be read.  ``is_own`` says whether the
-    path belongs to an enclave of the robot.
+    ``confirmed`` is the SHA-256 of the robot's file, or "" if the robot has none; ``kept`` is that
+    of the keystore's file.  ``certificates`` are the SHA-256 of the certificates in the robot's
+    file, ``present`` those in the keystore's.  ``exported`` says whether an export has a file at
+    this path; None if the file in the keystore cannot be read.  ``is_own`` says whether the path
+    belongs to an enclave of the robot.
     """
 
     path: str
@@ -631,9 +646,9 @@ class _Difference(NamedTuple):
 class _ComparedRobot(NamedTuple):
     """A robot's confirmation, compared with the files of its enclaves in the keystore.
 
-    ``current`` counts the files that are as in the keystore, by kind.  ``authorities`` maps the
-    kind of a CA file to the certificates in the confirmed CA files of all enclaves.  ``expiring``
-    maps kinds of files that expire to the SHA-256 by which the ledger has them.
+    ``current`` counts the files that are equal to the keystore's, by kind.  ``authorities`` maps
+    the kind of a CA file to the certificates in the confirmed CA files of all enclaves.
+    ``expiring`` maps kinds of files that expire to the files' SHA-256 in the ledger.
     """
 
     robot: Robot
@@ -647,13 +662,13 @@ class _ComparedRobot(NamedTuple):
 
     @property
     def confirmed(self) -> Confirmation | None:
-        """The confirmation; None if the robot sent none."""
+        """The confirmation; None if the robot has sent none."""
         return self.received.confirmation if self.received else None
 
     def has_all(self, kind: str, is_equal: Callable[[_Difference], bool] = lambda _: False) -> bool:
-        """Return whether all its files of a kind are current, or other files that are equal.
+        """Return whether all files of a kind are current, or equal by ``is_equal``.
 
-        Enclaves that the robot does not have yet do not count: no process can run in them.
+        Enclaves that the robot does not have yet do not count, because no process can run in them.
         """
         had = {enclave_of(path) for path in self.confirmed.files} if self.confirmed else set()
         there = {*self.enclaves} & {*had, *(self.running() or ())}
@@ -666,16 +681,16 @@ class _ComparedRobot(NamedTuple):
         return 0 < number == len(there) and all(map(is_equal, others))
 
     def running(self) -> Mapping[str, RunningFiles] | None:
-        """Return what the processes of its enclaves have loaded; None if not reported."""
+        """Return what the processes of the robot's enclaves have loaded; None if not reported."""
         if self.confirmed is None or self.confirmed.running is None:
             return None
         running = self.confirmed.running
         return {name: running[name] for name in self.enclaves if name in running}
 
     def restart(self) -> tuple[str, ...] | None:
-        """Return the enclaves whose processes have earlier files; None if it was not reported.
+        """Return the enclaves whose processes have earlier files; None if not reported.
 
-        Processes may still run in an enclave that the keystore no longer gives to the robot.
+        Processes may also still run in an enclave that the keystore no longer gives to the robot.
         """
         running = self.running()
         due = self.confirmed.restart if self.confirmed else None
@@ -687,7 +702,8 @@ class _ComparedRobot(NamedTuple):
     def crl_restart(self) -> tuple[str, ...] | None:
         """Return the enclaves whose processes may lack the revocation list; None if not reported.
 
-        Robots of earlier releases say only which enclaves have to restart, whatever changed.
+        Robots with earlier releases of sros only report which enclaves have to restart, whatever
+        changed.
         """
         due = self.confirmed.crl_restart if self.confirmed else None
         return self.restart() if due is None else due
@@ -696,7 +712,7 @@ class _ComparedRobot(NamedTuple):
 def _compare_robots(
     keystore: OpenedKeystore, fleet: Fleet, robots: Sequence[Robot]
 ) -> list[_ComparedRobot]:
-    """Compare the robots' confirmations with the keystore, on all cores."""
+    """Return the comparison of each robot's confirmation with the keystore, using all cores."""
 
     def work(part: Sequence[Robot]) -> list[_ComparedRobot]:
         with Folder(keystore.root) as folder:
@@ -776,7 +792,7 @@ class _KeystoreFile(NamedTuple):
 
 
 class _KeystoreFiles:
-    """Reader of the digests of enclave files in a keystore; shared files are read once."""
+    """A reader of the digests of enclave files in a keystore, which reads shared files once."""
 
     def __init__(self, folder: Folder) -> None:
         self._folder = folder
@@ -785,7 +801,8 @@ class _KeystoreFiles:
     def files_of(self, name: str) -> Mapping[str, _KeystoreFile | None]:
         """Map the paths of an enclave's exported files, without the key, to their digests.
 
-        A path maps to None if its file cannot be read, or is a missing file of `REQUIRED_FILES`.
+        A path maps to None if its file cannot be read, or if it is missing although it is one of
+        `REQUIRED_FILES`.
         """
         folder = enclave_folder(name)
         files: dict[str, _KeystoreFile | None] = dict.fromkeys(
@@ -802,7 +819,7 @@ class _KeystoreFiles:
         return files
 
     def _linked_file(self, path: str, up: str) -> _KeystoreFile | None:
-        """Return the digests of the file that a link leads to; None for an unreadable file.
+        """Return the digests of the file to which a link leads; None if it cannot be read.
 
         ``up`` is the relative path from the link to the folder of all enclaves.
         """
@@ -810,7 +827,7 @@ class _KeystoreFiles:
             link = self._folder.link_target(path) or ""
             if not link.startswith(up):
                 return self._read(path, self._folder.read_inside)
-            place = (up, link)  # which is the same file for every enclave of this depth
+            place = (up, link)  # the same file for every enclave at this depth
             if place not in self._shared:
                 self._shared[place] = self._read(path, self._folder.read_inside)
             return self._shared[place]
@@ -833,14 +850,14 @@ class _KeystoreFiles:
 
 
 class _Expiring(NamedTuple):
-    """The validity of a file on a robot, and its enclave; "" for a file of the keystore."""
+    """The validity of a file on a robot, and its enclave; "" if the file is the keystore's own."""
 
     enclave: str
     window: Window
 
 
 class _KeystoreRecords:
-    """Identification, by the ledger, of confirmed files that differ from the keystore."""
+    """Looks up confirmed files that differ from the keystore in the ledger."""
 
     def __init__(
         self,
@@ -857,7 +874,7 @@ class _KeystoreRecords:
         published = read_published(keystore)
         self._published = published.robots
         self.published = {name: robot.release.number for name, robot in published.robots.items()}
-        """Number of the release that was published last, by robot."""
+        """Maps robots to the number of the release that was published last for them."""
         self.publication = (
             PublishedMetadata(
                 published.folder, published.until, published.root_until, lacks=published.lacking()
@@ -866,7 +883,7 @@ class _KeystoreRecords:
             else None
         )
         self.refusals = refusals(keystore)
-        """Why the last messages of robots were refused, by robot."""
+        """Maps robots to the reason why their last message was refused."""
         self._fleet = fleet
         self._issued: dict[str, Entry] = {}
         self._revoked_serials: set[str] = set()
@@ -893,7 +910,7 @@ class _KeystoreRecords:
             )
             if robot.different:
                 wanted_digests.update((stages.sealing_ca, stages.identity_ca))
-        wanted_digests.discard("")  # of a file that the robot does not have
+        wanted_digests.discard("")  # stands for a file that the robot does not have
         ledger = keystore.ledger if wanted_digests else keystore.ledger_with("what", "revocation")
         for entry in ledger.entries:
             if entry.sha256 in wanted_digests:
@@ -912,7 +929,7 @@ class _KeystoreRecords:
         self._unrecorded = unrecorded_enclaves(fleet, self._revoked, robots)
 
     def _add_listed(self) -> None:
-        """Add what only a revocation list revokes, such as a list that was copied from a robot."""
+        """Add what only a revocation list revokes, for example a list copied from a robot."""
         reason_by_serial = {
             f"{entry.serial:x}": entry.reason
             for crl in self._keystore.revocation_lists
@@ -920,7 +937,7 @@ class _KeystoreRecords:
             if f"{entry.serial:x}" not in self._revoked_serials
         }
         self._revoked_serials.update(reason_by_serial)
-        if reason_by_serial:  # the ledger does not say which lists have them
+        if reason_by_serial:  # the ledger does not say which lists have these certificates
             self._equal_lists.clear()
         for entry in self._keystore.ledger_file.with_values("serial", reason_by_serial).entries:
             if (
@@ -932,13 +949,13 @@ class _KeystoreRecords:
     def is_list_equal(self, file: _Difference) -> bool:
         """Return whether an earlier revocation list revokes all that the current list revokes.
 
-        Every list has all serial numbers.  So a list that was signed after the last revocation in
-        the ledger is equal, if the ledger has all revocations on the current list.
+        Each list has all revocations so far.  So a list that was signed after the last revocation
+        in the ledger is equal, provided that the ledger has all revocations on the current list.
         """
         return bool(file.exported and file.is_own) and file.confirmed in self._equal_lists
 
     def is_later(self, robot: str, release: int) -> bool:
-        """Return whether no release with so high a number was ever published for a robot."""
+        """Return whether a release number is higher than any that was published for a robot."""
         last = self.published.get(robot)
         return release > (self._last_release if last is None else last)
 
@@ -947,7 +964,8 @@ class _KeystoreRecords:
         published = self._published.get(compared_robot.robot.name)
         if published is None or not (compared_robot.received and compared_robot.received.message):
             return False
-        from sros_tool.keystore.delivery.publish import is_all_published  # few robots need it
+        # Few robots need this import.
+        from sros_tool.keystore.delivery.publish import is_all_published
 
         return is_all_published(self._root, published, compared_robot.enclaves)
 
@@ -958,12 +976,13 @@ class _KeystoreRecords:
         marks = [entry for entry in entries if entry.what in (RESTORED, "release")]
         if marks and marks[-1].what == RESTORED:
             return "robots have files that it signed but does not know"
-        from sros_tool.keystore.delivery.publish import later_in_folder  # few folders are later
+        # Few folders have later releases.
+        from sros_tool.keystore.delivery.publish import later_in_folder
 
         return later_in_folder(self._keystore)
 
     def is_ahead(self, confirmed: Confirmation) -> bool:
-        """Return whether a robot says that it has a release from after the keystore's backup."""
+        """Return whether a robot reports a release from after the keystore's backup."""
         is_from_backup = bool(self.age_clause or restored_at(self._keystore))
         return bool(
             confirmed.release and is_from_backup and confirmed.release not in self._releases
@@ -972,9 +991,9 @@ class _KeystoreRecords:
     def lacks_key(self, compared_robot: _ComparedRobot) -> tuple[str, ...]:
         """Return the enclaves whose certificate is for a key that the robot does not have.
 
-        These are the enclaves of which the robot has no file, the enclaves with an earlier key, and
-        the enclaves whose key, as its agent reports, is missing.  A key that the keystore lacks was
-        made on the robot, and a release is enough.
+        The robot has no file of the enclave, or an earlier key, or its agent reports that the key
+        is missing.  An enclave whose key is not in the keystore is left out: the key was made on
+        the robot, and a release is enough.
         """
         confirmed = compared_robot.confirmed
         if confirmed is None:
@@ -1007,9 +1026,9 @@ class _KeystoreRecords:
     def lacks_ca(self, compared_robot: _ComparedRobot, *, is_published: bool) -> bool:
         """Return whether a robot that fetches does not trust the CA that seals releases.
 
-        Until the keystore's current files are published (``is_published``), what is published may
-        still be sealed by the earlier CA.  A CA with the same key as its predecessor may be
-        trusted by robots that have only the predecessor.
+        Until the current files are published (``is_published``), the earlier CA may have sealed the
+        robot's release.  A CA that has the same key as its predecessor is also trusted by robots
+        that only have the predecessor.
         """
         confirmed = compared_robot.confirmed
         trusted = {*chain.from_iterable(compared_robot.authorities.get("permissions_ca", ()))}
@@ -1024,8 +1043,9 @@ class _KeystoreRecords:
     def locked_out_from(self, compared_robot: _ComparedRobot) -> datetime | None:
         """Return when a web server with the current CA and list begins to refuse a robot.
 
-        This is the last expiry of its certificates, without those that are revoked, or of identity
-        CAs that were replaced; without any other, the time is long ago.  None if it is not known.
+        This is the last expiry of the robot's certificates.  Revoked certificates do not count, nor
+        certificates of replaced identity CAs; if there are no others, the time is long ago.  The
+        result is None if the time is not known.
         """
         long_ago = datetime.min.replace(tzinfo=UTC)
         authority = self._issued.get(self._stages.identity_ca)
@@ -1045,9 +1065,9 @@ class _KeystoreRecords:
         return max(ends, default=None)
 
     def reads_copy(self, compared_robot: _ComparedRobot, last_heard: datetime | None) -> bool:
-        """Return whether a robot fetched long after the publication, and got an earlier release.
+        """Return whether a robot fetched long after the publication, but got an earlier release.
 
-        Robots that report another problem say themselves why they got no release.
+        A robot that reports another problem says itself why it did not get the release.
         """
         confirmed = compared_robot.confirmed
         if confirmed and any(map(is_of_copy, confirmed.problems or ())):
@@ -1064,18 +1084,18 @@ class _KeystoreRecords:
 
     @property
     def _last_release(self) -> int:
-        """The highest number of a release that the ledger has; 0 without one."""
+        """The highest number of a release in the ledger; 0 without a release."""
         return max(self._releases, default=0)
 
     @cached_property
     def _releases(self) -> Mapping[int, datetime]:
-        """The numbers of all releases, with the time of their publication."""
+        """Maps the numbers of all releases to the times of their publication."""
         entries = self._keystore.ledger_with("what", "release").entries
         return {entry.number: parse_iso(entry.time) for entry in entries if entry.what == "release"}
 
     @property
     def is_any_revoked(self) -> bool:
-        """Whether a certificate was revoked; the list of its CA may be gone with the CA."""
+        """Whether a certificate was revoked, even one of a replaced CA, whose list may be gone."""
         return bool(self._revoked_serials)
 
     def is_any_listed(self) -> bool:
@@ -1086,9 +1106,9 @@ class _KeystoreRecords:
             return self.has_list
 
     def revoked_until(self, *, may_trust_replaced: bool) -> datetime | None:
-        """Return when the last certificate on the revocation list expires; None if unknown.
+        """Return when the last certificate on the revocation list expires; None if not known.
 
-        If a robot may trust a replaced CA, the certificates on lists of replaced CAs count, too.
+        If a robot may trust a replaced CA, the revoked certificates of replaced CAs count, too.
         """
         with suppress(SrosError):
             lists = self._keystore.revocation_lists
@@ -1101,7 +1121,7 @@ class _KeystoreRecords:
         return None
 
     def revoked(self, robot: Robot) -> tuple[str, ...]:
-        """Return the enclaves of a robot that were revoked and are not in the keystore."""
+        """Return the revoked enclaves of a robot that are not in the keystore."""
         if not self._revoked:
             return ()
         names = {name for name in enclaves_of(self._fleet, robot) if name in self._revoked}
@@ -1109,7 +1129,10 @@ class _KeystoreRecords:
         return tuple(sorted(name for name in names if not self._keystore.has_enclave(name)))
 
     def short_lived(self, first: Mapping[str, _Expiring]) -> tuple[str, ...]:
-        """Return the short-lived enclaves in ``first``, the first file of each kind to expire."""
+        """Return the short-lived enclaves of the files in ``first``.
+
+        ``first`` maps a kind of file to the robot's file that expires first.
+        """
         names = {file.enclave for file in first.values() if file.enclave}
         template = self._keystore.template
         return tuple(sorted(name for name in names if template.longest_validity(name) is not None))
@@ -1156,7 +1179,7 @@ class _KeystoreRecords:
         )
 
     def _is_edited(self, difference: _Difference, kind: str) -> bool:
-        """Return whether the keystore's file is not as it was issued or signed."""
+        """Return whether the keystore's file is not the one that was issued or signed."""
         if not difference.exported:
             return False
         if kind in (*_AUTHORITIES, "certificate"):
@@ -1170,9 +1193,10 @@ class _KeystoreRecords:
         return True
 
     def _identify(self, difference: _Difference, kind: str, name: str) -> tuple[State, str, str]:
-        """Return the state of a file, when the file was issued ("": unknown), and its enclave.
+        """Return a file's state, the time when it was issued, and the enclave to which it belongs.
 
-        The enclave is "" unless the file belongs to another enclave than ``name``.
+        The time is "" if it is not known.  The enclave is "" unless it is another one than
+        ``name``.
         """
         if difference.exported is None or self._is_edited(difference, kind):
             return State.BROKEN, "", ""
@@ -1213,7 +1237,7 @@ def _status(
         counts.setdefault(file.kind, Counter())[file.state] += 1
     restart = compared_robot.restart()
     if revoked and not compared_robot.enclaves:
-        state = State.REVOKED  # whatever the robot says: it should have no files
+        state = State.REVOKED  # such a robot should have no files, whatever it reports
     elif different:
         state = max((file.state for file in different), key=_BADNESS.__getitem__)
     elif not compared_robot.enclaves:
@@ -1253,7 +1277,8 @@ def _status(
     problems = confirmed.problems if confirmed else None
     if two_computers := received.two_computers() if received and compared_robot.enclaves else "":
         problems = (*(problems or ()), two_computers)
-    is_doubtful = bool(is_refused or is_later or two_computers)  # whichever state is shown
+    # In addition to the state that is shown.
+    is_doubtful = bool(is_refused or is_later or two_computers)
     has_authorities = (
         not is_doubtful
         and bool(compared_robot.enclaves)
@@ -1319,7 +1344,7 @@ def _status(
 
 
 class _Stages:
-    """Comparison of robots' CA files with the stages of the keystore's CA rotation."""
+    """The stages of the keystore's CA rotation that robots' CA files have reached."""
 
     BEFORE, COMPLETE, UNKNOWN = "before", "complete", "unknown"
     ORDER = (UNKNOWN, BEFORE, "distribute", "reissue", COMPLETE)
@@ -1353,13 +1378,14 @@ class _Stages:
 
     @property
     def identity_ca(self) -> str:
-        """The SHA-256 of the identity CA that issues certificates after the rotation, or now."""
+        """The SHA-256 of the identity CA after the rotation, or of the present CA."""
         return self._new["identity_ca"]
 
     def is_of_replaced_ca(self, compared_robot: _ComparedRobot) -> bool:
-        """Return whether all certificates of a robot are of untrusted, replaced identity CAs.
+        """Return whether replaced, untrusted identity CAs issued all certificates of a robot.
 
-        Files of the stage ``distribute`` are those of the old CA, which trust the new one, too.
+        In files of the stage ``distribute``, the certificates are still by the old CA, and the new
+        CA is trusted.
         """
         files = compared_robot.authorities.get("identity_ca", ())
         is_over = self._of_kind["identity_ca"][1] == self.COMPLETE
@@ -1373,7 +1399,7 @@ class _Stages:
         )
 
     def of(self, compared_robot: _ComparedRobot) -> str:
-        """Return the stage of the robot's least advanced CA file; "" if it confirmed no CA file."""
+        """Return the stage of the least advanced CA file of a robot; "" if it confirmed none."""
         stages = {
             self._stage(kind, certificates)
             for kind, files in compared_robot.authorities.items()
@@ -1522,7 +1548,7 @@ def fleet_metrics(
 def _dds_metrics(
     robots: Sequence[tuple[Mapping[str, str], RobotStatus]], advisories: Sequence[Advisory] | None
 ) -> Iterator[Metric]:
-    """Yield the known vulnerabilities of robots, and how much of their DDS is not known."""
+    """Yield metrics on known vulnerabilities of the robots' DDS, and on DDS that is not known."""
     numbers: list[Sample] = []
     unknown: list[Sample] = []
     for labels, robot in robots:

@@ -1,9 +1,8 @@
-"""What a keystore knows of its keys: the keys of its enclaves, revoked keys, and until when
-certificates and permissions that it issued for them work.
+"""The keys of a keystore's enclaves, revoked keys, and until when issued files work.
 
-A revocation list names certificates, so a new certificate for a revoked key would undo its
-revocation.  Two enclaves with one key are one identity: each can act as the other.  Keys are
-compared by the SHA-256 of their SubjectPublicKeyInfo (DER).
+A revocation list names certificates, so a new certificate for a revoked key would undo the
+revocation of the key.  Two enclaves with one key are one identity: each can act as the other.  Keys
+are compared by the SHA-256 of their SubjectPublicKeyInfo (DER).
 """
 
 from __future__ import annotations
@@ -47,9 +46,10 @@ from sros_tool.validity import iso, parse_iso
 
 
 def other_enclave(keystore: OpenedKeystore, name: str, certificate: x509.Certificate) -> str:
-    """Return the enclave whose certificate the enclave ``name`` has; "" for one of its own.
+    """Return the enclave that the certificate of the enclave ``name`` belongs to, if another.
 
-    Other PKIs have names of their own, which no vendor compares with the folder.
+    The result is "" if the certificate belongs to ``name`` itself, or comes from another PKI, whose
+    names no vendor compares with the folder.
     """
     common_name = common_name_of(certificate.subject)
     certified = f"/{common_name.removeprefix('/')}"
@@ -59,7 +59,7 @@ def other_enclave(keystore: OpenedKeystore, name: str, certificate: x509.Certifi
 
 
 def revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
-    """Return the serial numbers of all revoked certificates, also of those that were replaced."""
+    """Return the serial numbers of all revoked certificates, including renewed ones."""
     entries = keystore.ledger_with("what", "revocation").entries
     recorded = {int(entry.serial, 16) for entry in entries if entry.what == "revocation"}
     listed = {entry.serial for crl in keystore.revocation_lists for entry in crl.revoked}
@@ -67,14 +67,14 @@ def revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
 
 
 def known_expiries(keystore: OpenedKeystore, serials: Collection[int]) -> dict[int, str]:
-    """Map serial numbers to expiries (ISO 8601, UTC), from ledger and folder ``revoked``.
+    """Map serial numbers to expiries (ISO 8601, UTC), by the ledger and the folder ``revoked``.
 
-    A certificate whose ledger entry is not certain has no expiry.
+    A certificate is left out if its entry in the ledger is not certain.
     """
     wanted = {f"{serial:x}" for serial in serials}
     if not wanted:
         return {}
-    # Version 0.2 of sros recorded the expiry with the certificate only.
+    # Version 0.2 of sros recorded the expiry only with the certificate.
     recorded = {
         entry.serial: entry.not_after
         for entry in keystore.ledger_file.with_values("serial", wanted).certain
@@ -99,7 +99,7 @@ def certificates_of_revoked(
     file = keystore.identity_file
     trusted = keystore.certificates_of(file) if file else ()
     for path in revoked_certificates(keystore.root, known):
-        with suppress(SrosError):  # a file that is not a certificate
+        with suppress(SrosError):  # the file is not a certificate
             certificate = keystore.certificate(path)
             if any(issued_by(certificate, authority) for authority in trusted):
                 yield certificate
@@ -114,11 +114,12 @@ def restored_at(keystore: OpenedKeystore) -> str:
 def _since_trusted(
     keystore: OpenedKeystore, entries: Sequence[Entry], role: str = IDENTITY
 ) -> Sequence[Entry]:
-    """Return the entries from when the key of a CA that is trusted in a role was recorded.
+    """Return the entries from the first record of a key that a CA trusted in ``role`` has.
 
-    ``entries`` are of a reading of the ledger, each of which has all CAs; all are returned if there
-    is no trusted CA, if a trusted CA was recorded only when it was renewed or replaced, because the
-    ledger from before was lost, or if CAs are recorded without keys, as by earlier versions.
+    ``entries`` come from reading the ledger, and include all CAs.  All entries are returned if
+    there is no trusted CA; if a trusted CA was recorded only when it was renewed or replaced,
+    because the earlier ledger was lost; or if CAs are recorded without keys, as by earlier
+    versions.
     """
     trusted = {_digest_of(ca) for ca in keystore.authority(role)}
     authorities = [
@@ -136,8 +137,9 @@ def _since_trusted(
 def revoked_issues(keystore: OpenedKeystore, listed: Collection[str] = ()) -> Iterator[Entry]:
     """Yield what was issued to enclaves with revoked certificates of CAs that are trusted now.
 
-    Each such certificate is yielded once, by the entry that records it, else by its revocation; and
-    all permissions of its enclave.  Certificates with the serial numbers ``listed`` are left out.
+    For each such certificate, this is the entry that records it, or else the entry of its
+    revocation; and all permissions of its enclave.  Certificates with serial numbers in ``listed``
+    are left out.
     """
     serials = {f"{serial:x}" for serial in revoked_serials(keystore)}.difference(listed)
     recorded = keystore.ledger_file.with_values("serial", serials).entries if serials else ()
@@ -155,9 +157,9 @@ def revoked_issues(keystore: OpenedKeystore, listed: Collection[str] = ()) -> It
 
 
 def removed_enclaves(keystore: OpenedKeystore, now: datetime) -> Mapping[str, str]:
-    """Map enclaves that are no longer in a keystore, and were not revoked, to their expiry.
+    """Map enclaves that were removed from a keystore without being revoked to their expiry.
 
-    Whoever has their files can use them until then, with a CA that the keystore trusts.
+    Until then, whoever has their files can use them with a CA that the keystore trusts.
     """
     recorded = keystore.ledger_file.recorded_enclaves()
     if recorded is None:
@@ -179,7 +181,7 @@ def removed_enclaves(keystore: OpenedKeystore, now: datetime) -> Mapping[str, st
 
 
 def unlisted_revocations(keystore: OpenedKeystore, now: datetime) -> Sequence[str]:
-    """Return the enclaves with revoked certificates, valid and trusted, that no list names."""
+    """Return the enclaves with revoked certificates that are still valid, but on no list."""
 
     def read() -> Sequence[str]:
         lists = keystore.revocation_lists
@@ -191,7 +193,10 @@ def unlisted_revocations(keystore: OpenedKeystore, now: datetime) -> Sequence[st
 
 
 def unknown_authorities(keystore: OpenedKeystore, role: str) -> Sequence[x509.Certificate]:
-    """Return the CAs in the file of a role that the keystore does not know; none if it has none."""
+    """Return the CAs in the file of a role that the keystore does not know.
+
+    The result is empty if the ledger records no CA.
+    """
     known = known_authorities(keystore, role)
     return (
         () if known is None else [ca for ca in keystore.authority(role) if digest(ca) not in known]
@@ -201,8 +206,8 @@ def unknown_authorities(keystore: OpenedKeystore, role: str) -> Sequence[x509.Ce
 def known_authorities(keystore: OpenedKeystore, role: str) -> frozenset[str] | None:
     """Return the SHA-256 of the certificates in a CA file that the keystore knows.
 
-    These are the CAs in the ledger, and the CAs that issued their certificates; None if the ledger
-    has no CA.
+    These are the CAs in the ledger, and the CAs that issued their certificates.  The result is None
+    if the ledger has no CA.
     """
     return keystore.once(("known", role), lambda: _known_authorities(keystore, role))
 
@@ -224,10 +229,10 @@ def _known_authorities(keystore: OpenedKeystore, role: str) -> frozenset[str] | 
 
 
 def _may_be_of_trusted(keystore: OpenedKeystore, entry: Entry) -> bool:
-    """Return whether a trusted CA may have issued a certificate that was recorded after this CA.
+    """Return whether a trusted CA may have issued a certificate that was recorded after the CA.
 
-    The CA before it goes on to issue until the stage reissue of a rotation: the revoked file tells,
-    if it is there and the one that the ledger records.
+    Until the stage reissue of a rotation, the previous CA goes on to issue.  The revoked
+    certificate's file shows the issuer, if the file exists and is the recorded one.
     """
     file = keystore.identity_file
     with suppress(SrosError):
@@ -240,8 +245,8 @@ def _may_be_of_trusted(keystore: OpenedKeystore, entry: Entry) -> bool:
 class IssuedEarlier:
     """The certificates and permissions of enclaves in the ledger, without revoked certificates.
 
-    Permissions work with a certificate for their subject, until one of the two expires.  What was
-    issued before all CAs that are trusted now is left out.
+    Permissions work with a certificate for their subject, until the permissions or the certificate
+    expires.  Entries from before all CAs that are trusted now are left out.
     """
 
     def __init__(self, keystore: OpenedKeystore, names: Collection[str]) -> None:
@@ -261,9 +266,9 @@ class IssuedEarlier:
                 expiry[entry.subject] = max(last, entry.not_after)
 
     def permissions(self, name: str) -> Sequence[tuple[Entry, str]]:
-        """Return the permissions of an enclave, each with the moment until which they work.
+        """Return the permissions of an enclave, each with the time until which they work.
 
-        The moment is "" if no certificate has their subject.
+        The time is "" if no certificate has their subject.
         """
         expiry = self._certificates[name]
         return [
@@ -272,16 +277,17 @@ class IssuedEarlier:
         ]
 
     def permissions_until(self, name: str) -> datetime | None:
-        """Return until when the last permissions of an enclave work; None for none."""
+        """Return until when the last permissions of an enclave work; None if there are none."""
         last = max((until for _, until in self.permissions(name)), default="")
         return parse_iso(last) if last else None
 
     def certificates_until(self, replaced: Entry, signed_for: str | None) -> datetime:
         """Return until when the ``replaced`` certificate and earlier ones of its enclave work.
 
-        The ledger has the last permissions that fit a certificate, unless the certificate has the
-        subject ``signed_for`` of the enclave's new one, or a subject without a unique part, which
-        Cyclone DDS finds in others.  With None, certificates need no permissions.
+        A certificate works only as long as permissions in the ledger fit it.  But if it has the
+        subject ``signed_for`` of the enclave's new certificate, or a subject without a unique part,
+        which Cyclone DDS finds in other subjects, it works until it expires.  If ``signed_for`` is
+        None, certificates need no permissions.
         """
         last: defaultdict[str, str] = defaultdict(str)
         for entry in self._permissions[replaced.enclave]:
@@ -301,8 +307,9 @@ class IssuedEarlier:
 
 _UNIQUE_PART = re.compile(r"(?:^|,)OU=[0-9a-f]{16}(?:,|$)")
 _MOST_NAMES = 200
-"""Number of enclaves up to which keys are looked up one by one; for more, the files of all enclaves
-are read.
+"""Number of enclaves up to which keys are looked up one by one.
+
+For more enclaves, the files of all enclaves are read.
 """
 
 
@@ -320,13 +327,13 @@ class KnownKeys:
 
     @cached_property
     def _revoked(self) -> Mapping[str, str]:
-        """Map the digests of revoked keys to a description of the revoked certificate."""
+        """Maps the digests of revoked keys to descriptions of the revoked certificates."""
         recorded = [entry for entry in self._revocations if entry.key]
         descriptions = {
             entry.key: f"certificate {entry.serial} of {entry.subject}" for entry in recorded
         }
         serials = {entry.serial for entry in recorded}
-        # An earlier ledger that was put back has certificates that only the lists revoke.
+        # If an earlier ledger was put back, only the lists have the later revocations.
         listed = {f"{serial:x}" for serial in self._revoked_serials} - serials
         if listed:
             for entry in self._keystore.ledger_file.with_values("serial", listed).entries:
@@ -334,7 +341,7 @@ class KnownKeys:
                     text = f"certificate {entry.serial} of {entry.subject}"
                     descriptions.setdefault(entry.key, text)
         indexed = self._keystore.ledger_file.is_indexed
-        known = serials if indexed else ()  # the ledger has them
+        known = serials if indexed else ()  # the ledger has these certificates
         for path in revoked_certificates(self._keystore.root, known):
             try:
                 descriptions.update([_key_and_description(self._keystore.certificate(path))])
@@ -356,7 +363,7 @@ class KnownKeys:
 
     @cached_property
     def _unrecorded(self) -> frozenset[int]:
-        """The serial numbers that only lists have, as after a restore: copied, or published."""
+        """The serial numbers that are only on lists (copied or published), as after a restore."""
         from sros_tool.keystore.delivery.published import later_revoked_serials
 
         recorded = {int(entry.serial, 16) for entry in self._revocations}
@@ -364,10 +371,10 @@ class KnownKeys:
         return (later_revoked_serials(self._keystore) | listed) - recorded
 
     def revoked_before(self, names: Collection[str]) -> set[str]:
-        """Return the enclaves in ``names`` whose last certificate was revoked, and not superseded.
+        """Return the enclaves in ``names`` whose last certificate was revoked, not just renewed.
 
-        If the ledger lacks the revocation, a revocation list that names the certificate decides; if
-        the ledger was lost, such a list decides for the certificates in the folder ``revoked``.
+        For a certificate whose revocation is not in the ledger, a revocation list decides.  If the
+        ledger was lost, the lists decide on the certificates in the folder ``revoked``.
         """
         if not self._revoked_serials:
             return set()
@@ -383,7 +390,7 @@ class KnownKeys:
                 enclaves.add(entry.enclave)
         for path in files:
             if path.parent.name not in recorded:
-                with suppress(SrosError):  # a file that is not a certificate
+                with suppress(SrosError):  # the file is not a certificate
                     certificate = self._keystore.certificate(path)
                     if certificate.serial_number in self._revoked_serials:
                         enclaves.add(common_name_of(certificate.subject))
@@ -412,7 +419,7 @@ class KnownKeys:
 
     @cached_property
     def _enclaves(self) -> Mapping[str, Sequence[str]]:
-        """Map the digest of each key to the enclaves that have it."""
+        """Maps the digest of each key to the enclaves that have the key."""
 
         def read(names: Sequence[str]) -> list[tuple[str, str]]:
             return [(key, name) for name in names for key in _digests(self._keystore, name)]
@@ -508,13 +515,13 @@ class KnownKeys:
     def _holders(self, key: str) -> Sequence[str]:
         """Return the enclaves that have the key with the digest ``key``.
 
-        In a keystore with an index these are the enclaves that the ledger records for the key, and
-        that still have it; a key that was put into another enclave by hand is found by `sros
-        check`, which reads the files of all.
+        If the ledger has an index, these are the enclaves that the ledger records for the key and
+        that still have it.  A key that somebody copied to another enclave is not found here, but by
+        `sros check`, which reads the files of all enclaves.
         """
         if "_enclaves" in self.__dict__ or not self._keystore.ledger_file.is_indexed:
             return self._enclaves.get(key, ())
-        # Certificates of earlier versions of sros are recorded without their keys.
+        # Earlier versions of sros recorded certificates without their keys.
         entries = self._keystore.ledger_file.with_values("key", (key, "")).entries
         recorded = {e.enclave for e in entries if e.what == "certificate" and e.key in ("", key)}
         return [name for name in sorted(recorded) if key in _digests(self._keystore, name)]
@@ -531,9 +538,9 @@ def _digest_of(certificate: x509.Certificate) -> str:
 
 
 def _digests(keystore: OpenedKeystore, name: str) -> Iterator[str]:
-    """Yield the digest of an enclave's key, read from its certificate, key file or request.
+    """Yield the digest of an enclave's key, from its certificate, key file or request.
 
-    Yield nothing if there is none of them, or the file is damaged.
+    Yields nothing if all these files are missing, or if the file is damaged.
     """
     folder = keystore.folder(name)
     try:
@@ -546,17 +553,17 @@ def _digests(keystore: OpenedKeystore, name: str) -> Iterator[str]:
             request = load_request(keystore.read(path, "request"), f"'{path}'")
             yield key_digest(request.public_key)
     except PkiError:
-        return  # a damaged file, which no DDS loads; `sros check` reports it
+        return  # a damaged file: DDS does not load it, and `sros check` reports it
 
 
 # ── DDS participants ───────────────────────────────────────────────────────────────────────
 
 
 def enclaves_by_identity(keystore: OpenedKeystore) -> dict[str, str]:
-    """Map the DDS identity of each enclave's certificate subject (`identity_of`) to the enclave.
+    """Map the DDS identity of each certificate subject (`identity_of`) to the enclave.
 
-    A secured participant shows this identity in its GUID.  An enclave whose certificate cannot be
-    read is left out.
+    A secured participant shows this identity in its GUID.  Enclaves whose certificate cannot be
+    read are left out.
     """
     enclaves: dict[str, str] = {}
     for name in keystore.names:

@@ -1,12 +1,11 @@
-"""Acceptance of enclaves by DDS vendors, before a transaction puts new files in place.
+"""Whether DDS vendors accept enclaves, checked before a transaction puts new files in place.
 
-Every verb that changes trust calls `refuse_stopping` before it commits.  It evaluates each changed
-enclave as every tested vendor would load it, before and after the change.  If a vendor accepts an
-enclave before and would refuse it after, its nodes would stop at their next start, so the change is
-refused.
+Every verb that changes trust calls `refuse_stopping` before it commits.  This function evaluates
+each changed enclave as every tested vendor would load it, before and after the change.  If a vendor
+accepts an enclave before the change and would refuse it afterwards, the vendor's nodes would not
+start again, so the change is refused.
 
-All enclaves are read; of enclaves that differ in nothing that a vendor looks at, only one is
-evaluated.
+Of enclaves that are alike in everything that vendors look at, only one is evaluated.
 """
 
 from __future__ import annotations
@@ -79,26 +78,26 @@ _LOADED = (
     CRL_FILE,
     KEY_URI_FILE,
 )
-"""The files that DDS loads, except the key, which never changes without its certificate."""
+"""The files that DDS loads, except the key, which only changes together with its certificate."""
 _NEEDED = _LOADED[:5]
 _CRL_NAME = CRL.rpartition("/")[2]
 _ONLY_IDENTITY = {IDENTITY_CA_FILE, _CRL_NAME}
-"""Shared files that vendors do not use to verify governance or permissions."""
+"""Shared files that do not affect the verification of governance and permissions."""
 _CHOSEN = {Fault.DOCUMENT_SIZE, Fault.KEY_ON_TOKEN}
-"""Faults that follow from the user's own choices; notes report them."""
+"""Faults that follow from the user's own choices, and are only reported by notes."""
 _SHOWN = 5
 _EXAMPLE = "/example"
 _MOST_BROKEN = 20
-"""Largest number of enclaves of the same kind that are tried until a vendor accepts one."""
+"""Maximum number of enclaves of one kind that are tried until a vendor accepts one."""
 
 Files = dict[str, bytes]
 _Kind = tuple[tuple[str, ...], frozenset[str], tuple[object, ...]]
-"""An enclave's paths and changed files, and the content on which vendors decide."""
+"""What vendors decide on: an enclave's paths and changed files, and the relevant content."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Refusals:
-    """The enclaves that a vendor would refuse, and its reasons as clauses."""
+    """The enclaves that a vendor would refuse, and the vendor's reasons as clauses."""
 
     enclaves: tuple[str, ...]
     reasons: tuple[str, ...]
@@ -115,17 +114,18 @@ def refuse_stopping(
 ) -> tuple[Note, ...]:
     """Refuse a transaction after which vendors refuse enclaves that they accept today.
 
-    A new enclave is refused if no vendor would accept it.  Enclaves whose certificates were revoked
-    before are meant to be refused: somebody put their files back.
+    A transaction is also refused if no vendor would accept a new enclave in it.  Enclaves whose
+    certificates were revoked before do not count, because vendors are meant to refuse them:
+    somebody put their files back.
 
     Args:
         transaction: the transaction, with all its files staged.
         now: the time at which the enclaves are evaluated.
-        keystore: the keystore as it was opened for the change.
+        keystore: the keystore that was opened for the change.
         allowed: vendors whose nodes may stop, because the user named them.
-        revoked_before: serial numbers that were revoked before, though the keystore lacks it.
-        remedy: function that returns a remedy, as sentences; by default the error names the changed
-            files.
+        revoked_before: serial numbers that were revoked before, but not in this keystore.
+        remedy: a function that returns a remedy, as sentences; by default, the error names the
+            changed files.
 
     Returns:
         Notes on enclaves that stop on the ``allowed`` vendors, and on enclaves that a dry run did
@@ -168,13 +168,12 @@ def refuse_stopping(
 def _stopped_enclaves(
     files: _FilesOfChange, now: datetime
 ) -> tuple[dict[Vendor, _Refusals], list[str]]:
-    """Return the enclaves that stop working: a vendor would refuse them, and accepts them today.
+    """Return the enclaves that a vendor accepts today, but would refuse after the change.
 
-    New enclaves that a vendor would refuse count, too.
+    New enclaves that a vendor would refuse are included.
 
-    Returns:
-        a map from vendors to the enclaves that they would refuse, and the enclaves that are left
-            out of the map because their certificates were revoked before.
+    Returns: a map from vendors to the enclaves that they would refuse; and the enclaves that are
+    left out because their certificates were revoked before.
     """
     stopped: dict[Vendor, dict[str, list[str]]] = {}
     put_back: list[str] = []
@@ -183,7 +182,8 @@ def _stopped_enclaves(
             before, after = files.before(name), files.after(name)
             refused = refusals(name, after, now) if after else {}
             is_last = tried == min(len(names), _MOST_BROKEN)
-            # Who accepts it today matters if somebody refuses it, or to try the next enclave.
+            # Today's acceptance matters if a vendor would refuse the enclave, or if another enclave
+            # can still be tried.
             asked = before and (refused or not is_last)
             accepted = set(TESTED) - refusals(name, before, now).keys() if asked else set()
             if accepted or not before or is_last:
@@ -205,10 +205,9 @@ def _stopped_enclaves(
 
 
 def refusals(name: str, files: Files, now: datetime) -> dict[Vendor, str]:
-    """Return the tested vendors that refuse an enclave with these files, each with the reason.
+    """Map the tested vendors that refuse an enclave with these files to their reasons.
 
-    ``files`` has the content of the files by name.  The private key is assumed to belong to the
-    certificate.
+    ``files`` maps file names to content.  The private key is assumed to fit the certificate.
     """
     import tempfile
 
@@ -216,7 +215,7 @@ def refusals(name: str, files: Files, now: datetime) -> dict[Vendor, str]:
         for file, data in files.items():
             write_new_file(Path(folder, file), data, flush=False)
         if KEY_URI_FILE not in files:
-            # As where the key is on its robot.
+            # With a request, the key counts as being on its robot.
             write_new_file(Path(folder, REQUEST), b"\n", flush=False)
         enclave = load_enclave(name, Path(folder), moment=now)
     domains = enclave.joined_domains
@@ -254,9 +253,9 @@ _READ_SEVERAL = tuple(vendor for vendor in TESTED if not vendor.traits.reads_fir
 
 
 def _authority_without_list(files: _FilesOfChange) -> x509.Certificate | None:
-    """Return an earlier CA that may not sign revocation lists, if the change adds the first list.
+    """Return an earlier CA that may not sign lists, if the change adds the first revocation list.
 
-    Once there is a list, OpenSSL demands a list of the CA of every certificate.
+    Once there is a list, OpenSSL demands a list of the CA for every certificate.
     """
     if not files.content_after(CRL) or files.content(CRL):
         return None
@@ -318,8 +317,8 @@ def imported_notes(
 ) -> tuple[Note, ...]:
     """Return notes on vendors that refuse enclaves of imported CAs, now or after a revocation.
 
-    An example enclave, which is not written, is issued and evaluated without and with a revocation
-    list.  Vendors that the notes of ``authorities`` already name are left out.
+    An example enclave is issued, without being written, and evaluated both without and with a
+    revocation list.  Vendors that the notes of ``authorities`` already name are left out.
 
     Raises:
         KeystoreError: no vendor would accept an enclave of the keystore.
@@ -372,7 +371,7 @@ def _example(
     domains: DomainSet,
     now: datetime,
 ) -> Files:
-    """Return the files of an example enclave of a new keystore, by name."""
+    """Return the files of an example enclave for a new keystore, by name."""
     files = {
         f"{role}_ca.cert.pem": transaction.content_after(
             transaction.place_after(ca_certificate(role))
@@ -403,7 +402,7 @@ def _example(
 
 
 class _FilesOfChange:
-    """The files of enclaves before and after a transaction; shared files are read once."""
+    """The files of enclaves before and after a transaction; each shared file is read once."""
 
     def __init__(
         self, transaction: Transaction, keystore: OpenedKeystore, revoked_before: Collection[int]
@@ -417,9 +416,10 @@ class _FilesOfChange:
 
     @cached_property
     def _revoked_serials(self) -> frozenset[int]:
-        """Serial numbers that the ledger or the revocation list had before the transaction.
+        """The serial numbers that the ledger or the revocation list had before the transaction.
 
-        If the list is from a robot and the keystore from a backup, only the list has some of them.
+        If the list comes from a robot and the keystore from a backup, some numbers are only on the
+        list.
         """
         entries = self._keystore.ledger_with("what", "revocation").entries
         of_ledger = {int(entry.serial, 16) for entry in entries if entry.what == "revocation"}
@@ -429,11 +429,11 @@ class _FilesOfChange:
         ) | of_ledger.union(self._revoked_before)
 
     def with_a_newer_list(self) -> set[str] | None:
-        """Return the enclaves to evaluate if a newer revocation list is the only change.
+        """Return the enclaves to evaluate if a newer revocation list is the only change, or None.
 
-        They are one enclave that stays, and all whose certificates only the new list has.  Returns
-        None if the lists differ in more than entries, number and dates, or no index finds these
-        enclaves.
+        These are the enclaves whose certificates only the new list has, and one other enclave.  The
+        result is None if the lists differ in more than entries, number and dates, or if no index
+        finds these enclaves.
         """
         before, after = self.content(CRL), self.content_after(CRL)
         ledger = self._keystore.ledger_file
@@ -462,12 +462,12 @@ class _FilesOfChange:
         return form is not None and form.serial in self._revoked_serials
 
     def places_after(self, name: str) -> dict[str, str]:
-        """Map the file names of an enclave to the paths that their content will be read from."""
+        """Map an enclave's file names to the paths from which their content will be read."""
         folder = enclave_folder(name)
         return {file: self._place_after(f"{folder}/{file}") for file in _LOADED}
 
     def _place_after(self, path: str) -> str:
-        """Return the path that ``path`` will lead to, which may be a link to a shared file."""
+        """Return the path to which ``path`` will lead; it may be a link to a shared file."""
         target = self.transaction.target_after(path)
         if target is None:
             return path
@@ -479,7 +479,7 @@ class _FilesOfChange:
         return self._places[linked]
 
     def before(self, name: str) -> Files:
-        """Return the current files of an enclave; empty if a required file is missing."""
+        """Return the present files of an enclave; empty if a required file is missing."""
         folder = enclave_folder(name)
         return _if_complete({file: self.content(f"{folder}/{file}") for file in _LOADED})
 
@@ -489,7 +489,7 @@ class _FilesOfChange:
         return _if_complete({file: self.content_after(place) for file, place in places.items()})
 
     def content(self, path: str) -> bytes:
-        """Return the current content of a file; empty if it cannot be read."""
+        """Return the present content of a file; empty if it cannot be read."""
         try:
             return self._keystore.read(path, "file")
         except SrosError:
@@ -525,15 +525,16 @@ def _kinds(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[str]]:
         folder = enclave_folder(name)
         own = frozenset(changed.get(folder, ())).intersection(_LOADED)
         if name not in present and own.issuperset(_NEEDED):
-            kinds.setdefault(((), own, ()), []).append(name)  # all of it is made alike, and now
+            # All of its files are made now, in the same way.
+            kinds.setdefault(((), own, ()), []).append(name)
             continue
         places = files.places_after(name)
         shared_places = tuple(place.removeprefix(f"{folder}/") for place in places.values())
         looks: tuple[object, ...] = ()
-        if name in present:  # otherwise this transaction issues it, as all others that are new
+        if name in present:  # a new enclave is issued by this transaction like all other new ones
             data = files.content_after(places[CERTIFICATE_FILE])
             if not data:
-                continue  # it is revoked, or its request is not answered yet
+                continue  # the enclave is revoked, or its request is not answered yet
             crl = places[CRL_FILE]
             if crl not in lists:
                 lists[crl] = _listed_serials(files.content_after(crl))
@@ -557,7 +558,7 @@ def _if_complete(files: Mapping[str, bytes | None]) -> Files:
 def _certificate_kind(
     data: bytes, listed_serials: frozenset[int], now: datetime
 ) -> tuple[object, ...]:
-    """Return all that vendors could treat differently in a certificate, except name and key."""
+    """Return what vendors could treat differently in a certificate, except name and key."""
     form = read_form(data)
     if form is None:
         return (data,)
@@ -583,7 +584,7 @@ def _refusable_parts_of_crl(crl: bytes) -> tuple[object, ...] | None:
 
 
 def _signers(message: bytes) -> tuple[object, ...] | None:
-    """Return the certificates and the hash of the signature of permissions; None if unreadable."""
+    """Return the certificates and the hash of a message's signature; None if unreadable."""
     try:
         signed = smime.parse(message)
     except SrosError:

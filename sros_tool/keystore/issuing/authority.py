@@ -1,7 +1,7 @@
-"""The identity CA and the permissions CA of a keystore: creating them, and loading them to sign.
+"""The identity CA and the permissions CA of a keystore: creating and loading them.
 
 The issuing CA is the first certificate of a CA file, because Cyclone DDS 0.10.2 reads only the
-first certificate.  Fast DDS 2.9.1 trusts all CAs in the file, and also reads a revocation list in
+first certificate.  Fast DDS 2.9.1 trusts all CAs in the file, and also reads a revocation list from
 it.
 """
 
@@ -59,7 +59,7 @@ from sros_tool.validity import iso, window
 class Authority:
     """A certificate authority that can sign.
 
-    An identity CA that is a CA ``service`` has no key here, and only issues certificates.
+    If the identity CA is a CA ``service``, its key is not here, and it only issues certificates.
     """
 
     certificate: x509.Certificate
@@ -82,7 +82,7 @@ class Authority:
 
     @property
     def on_token(self) -> bool:
-        """Whether the key is on a token, so that forked processes cannot sign."""
+        """Whether the key is on a token, so that forked processes cannot use it."""
         return isinstance(self.own_key, TokenKey)
 
     def __post_init__(self) -> None:
@@ -95,8 +95,8 @@ class Authority:
     def sign(self, document: bytes, label: str) -> bytes:
         """Return ``document`` as a signed S/MIME message (``.p7s``).
 
-        The message is parsed again, to check its digest and its content.  ``label`` names the
-        document in the error.
+        The message is read back, to check its digest and its content.  ``label`` names the document
+        in the error.
 
         Raises:
             PkiError: the message does not contain ``document`` with a correct digest.
@@ -104,9 +104,9 @@ class Authority:
         return self.sign_all((document,), label)[0]
 
     def sign_all(self, documents: Sequence[bytes], label: str) -> list[bytes]:
-        """Return ``documents`` as signed S/MIME messages, in order, as by `sign`.
+        """Return ``documents`` as signed S/MIME messages, in order, like `sign`.
 
-        For small documents this is faster than `sign`, because each step is done for several
+        For small documents, this is faster than `sign`, because each step is done for several
         documents in a row.
         """
         messages: list[bytes] = []
@@ -124,7 +124,7 @@ _BATCH_BYTES = 1 << 18
 
 
 def _batches(documents: Sequence[bytes]) -> Iterator[Sequence[bytes]]:
-    """Yield the documents in batches of up to 256 KiB; a larger document is a batch alone."""
+    """Yield the documents in batches of up to 256 KiB; a larger document is a batch by itself."""
     begin = size = 0
     for end, document in enumerate(documents):
         size += len(document)
@@ -156,14 +156,14 @@ def create_authorities(
     then used instead of a new one.
 
     Raises:
-        KeystoreError: the places of the CA keys do not fit the template.
+        KeystoreError: the places of the CA keys contradict the template.
         UsageError: an imported CA comes without its key, or does not fit the template.
         PkiError: an imported CA cannot be used.
     """
     check_places(keyring, template)
     check_imported_keys(imported_cas, keyring, template)
     validity = window(now, template.authority_validity)
-    # Separate CAs get unique names, so that messages and diagrams distinguish keystores.
+    # Separate CAs get unique names, by which messages and diagrams tell keystores apart.
     serial = secrets.token_hex(4)
     notes: list[Note] = []
 
@@ -265,10 +265,10 @@ def write_bundle(
     bundle: bytes,
     names: Sequence[str],
 ) -> None:
-    """Stage ``bundle`` (PEM) as a CA file, and replace copies of the file in enclaves.
+    """Stage ``bundle`` (PEM) as a CA file, and as the copies of this file in enclaves.
 
-    ``file`` is its name without the suffix ``.cert.pem``; ``roles`` are the roles of the CA,
-    ``names`` the enclaves of the keystore.
+    ``file`` is the file's name without the suffix ``.cert.pem``.  ``roles`` are the roles of the
+    CA, and ``names`` the enclaves of the keystore.
     """
     transaction.write(f"{PUBLIC}/{file}.cert.pem", bundle)
     for role in roles:
@@ -276,7 +276,7 @@ def write_bundle(
 
 
 def write_copies(transaction: Transaction, names: Sequence[str], name: str, data: bytes) -> None:
-    """Stage ``data`` as the file ``name`` in all enclaves that have a copy of it, not a link."""
+    """Stage ``data`` as the file ``name`` of all enclaves that have a copy, not a link."""
     for enclave in names:
         path = f"{enclave_folder(enclave)}/{name}"
         if (transaction.root / path).is_file() and not (transaction.root / path).is_symlink():
@@ -304,11 +304,11 @@ class ImportedAuthority:
 def check_imported(
     role: str, data: bytes, key: PrivateKey | None, now: datetime
 ) -> ImportedAuthority:
-    """Return the CA certificate of ``key`` with its chain, after checking them.
+    """Return the CA to which ``key`` belongs, with its chain, after checks.
 
-    ``data`` holds the certificates of the CA and of its issuers as PEM, in any order; without a
-    ``key``, the first certificate is the CA's.  A fault that only some DDS vendors refuse becomes a
-    note.
+    ``data`` has the certificates of the CA and of its issuers as PEM, in any order; without a
+    ``key``, the first certificate is that of the CA.  Faults that only some DDS vendors refuse
+    become notes.
 
     Raises:
         PkiError: the CA cannot be the ``role`` CA.
@@ -372,7 +372,7 @@ def _chain(
 def _check_ca(certificate: x509.Certificate, role: str, now: datetime) -> None:
     """Raise `PkiError` if a certificate says that it is not a CA, or is not valid at ``now``.
 
-    A certificate that does not say whether it is a CA is left to the vendors.
+    If a certificate does not say whether it is a CA, the decision is left to the vendors.
     """
     name = subject_text(certificate.subject)
     if denies_issuing(certificate):

@@ -1,12 +1,14 @@
 """Identity certificates from an existing CA service, through a program of the user.
 
 The place ``issuer:NAME`` of an identity CA's key stands for the program ``sros-issuer-NAME`` on the
-PATH.  It gets a request (PKCS#10, PEM) on standard input and writes the certificate, as PEM, to
-standard output; a chain may follow.  These variables say what is asked: ``SROS_ENCLAVE``,
-``SROS_SUBJECT`` (RFC 4514), ``SROS_NOT_AFTER`` (ISO 8601, UTC) and ``SROS_KEYSTORE``.
+PATH.  The program gets a request (PKCS#10, PEM) on standard input, and writes the certificate as
+PEM to standard output; a chain may follow.  These environment variables say what is requested:
+``SROS_ENCLAVE``, ``SROS_SUBJECT`` (RFC 4514), ``SROS_NOT_AFTER`` (ISO 8601, UTC) and
+``SROS_KEYSTORE``.
 
 As with ``git-credential-NAME``, a keystore chooses among the programs that the user installed for
-this, and cannot bring its own.  What a program answers is not trusted until it is verified.
+this purpose, and cannot contain a program.  The answer of a program is verified before it is
+trusted.
 """
 
 from __future__ import annotations
@@ -48,26 +50,27 @@ _MOST_BYTES = 64 * 1024
 _MOST_SAID = 500
 _SECONDS = 60
 _LOOK = 0.02
-"""Seconds between two looks at whether a program that closed its output has ended."""
+"""Seconds between two checks whether a program that closed its output has ended."""
 _AHEAD = timedelta(hours=1)
-"""How long after the start of a keystore's change a certificate may become valid: services date
-certificates by their own clock, when they issue.
+"""How long after the start of a keystore's change a certificate may become valid.
+
+A service dates certificates by its own clock, at the time of issuing.
 """
 _MOST_SERIAL_BITS = 159
-"""Largest serial number that a revocation list can have (RFC 5280, 4.1.2.2)."""
+"""Largest serial number, in bits, that a revocation list can have (RFC 5280, 4.1.2.2)."""
 
 _LOG = logging.getLogger(__name__)
 
 
 class CaServiceError(KeystoreError):
-    """A CA service did not issue a certificate, or issued one that cannot be used."""
+    """The CA service did not issue a certificate, or issued one that cannot be used."""
 
 
 @dataclass(frozen=True, slots=True)
 class CertificateRequest:
-    """A request to a CA service: the ``request`` (PEM), and what the certificate has to have.
+    """A request to a CA service: the ``request`` (PEM), and what the certificate must have.
 
-    The ``subject`` may have more than the one in the request, if the request is from a robot.
+    If the request is from a robot, ``subject`` may have more parts than the subject in it.
     """
 
     enclave: str
@@ -78,7 +81,7 @@ class CertificateRequest:
 
 
 def check_ca_service(place: str) -> None:
-    """Raise `UsageError` if ``place`` stands for a CA service, and its name is not valid."""
+    """Raise `UsageError` if ``place`` stands for a CA service with an invalid name."""
     if is_ca_service(place) and not _NAME.fullmatch(place.removeprefix(CA_SERVICE_SCHEME)):
         raise UsageError(
             f"'{place}' is not the name of a CA service",
@@ -119,7 +122,7 @@ class CaService:
         return certificate
 
     def _answer(self, asked: CertificateRequest) -> bytes:
-        """Return what the program writes to its standard output."""
+        """Return what the program writes to standard output."""
         program = shutil.which(self.program)
         if program is None or not Path(program).is_absolute():
             raise self._error(asked, f"There is no program `{self.program}` on the PATH")
@@ -163,10 +166,10 @@ class CaService:
 
 
 def _bounded_output(process: subprocess.Popen[bytes]) -> tuple[bytes | None, bytes]:
-    """Return the output of a program, up to just above the limit, and the end of its errors.
+    """Return the output of a program, up to just above the limit, and the end of its error output.
 
-    The output is None if the program does not end in time.  In both cases the program and its child
-    processes are ended.
+    The output is None if the program does not end in time.  The program and its child processes are
+    then ended in any case.
     """
     end, answer, errors, ended = time.monotonic() + _SECONDS, b"", b"", False
     assert process.stdout and process.stderr
@@ -204,7 +207,7 @@ def _fault(
     authority: x509.Certificate,
     now: datetime,
 ) -> str:
-    """Return why a certificate is not what was asked for, as a clause; "" if it is.
+    """Return why a certificate is not the requested one, as a clause; "" if it is.
 
     Whether DDS vendors accept it is evaluated later, as for every change of a keystore.
     """

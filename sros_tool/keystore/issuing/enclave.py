@@ -1,8 +1,9 @@
 """The only writer of enclaves: it issues, proves and stages their certificates and permissions.
 
-Every command that issues passes an `Issuance` to `EnclaveWriter.write`, which turns the rights into
-permissions, proves that they match the policy, signs certificate and permissions, stages them in a
-transaction, and records them for the ledger.  For many enclaves, several processes share the work.
+Every command that issues passes an `Issuance` to `EnclaveWriter.write`.  This method turns the
+rights into permissions, proves that these match the policy, signs certificate and permissions,
+stages both in a transaction, and records them for the ledger.  For many enclaves, several processes
+share the work.
 """
 
 from __future__ import annotations
@@ -81,9 +82,9 @@ _NOTED_LOSS = 0.01
 
 @dataclass(frozen=True, slots=True)
 class NewIdentity:
-    """The subject and the key that a certificate is issued for.
+    """The subject and the key for which a certificate is issued.
 
-    ``new_key`` is the private key if it was just generated; the key, or its place if it is on a
+    ``new_key`` is the private key if it was just generated; the key itself, or its place on a
     token, is staged with the certificate.  ``request`` is the request (PEM) of a robot that has the
     key.
     """
@@ -96,7 +97,7 @@ class NewIdentity:
 
 @dataclass(frozen=True, slots=True)
 class StatedRights:
-    """The rights that a policy states for an enclave, and the ROS domains that they apply to."""
+    """The rights that a policy states for an enclave, and the ROS domains to which they apply."""
 
     enclave: Enclave
     domains: DomainSet
@@ -107,7 +108,7 @@ class Issuance:
     """The certificate and permissions to issue for an enclave.
 
     ``identity`` is the certificate that the enclave keeps, or the subject and key of a new
-    certificate.  With ``rights`` None, the permissions do not change.
+    certificate.  If ``rights`` is None, the permissions do not change.
     """
 
     name: str
@@ -131,7 +132,7 @@ class Issued:
     short_lived: bool = False
 
     def notes(self) -> Iterator[Note]:
-        """Yield notes on short-lived enclaves, and on rights that ros2/sros2 would not join."""
+        """Yield notes on short-lived enclaves, and on rights that ros2/sros2 keeps separate."""
         name, rights = self.issuance.name, self.issuance.rights
         if isinstance(rights, StatedRights) and len(rights.enclave.profiles) > 1:
             yield Note(
@@ -157,9 +158,9 @@ class EnclaveWriter:
     """Writer of enclaves, which issues certificates and permissions within one transaction.
 
     ``identity`` signs certificates, ``permissions`` signs permissions.  ``entries`` collects
-    entries for the ledger; ``grants`` collects the new grants of enclaves, if the keystore has a
-    Zenoh network.  ``notes`` report CAs that expire too early for the validity that the template
-    chooses.  ``keys_on_token`` says that enclaves get keys on a token.
+    entries for the ledger.  ``grants`` collects the new grants of enclaves if the keystore has a
+    Zenoh network.  ``notes`` report CAs that expire too early for the template's validities.
+    ``keys_on_token`` says that enclaves get keys on a token.
     """
 
     def __init__(
@@ -180,7 +181,8 @@ class EnclaveWriter:
         self._now = now
         self._identity = identity
         self._issuer = identity.issuer() if identity and not identity.service else None
-        if identity and identity.service and transaction.dry_run:  # the service is not asked
+        # A dry run does not ask the service.
+        if identity and identity.service and transaction.dry_run:
             self._issuer = Issuer(identity.certificate, generate_key())
         self._secrets = secrets
         self._signer = permissions
@@ -252,10 +254,10 @@ class EnclaveWriter:
     def would_change_only_dates(
         self, rights: StatedRights, certificate: x509.Certificate, validity: Window, text: bytes
     ) -> bool:
-        """Return whether `write` would change only dates, and the current expiry is late enough.
+        """Return whether `write` would change only dates, while the present expiry is late enough.
 
-        ``text`` is the current document, with LF line ends.  Its ``validity`` is long enough until
-        two thirds of a new validity are over (`Window.can_be_kept`).
+        ``text`` is the present document, with LF line ends.  The expiry is late enough until two
+        thirds of a new ``validity`` are over (`Window.can_be_kept`).
 
         Raises:
             KeystoreError: the permissions would not decide as the policy does.
@@ -279,7 +281,8 @@ class EnclaveWriter:
     def _validity_of_permissions(self, name: str, certificate: x509.Certificate) -> Window:
         """Return the validity of an enclave's permissions, which expire with their certificate.
 
-        They may begin before it: Fast DDS reads their dates in local time (`BACKDATE`).
+        Permissions may begin before the certificate, because Fast DDS reads their dates in local
+        time (`BACKDATE`).
         """
         validity = self._validity(name, self._permissions_validity)
         end = validity_of(certificate).not_after
@@ -311,7 +314,7 @@ class EnclaveWriter:
         """Return the certificate that the CA service ``authority`` issues for an enclave.
 
         Raises:
-            CaServiceError: it does not issue the certificate, or another one than was asked for.
+            CaServiceError: the service issues no certificate, or another one than was requested.
         """
         assert authority.service
         asked = CertificateRequest(
@@ -324,9 +327,9 @@ class EnclaveWriter:
         return authority.service.issue(asked, authority.certificate, self._now)
 
     def _request(self, name: str, identity: NewIdentity) -> bytes:
-        """Return a request for an enclave's certificate, signed with its key.
+        """Return a request for an enclave's certificate, signed with the enclave's key.
 
-        A key on a robot signed the request that the keystore has.
+        If the key is on a robot, this is the request that the robot signed and the keystore kept.
         """
         folder = enclave_path(self._transaction.root, name)
         key = identity.new_key
@@ -364,11 +367,11 @@ class EnclaveWriter:
         work: Callable[[str], Result],
         progress: Progress | None = None,
     ) -> dict[str, Result]:
-        """Run ``work`` for all enclaves on all cores; map each enclave to its result.
+        """Run ``work`` for all enclaves on all cores, and map each enclave to its result.
 
         Everything that forked workers issue and stage is added to this writer and its transaction.
-        With a CA key on a token, no workers are forked: the session of a token does not survive a
-        fork.
+        If a CA key is on a token, no workers are forked, because the session of a token does not
+        survive a fork.
         """
         own_process = os.getpid()
 
@@ -387,7 +390,7 @@ class EnclaveWriter:
         slices = self._transaction.stage_on_all_cores(names, work_on, alone=self._key_on_token)
         results_by_name: dict[str, Result] = {}
         for index, (part, (results, entries, signed)) in enumerate(slices):
-            if index:  # this process did the first slice, forked workers did the others
+            if index:  # forked workers did the other slices, this process the first
                 self.entries += entries
                 self.signed |= signed
                 for name in part if progress else ():
@@ -459,7 +462,7 @@ def default_rights(template: Template, name: str) -> Enclave:
 
 
 def present_files(root: Path, name: str) -> set[str]:
-    """Return the names of the files of an enclave; a broken link counts as missing."""
+    """Return the names of an enclave's files; a broken link counts as missing."""
     folder = enclave_path(root, name)
     try:
         names = os.listdir(folder)
@@ -469,9 +472,9 @@ def present_files(root: Path, name: str) -> set[str]:
 
 
 def shared_files(root: Path, name: str) -> dict[str, str]:
-    """Map the names of the files that all enclaves share to their paths in the keystore."""
+    """Map the names of the files that all enclaves share to the files' paths in the keystore."""
     shared = {f"{role}_ca.cert.pem": ca_certificate(role) for role in ROLES}
-    if enclave_folder(name) != ENCLAVES:  # the folder of enclave / already holds the governance
+    if enclave_folder(name) != ENCLAVES:  # the folder of the enclave / itself holds the governance
         shared[GOVERNANCE_FILE] = GOVERNANCE_P7S
     if (root / CRL).exists():
         shared[CRL_FILE] = CRL
@@ -479,7 +482,7 @@ def shared_files(root: Path, name: str) -> dict[str, str]:
 
 
 def link_shared_files(transaction: Transaction, name: str, present: Collection[str]) -> None:
-    """Stage links to the files that all enclaves share, except the ``present`` ones."""
+    """Stage links to the files that all enclaves share, except those in ``present``."""
     folder = enclave_folder(name)
     up = "../" * folder.count("/")
     for file, source in shared_files(transaction.root, name).items():

@@ -1,6 +1,6 @@
 """The private keys of the CAs: in the keystore, in another file, or on a PKCS#11 token.
 
-The library never prompts for a secret: it calls the secrets handler of its caller.
+The library never prompts for a secret: it calls the function that the caller gave it for secrets.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from sros_tool.pki.token import (
 )
 from sros_tool.xml import read_bytes
 
-_SHORTEST_PASSPHRASE = 12  # characters; OWASP ASVS 4.0.3, 2.1.1
+_SHORTEST_PASSPHRASE = 12  # in characters; OWASP ASVS 4.0.3, 2.1.1
 
 _LOG = logging.getLogger(__name__)
 
 Secrets = Callable[[str], str]
-"""Function that returns a secret, such as a passphrase or PIN, for a description of it."""
+"""A function that returns a secret, such as a passphrase or PIN, given its description."""
 
 
 def no_secrets(label: str) -> str:
-    """Raise `PkiError`: without another function, a keyring cannot ask the user for secrets."""
+    """Raise `PkiError`; this is the default of a keyring that cannot ask the user for secrets."""
     raise PkiError(
         f"{label} is needed",
         "The keyring has no secrets handler to ask for it.",
@@ -53,11 +53,10 @@ class Keyring:
     """Where the CA keys are, and the function that returns the secrets to open them.
 
     ``places`` maps a role ("identity", "permissions") to the URI of its key, ``file:PATH`` or
-    ``pkcs11:...``, as the user named it.  For a role without an entry, the keystore's settings name
-    the place.
+    ``pkcs11:...``, as the user named it.  For other roles, the keystore's settings name the place.
 
-    ``secrets`` returns passphrases and PINs.  With ``encrypt``, new key files get a passphrase;
-    only with ``short_passphrase`` may it have less than 12 characters.
+    ``secrets`` returns passphrases and PINs.  With ``encrypt``, new key files get a passphrase, of
+    at least 12 characters unless ``short_passphrase`` is set.
     """
 
     secrets: Secrets = no_secrets
@@ -78,12 +77,12 @@ class Keyring:
         return self.places.get(role) or template.key_place(role) or ca_key(role)
 
     def ca_service(self, root: Path, role: str, template: Template) -> CaService | None:
-        """Return the CA service that signs as the ``role`` CA; None if the CA has a key for sros.
+        """Return the CA service that issues as the ``role`` CA; None if sros signs with a key.
 
         Raises:
-            UsageError: the place is not a valid one, or is that of the permissions CA.
-            KeystoreError: only the keystore, of another user, names the service, which could make
-                it issue with the rights of this user.
+            UsageError: the place is not valid, or names a service for the permissions CA.
+            KeystoreError: the service is named only by a keystore of another user, who could so
+                make it issue with the rights of this user.
         """
         place = self.place(role, template)
         if not is_ca_service(place):
@@ -109,7 +108,7 @@ class Keyring:
         """Return the private key of the ``role`` CA.
 
         Raises:
-            KeystoreError: the key is missing, cannot be opened, or is that of a CA service.
+            KeystoreError: the key is missing, cannot be opened, or belongs to a CA service.
         """
         root, place = keystore.root, self.place(role, template)
         _refuse_ca_service(role, place)
@@ -144,14 +143,14 @@ class Keyring:
     ) -> PrivateKey:
         """Return the key for a new CA: the existing key at its place, or a new key created there.
 
-        ``file`` is the path in the keystore of a new key if nobody named another place.  A dry run
-        opens a token only if the key is ``compared`` with a certificate; otherwise it returns a
+        ``file`` is the path of a new key in the keystore if no other place is named.  A dry run
+        opens a token only if the key is ``compared`` with a certificate; otherwise, it returns a
         temporary key.
 
         Raises:
             KeystoreError: only the template names the place of an existing key, and the key is not
-                ``compared`` with a certificate that the user chose: whoever wrote the template
-                could make another CA of the user sign for the new keystore.
+                ``compared`` with a certificate that the user chose.  Otherwise, whoever wrote the
+                template could make another CA of the user sign for the new keystore.
         """
         place = self.places.get(role) or template.key_place(role)
         _refuse_ca_service(role, place)
@@ -188,7 +187,7 @@ class Keyring:
             )
 
     def is_encrypted(self, keystore: OpenedKeystore, role: str, template: Template) -> bool | None:
-        """Return whether the file of a CA's key is encrypted; None if no such file can be read."""
+        """Return whether the file of a CA's key is encrypted; None if there is no readable file."""
         place = self.place(role, template)
         if is_token_uri(place) or is_ca_service(place):
             return None
@@ -197,7 +196,7 @@ class Keyring:
         return None
 
     def settings_with_places(self, template: Template) -> Template:
-        """Return ``template`` with the places of the CA keys, as settings of a new keystore."""
+        """Return ``template`` with the places of the CA keys, to be a new keystore's settings."""
         identity = self.places.get(IDENTITY) or template.identity_key
         permissions = self.places.get(PERMISSIONS) or template.permissions_key
         if not template.separate_authorities:
@@ -207,8 +206,8 @@ class Keyring:
     def _read(self, keystore: OpenedKeystore, path: Path, role: str) -> bytes:
         """Return the PEM of a CA key.
 
-        The settings or a link in another user's keystore could name a CA key that only this user
-        can read, to make it sign.  So the key has to belong to the owner of the keystore, too,
+        The settings, or a link, in another user's keystore could name a CA key that only this user
+        can read, and so make this key sign.  So the owner of the keystore must also own the key,
         unless the user named the place.
 
         Raises:
@@ -230,7 +229,7 @@ class Keyring:
             ) from error
 
     def _is_from_user(self, role: str) -> bool:
-        """Return whether the user named the place of a key, rather than the keystore's settings."""
+        """Return whether the user named the place of a key; if not, the keystore's settings did."""
         return bool(self.places.get(role))
 
     def _new_passphrase(self, role: str) -> str:
@@ -251,7 +250,7 @@ class Keyring:
 
 
 def absolute_place(place: str) -> str:
-    """Return the place of a key as a URI, also where it is the path of a file."""
+    """Return the place of a key as a URI, also if it is given as the path of a file."""
     if is_token_uri(place) or is_ca_service(place):
         return place
     return f"file:{Path(place.removeprefix('file:')).absolute()}"
@@ -267,11 +266,11 @@ def _refuse_ca_service(role: str, place: str) -> None:
 
 
 IN_KEYSTORE = Keyring()
-"""The keyring for CA keys in the keystore, unencrypted."""
+"""The keyring for unencrypted CA keys in the keystore."""
 
 
 def check_places(keyring: Keyring, template: Template) -> None:
-    """Raise `KeystoreError` if the roles of a single CA have different places for its key."""
+    """Raise `KeystoreError` if a CA with both roles has a different key place for each."""
     named = {role: keyring.places.get(role) for role in ROLES}
     if not template.separate_authorities and len({place or "" for place in named.values()}) > 1:
         raise KeystoreError(
@@ -299,9 +298,10 @@ def check_imported_keys(roles: Iterable[str], keyring: Keyring, template: Templa
 
 
 def _write_outside(path: Path, pem: bytes, transaction: Transaction) -> None:
-    """Write a key file outside the keystore; remove it if the transaction fails.
+    """Write a key file outside of the keystore, and remove it if the transaction fails.
 
-    The file belongs to the owner of the keystore, who needs it, if the folder belongs to that user.
+    If the folder belongs to the owner of the keystore, so does the file, because the owner needs
+    the key.
     """
     root = transaction.root
     write_new_file(path, pem, for_user=root.stat().st_uid if root.exists() else None)

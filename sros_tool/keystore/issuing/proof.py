@@ -1,7 +1,7 @@
 """Proof that permissions give exactly the rights of the policy they are made from.
 
 A policy allows a topic if a rule allows it and no rule denies it.  DDS applies the first rule that
-matches.  Both decide the same for every topic name if
+matches.  Policy and DDS decide alike for every topic name if
 
 - the document has one grant, its deny rules come first, every rule is for all domains of the
   keystore and without partitions, the default is to deny, and its expressions equal the policy's.
@@ -41,9 +41,9 @@ from sros_tool.policy.patterns import common_name, matches, overlap
 _ASKED = (Vendor.STANDARD, Vendor.FAST)
 """The vendors that must decide as the policy does.
 
-Fast DDS 2.9 decides on these documents as 2.14 does.  Cyclone DDS 0.10 is left out: a topic that is
-denied in one direction is denied in both there.  No document can avoid that; a note reports it
-(``portable.deny-blocks-topic``).
+On these documents, Fast DDS 2.9 decides as 2.14 does.  Cyclone DDS 0.10 is left out, because it
+denies a topic in both directions if one direction is denied.  No document can avoid this; a note
+reports it (``portable.deny-blocks-topic``).
 """
 
 _SET = re.compile(r"\[!?[^\]]+\]")
@@ -100,7 +100,8 @@ class ExpressionSets:
     def matches_same_names(self, stated: ExpressionSets) -> bool:
         """Return whether these sets match the same names as the sets ``stated``.
 
-        They have to be subsets of ``stated``, and may lack only names that a wildcard also matches.
+        The sets must be subsets of ``stated``, and may lack only names that one of their wildcards
+        matches.
         """
         return all(
             own <= theirs and _are_matched_by_wildcards(theirs - own, own)
@@ -108,7 +109,7 @@ class ExpressionSets:
         )
 
     def paired_sets(self, other: ExpressionSets) -> Iterator[tuple[set[str], set[str]]]:
-        """Yield pairs of sets for the same side and direction: from self, and from ``other``."""
+        """Yield pairs of sets of the same kind and direction: from ``self``, and from ``other``."""
         for own, theirs in ((self.allowed, other.allowed), (self.denied, other.denied)):
             for verb in (_OUT, _IN):
                 yield own[verb], theirs[verb]
@@ -122,9 +123,9 @@ class ExpressionSets:
 
 @dataclass(frozen=True, slots=True)
 class Disagreement:
-    """A DDS topic on which policy and permissions differ.
+    """A DDS topic on which policy and permissions disagree.
 
-    ``allowed`` says whether the policy allows it; ``outcome`` is the decision of ``vendor``.
+    ``allowed`` says whether the policy allows the topic; ``outcome`` is the decision of ``vendor``.
     """
 
     verb: str
@@ -144,7 +145,7 @@ class Disagreement:
 def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None:
     """Raise `KeystoreError` unless ``permissions`` allow exactly what ``policy`` allows.
 
-    This must hold on all ``domains``.
+    They must do so in all ``domains``.
     """
     stated = stated_expressions(policy)
     wildcards = {expression for expression in stated.all() if is_expression(expression)}
@@ -180,7 +181,7 @@ def _are_matched_by_wildcards(left_out: set[str], expressions: set[str]) -> bool
 
 @lru_cache(maxsize=4096)
 def matched_as_meant(expression: str) -> bool:
-    """Return whether vendors and policies agree on example names for an expression."""
+    """Return whether vendors and policies agree on which example names an expression matches."""
     return all(
         dds_matches(vendor.traits.style, expression, name) == matches(expression, name)
         for name in example_topics([expression])
@@ -189,7 +190,10 @@ def matched_as_meant(expression: str) -> bool:
 
 
 def stated_expressions(policy: Enclave) -> ExpressionSets:
-    """Return an enclave's rights in a policy as DDS expressions, with the ROS discovery topic."""
+    """Return the rights that a policy gives an enclave as DDS expressions, and ROS discovery.
+
+    The topic of ROS discovery is added.
+    """
     expressions = ExpressionSets.none()
     for verb in (_OUT, _IN):
         expressions.allowed[verb].add(ROS_DISCOVERY_TOPIC)
@@ -207,7 +211,8 @@ def stated_expressions(policy: Enclave) -> ExpressionSets:
 def signed_expressions(permissions: Permissions, domains: DomainSet) -> ExpressionSets | None:
     """Return the expressions that permissions allow and deny.
 
-    Return None if the permissions do not have the form that the module docstring describes.
+    The result is None if the permissions do not have the form that the docstring of this module
+    describes.
     """
     if len(permissions.grants) != 1 or permissions.grants[0].default_allow:
         return None
@@ -235,11 +240,11 @@ def differences(
     domains: DomainSet,
     vendors: Iterable[Vendor] = _ASKED,
 ) -> list[Disagreement]:
-    """Return the topics on which a vendor decides otherwise than the policy.
+    """Return the topics on which a vendor's decision differs from the policy's.
 
-    The topics compared are the `example_topics` of all expressions together and of each wildcard
-    expression alone, and a topic of each expression that only the policy or only the permissions
-    have.
+    The compared topics are the `example_topics` of all expressions together and of each wildcard
+    expression by itself, and a topic for each expression that only the policy or only the
+    permissions have.
     """
     stated = stated_expressions(policy)
     expressions = {*stated.all(), *_topics(permissions)}
@@ -265,11 +270,11 @@ def differences(
 
 
 def example_topics(expressions: Iterable[str]) -> tuple[str, ...]:
-    """Return sorted example topics that distinguish the expressions.
+    """Return sorted example topics that tell the expressions apart.
 
-    These are every expression without wildcards; for each expression with wildcards, a topic that
+    These are: each expression without wildcards; for each expression with wildcards, a topic that
     it matches, a topic that no other expression matches, and a topic that it shares with each
-    overlapping expression; and for each ROS prefix a topic that no expression matches.
+    overlapping expression; and for each ROS prefix, a topic that no expression matches.
     """
     known = sorted(set(expressions))
     wild = [expression for expression in known if is_expression(expression)]
@@ -286,14 +291,15 @@ def example_topics(expressions: Iterable[str]) -> tuple[str, ...]:
 
 
 def _matching_name(expression: str) -> str | None:
-    """Return a name that an expression matches, or None if no valid name does."""
+    """Return a name that an expression matches; None if it matches no valid name."""
     name = expression.replace("*", "n")
-    # The search for the shortest name is only worth its time where this is none.
+    # Searching for the shortest name takes long, so it is only done if this name still has a
+    # wildcard.
     return common_name([expression], absolute=False) if is_expression(name) else name
 
 
 def _uniquely_matched_name(expression: str, known: list[str]) -> str | None:
-    """Return a name that only ``expression`` matches, or None if no simple name is such."""
+    """Return a name that only ``expression`` matches; None if no simple name does."""
     for letter in ("never_mentioned", "n", "0", ""):
         name = _SET.sub(_member_of_set, expression).replace("*", letter).replace("?", "n")
         if matches(expression, name) and not any(
@@ -317,9 +323,9 @@ def _range_ends(domains: DomainSet) -> tuple[int, ...]:
 
 
 def _access(vendor: Vendor, permissions: Permissions, domain: int) -> Access:
-    """Return an `Access` that decides as ``vendor``, for the subject of the first grant.
+    """Return the access control of ``vendor`` for the subject of the first grant.
 
-    Its time is the middle of the grant's validity.
+    The time is the middle of the grant's validity.
     """
     grant = permissions.grants[0]
     window = grant.validity

@@ -42,14 +42,14 @@ from sros_tool.values import DryRun, FileChanges, Notes, shows
 from sros_tool.wording import first_few
 
 _SHOWN = 5
-"""Largest number of robots that a note names."""
+"""Maximum number of robots that a note names."""
 _LINE = len("<topic></topic>\r\n")
 
 
 class SizeEstimator:
-    """Estimator of the size of signed permissions, which signs them with a temporary key.
+    """An estimator for the size of signed permissions, which signs with a temporary key.
 
-    The error is below 100 bytes: CA name and signature vary in length.
+    The error is less than 100 bytes, because the lengths of CA names and signatures vary.
     """
 
     def __init__(self) -> None:
@@ -71,9 +71,9 @@ class SizeEstimator:
 
 
 def right_bytes(right: Right) -> int:
-    """Return the size in bytes of a right in a large permissions document.
+    """Return the size in bytes of a right in large permissions.
 
-    A right takes a line per DDS topic.  In a smaller document the lines are indented, too.
+    A right takes one line for each DDS topic.  In smaller permissions, the lines are indented, too.
     """
     names = dds_names(right.right, right.name)
     return sum(_LINE + len(name) for name in (*names.publish, *names.subscribe))
@@ -82,7 +82,7 @@ def right_bytes(right: Right) -> int:
 # ── of a minimized policy ──────────────────────────────────────────────────────────────────
 
 _MARGIN = 256
-"""Bytes kept free below the size limit: CA names and signatures vary in length."""
+"""Number of bytes kept free below the size limit, as lengths of CA names and signatures vary."""
 
 
 class PermissionsBytes(NamedTuple):
@@ -109,12 +109,12 @@ class MinimizedEnclave(NamedTuple):
 
 
 class PolicyMinimization(NamedTuple):
-    """A policy reduced to the rights that were observed in use."""
+    """A policy reduced to the observed rights."""
 
     policy: Path
     """POLICY, as given on the command line."""
     output: Path | None
-    """The file that was written; null if none was."""
+    """The written file; null if none was written."""
     enclaves: Sequence[MinimizedEnclave]
     """The enclaves of the policy."""
     dry_run: DryRun
@@ -138,18 +138,19 @@ def minimized_policy(
     strict: bool = False,
     output: Path | None = None,
 ) -> Minimization:
-    """Return the policy in a file without the rights that were never observed in use.
+    """Return the policy in a file without the rights that were never observed.
 
     Args:
         file: the policy.
-        observed: policies or permissions with the rights that were observed.
-        fleet: the robots that placeholders of the policies stand for.  A right observed on one
-            robot stays for all robots; sizes are computed for the robot with the longest path.
-        strict: also remove unused rights that every node needs.
-        output: where the policy is going to be written.
+        observed: policies or permissions with the observed rights.
+        fleet: the robots for which placeholders of the policies stand.  A right that was observed
+            on one robot stays for all robots; sizes are computed for the robot with the longest
+            path.
+        strict: also remove rights that every node needs if they were not observed.
+        output: the file to which the caller will write the policy.
 
     Raises:
-        PolicyError: a policy cannot be read, or would change when it is written.
+        PolicyError: a policy cannot be read, or would change by being written.
     """
     policy = read_policy(file, placeholders=fleet is not None)
     sources = [load_rights(path, fleet) for path in observed]
@@ -223,7 +224,7 @@ def _measured_enclaves(
     ):
         was, now = (Policy((enclave,)) for enclave in (before, after))
         size = estimator.signed_bytes(_longest_enclave(was, fleet))
-        # Another signature of the same permissions can have another length.
+        # Without this, another signature of equal permissions could show another size.
         if policy_rights(was) == policy_rights(now):
             sizes = PermissionsBytes(size, size)
         else:

@@ -31,7 +31,7 @@ def token_places(uri: str, names: Sequence[str]) -> Mapping[str, TokenUri]:
     """Map enclaves to the places of their keys: ``uri``, with the enclave's name as default label.
 
     Raises:
-        UsageError: ``uri`` is not a PKCS#11 URI, or names the same key for several enclaves.
+        UsageError: ``uri`` is not a PKCS#11 URI, or names one key for several enclaves.
     """
     if not is_token_uri(uri):
         raise UsageError(
@@ -65,7 +65,7 @@ def place_in(path: Path) -> TokenUri:
 
 @dataclass(frozen=True, slots=True)
 class EnclaveTokens:
-    """The ``places`` of new keys on tokens, by enclave, and keys that must not be used again."""
+    """The ``places`` of new keys on tokens, by enclave, and the keys that must not be reused."""
 
     places: Mapping[str, TokenUri]
     secrets: Secrets
@@ -74,10 +74,10 @@ class EnclaveTokens:
     dry_run: bool = False
 
     def key(self, name: str) -> TokenKey:
-        """Return the key at the enclave's place on the token; create it if it does not exist.
+        """Return the key at the enclave's place on the token, after creating it if it is missing.
 
         Raises:
-            KeystoreError: the key was revoked, or is the key of another enclave or of a CA.
+            KeystoreError: the key was revoked, or belongs to another enclave or to a CA.
             PkiError: the token cannot be used.
         """
         place = self.places[name]
@@ -97,7 +97,7 @@ class EnclaveTokens:
         return key
 
     def check_present(self, name: str, root: Path) -> None:
-        """Raise `KeystoreError` if the key of an existing enclave is not at its chosen place."""
+        """Raise `KeystoreError` if the key of an existing enclave is not at the chosen place."""
         path = enclave_path(root, name) / KEY_URI_FILE
         if not path.exists() or read_bytes(path, "place of the key") != token_file(
             self.places[name]
@@ -111,7 +111,7 @@ class EnclaveTokens:
 
 
 def token_notes(key: TokenKey) -> Iterator[Note]:
-    """Yield notes on a token's key that may have been copied, and on the file with the PIN."""
+    """Yield notes on a token's key that may have been copied, and on the PIN file."""
     place = key.place
     if not key.never_left:
         yield Note(
