@@ -361,6 +361,24 @@ class Verb(click.Command):
             more |= {"help": text, "epilog": f"\b\nExample{example}"}
         super().__init__(*arguments, **more)
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Refuse an option that is given twice and takes one value: click drops all but the last.
+
+        Raises:
+            UsageError: there is such an option.
+        """
+        if not ctx.resilient_parsing:  # as for completion
+            _, _, given = self.make_parser(ctx).parse_args(list(args))
+            for option, times in Counter(given).items():
+                if (
+                    isinstance(option, click.Option)
+                    and times > 1
+                    and not (option.multiple or option.is_flag or option.count)
+                ):
+                    name = max(option.opts, key=len)
+                    raise UsageError(f"{name} is given twice", "It takes one value.", "Choose one.")
+        return super().parse_args(ctx, args)
+
 
 def verb(name: str, cls: type[Verb] = Verb) -> Callable[[Callable[..., Any]], Verb]:
     """Return a decorator that makes a verb of a function."""

@@ -232,3 +232,14 @@ def test_no_unit_is_written_where_others_can_change_it(
     assert snapshot(tmp_path) == before
     os.chown(tmp_path / theirs, 0, 0)
     sros("units", made, "/leg", folder).ok()
+
+
+def test_an_option_for_one_value_is_refused_twice(made: Path, tmp_path: Path) -> None:
+    """The first pair of folders would never be collected from, or published to."""
+    job = ("units", made, "--job", "collect", "--inbox", "a", "--publish", "p")
+    ended = sros(*job, "--inbox", "b", "--publish", "q", tmp_path / "units")
+    assert ended.status == 2 and "--inbox is given twice. It takes one value." in ended.err, ended
+    assert not (tmp_path / "units").exists()
+    sros(
+        "units", made, "--job", "renew", "--job", "metrics", tmp_path / "u", "--json", "--json"
+    ).ok()
