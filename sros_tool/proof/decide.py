@@ -817,7 +817,7 @@ _Chain = tuple[TopicHop, ...]
 def _shortest_chain(
     world: World,
     sources: Iterable[str],
-    targets: Container[str],
+    targets: Collection[str],
     excluded: Container[str],
     limit: SearchLimit,
 ) -> _Chain:
@@ -826,13 +826,15 @@ def _shortest_chain(
     It does not pass through the enclaves ``excluded``.  An enclave with rights in several ROS
     domains passes on what it learns in one of them to the others.
     """
-    starts = list(sources)
+    worlds = (world, *world.elsewhere)
+    targets = {each for each in targets if any(_may_learn(of, each, excluded) for of in worlds)}
+    starts = list(sources) if targets else []
     # A target that is a source must be reached from another source, so two sources are kept.
     most = 2 if any(start in targets for start in starts) else 1
     origins: dict[str, set[str]] = {start: {start} for start in starts}
     used: dict[tuple[int, str, str], set[str]] = {}
     queue: deque[tuple[str, str, _Chain]] = deque((start, start, ()) for start in starts)
-    flows = [_Flow(domain_world, limit) for domain_world in (world, *world.elsewhere)]
+    flows = [_Flow(domain_world, limit) for domain_world in worlds]
     while queue:
         source, origin, chain = queue.popleft()
 
@@ -856,6 +858,22 @@ def _shortest_chain(
                 origins.setdefault(target, set()).add(origin)
                 queue.append((target, origin, longer))
     return ()
+
+
+def _may_learn(world: World, enclave: str, excluded: Container[str]) -> bool:
+    """Return whether an enclave may learn something from another one that is not ``excluded``.
+
+    The answer may be True wrongly; that this is asked first saves a search of the whole robot.
+    """
+    around = world.side(False).of.get(enclave, NameSet()).around()
+    if around is None or around.automata:
+        return True
+    return any(
+        writer != enclave and writer not in excluded
+        for topic in around.exact
+        if topic not in _IGNORED
+        for writer in world.writers_of(topic)
+    )
 
 
 def influencers(world: World, limit: SearchLimit) -> dict[str, set[str]]:

@@ -341,6 +341,7 @@ class World:
         self._weak = weak
         self.demanded = demanded
         self._readers_of: dict[str, list[str]] = {}
+        self._writers_of: dict[str, list[str]] = {}
         self._shared: dict[tuple[str, str], str | None] = {}
         self._written: dict[str, Written] = {}
 
@@ -447,6 +448,12 @@ class World:
         if topic not in self._readers_of:
             self._readers_of[topic] = self._readers.users_of(topic)
         return self._readers_of[topic]
+
+    def writers_of(self, topic: str) -> list[str]:
+        """Return the enclaves that may write a topic."""
+        if topic not in self._writers_of:
+            self._writers_of[topic] = self._writers.users_of(topic)
+        return self._writers_of[topic]
 
     def topics_between(self, writer: str, reader: str) -> NameSet | None:
         """Return the topics that can get from one enclave to another; None for all."""

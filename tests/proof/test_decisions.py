@@ -13,6 +13,7 @@ from sros_tool.dds.decision.vendors import TESTED
 from sros_tool.files import templates_dir
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
+from sros_tool.proof import decide as decisions
 from sros_tool.proof.findings import Decided, decide_all, requirement_findings, short_text
 from sros_tool.proof.requirements import Only, Protected, parse_requirements
 from sros_tool.proof.suggestions import suggest
@@ -277,6 +278,18 @@ def test_a_package_may_promise_what_its_nodes_never_do(required: str, reason: st
     rights["/b"] = may("publish", "/arm/joint_commands")
     broken = decided(rights, '[[nobody]]\npublish = ["*joint_commands"]')
     assert len(broken.violations) == 1
+
+
+def test_whom_nobody_reaches_needs_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Proposals for 300 robots ask for each enclave whether one gate alone reaches it."""
+    rights = {"/a": may("publish", "/x"), "/gate": may("publish", "/y")}
+    text = b'[[apart]]\nfrom = ["*"]\nto = ["/base"]\nthrough = ["/gate"]'
+    (gate,) = parse_requirements(text, "r.toml")
+    around = robot({**rights, "/base": may("subscribe", "/x", "/y")})
+    assert all(decisions.decide(gate, world).witness for world in around.worlds)
+    system = robot({**rights, "/base": may("subscribe", "/y")})
+    monkeypatch.setattr(decisions._Flow, "hops", None)
+    assert not any(decisions.decide(gate, world).witness for world in system.worlds)
 
 
 def test_what_is_proposed_can_fail() -> None:
