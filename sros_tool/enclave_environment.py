@@ -168,7 +168,7 @@ def loadable_environment(
         enclave_environment = _zenoh_environment(place, name, zenoh, variables, environment)
         return (
             replace(enclave_environment, notes=()) if target else enclave_environment
-        )  # they are about this process
+        )  # the notes are about this process
     if (target and not rmw) or RMW_ZENOH in rmw_implementations(environment):
         # If Zenoh is chosen later, such as in a launch file, no node starts.
         variables |= REFUSING_ZENOH

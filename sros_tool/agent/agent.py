@@ -449,7 +449,7 @@ class _Round:
         if paths:
             now = self._machine.now
             text = (
-                f"At {iso(now)}, {counted(len(paths), 'file')} that release {release} has "
+                f"At {iso(now)}, {counted(len(paths), 'file')} of release {release} "
                 f"{'was' if len(paths) == 1 else 'were'} changed or missing here, and replaced: "
                 f"{first_few(paths, 3)}. Find out who or what changes files on this robot."
             )

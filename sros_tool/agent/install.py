@@ -289,7 +289,7 @@ def present_lists(folder: Folder, name: str) -> dict[str, bytes]:
     """Return the existing files of an enclave that may contain revocation lists."""
     present: dict[str, bytes] = {}
     for file in LIST_FILES:
-        with suppress(SrosError, OSError):  # an unreadable file is none that a process could load
+        with suppress(SrosError, OSError):  # a process cannot load an unreadable file, either
             present[file] = folder.read_inside(f"{enclave_folder(name)}/{file}")
     return present
 

@@ -110,7 +110,7 @@ def _merge_robots(
 
 _MOST_ROBOTS = 10
 _FEWEST_ENCLAVES = 2  # only more enclaves than this are merged into one finding
-_MOST_SIMILAR = 5  # more findings that differ in another robot become one
+_MOST_SIMILAR = 5  # more similar findings for different robots become one finding
 
 
 def _kinds(group: tuple[Finding, ...], fleet: Fleet) -> _Kinds:

@@ -407,7 +407,7 @@ def _offered_by_others_findings(unused_statements: Iterable[_Statement]) -> Iter
             place = RelatedPlace(f"{owner.right.enclave} offers it", *_source_place(owner.source))
             text = (
                 f"{statement.right.describe()} is under the name of a node in {owner.right.enclave}"
-                f", which offers it, too ({place}), and nobody may {asking} it"
+                f"; that enclave also offers it ({place}), and nobody may {asking} it"
             )
             remedy = f'Write {asking}="ALLOW" for it.'
             yield statement.found(MISTAKEN_SIDE, text, remedy)._replace(related=(place,))
@@ -1114,7 +1114,7 @@ def _check_rules(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
 
 
 def _remedy_of_denial(written: str) -> str:
-    """Return the remedy for a DENY without effect of a name, as it is written."""
+    """Return the remedy for a DENY without effect; ``written`` is its name in the policy file."""
     if written.startswith(("/", "~")):
         return NO_EFFECT.remedy
     return (

@@ -1018,7 +1018,7 @@ def _show_reach(
         source = load_zenoh_rights(keystore or _keystore_of_environment())
     else:
         fleet = fleet_of(fleet_file, None)
-        named = keystore.root if keystore else policy  # which can be a policy, too
+        named = keystore.root if keystore else policy  # this can also be the path of a policy
         source = load_rights(named or keystore_from_environment(), fleet)
     with progress("following the rights"):
         followed = follow_reach(source, enclave, infrastructure=infrastructure, domain=domain)

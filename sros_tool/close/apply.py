@@ -161,7 +161,7 @@ class _RemainingProcesses:
         self._started_by_hand = [*chain.from_iterable(by_hand.values())]
 
     def commands_to_open(self) -> Iterator[str]:
-        """Yield how to restart open the processes that run in enclaves, except those of units."""
+        """Yield how to restart processes in enclaves without security, except those of units."""
         closed = [process for process in self._started_by_hand if process.enclave in self._secured]
         counts = Counter(process.enclave for process in closed)
         started_by: dict[str, dict[str, None]] = {}

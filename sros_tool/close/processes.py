@@ -145,7 +145,7 @@ class ClosedProcess(NamedTuple):
             )
         ]
         if in_enclave:
-            pids = [self.pid] if self.pid in pids else pids[:1]  # each of them runs in the enclave
+            pids = [self.pid] if self.pid in pids else pids[:1]  # all of them run in the enclave
         elif self.pid not in pids and len(pids) > 1:
             pids = [pid for pid in pids if process_origin(pid).folder == self.folder] or pids
         unseen = {process.pid for process in running.unseen}

@@ -124,7 +124,7 @@ def _proof_of_files(robot: LocalRobot) -> Proof:
             changes = [change["path"] for change in value["changes"]]
         except UnavailableError as error:
             holds, reason = None, f"they cannot be compared with the keystore: {error}"
-        except SrosError as error:  # such as an older revocation list
+        except SrosError as error:  # for example, an older revocation list
             holds, reason = False, f"the keystore does not export them: {error}"
         else:
             if changes:

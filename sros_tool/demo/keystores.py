@@ -168,7 +168,7 @@ class KeystoreSet:
             if isinstance(error := self._missing(party), UncastError):
                 return str(error)
         if self.user is not None and (enclave := self.user.permitted_enclave(row)):
-            return f"the keystore has no other enclave than {enclave}, which is permitted to do it"
+            return f"only {enclave} could play the attacker, but this enclave has the right"
         return ""
 
     def problem(self, row: Row) -> str:

@@ -1149,7 +1149,7 @@ def _served_names(answer: Answer) -> tuple[str, ...]:
 
 
 def _renaming_advice(nodes: Sequence[str], wrong: str, enclave: str) -> str:
-    """Return the remedy for a node with the name ``wrong`` in ``enclave``, for other ``nodes``.
+    """Return the remedy for a node named ``wrong`` in ``enclave``, which is for other ``nodes``.
 
     A rule without the name of a node renames all nodes of a process.
     """

@@ -288,7 +288,7 @@ def _export_notes(answer: Answer) -> Iterator[Note]:
 def _earlier_permissions_notes(answer: Answer, now: datetime) -> Iterator[Note]:
     """Yield a note if earlier permissions of the enclave may allow what is denied."""
     if (keystore := answer.enclave.keystore) and not answer.allowed:
-        from sros_tool.explain.earlier import note_on_earlier_permissions  # only a denial needs it
+        from sros_tool.explain.earlier import note_on_earlier_permissions  # only for denials
 
         yield from note_on_earlier_permissions(keystore, {answer.enclave.name}, now)
 

@@ -329,7 +329,7 @@ def follow_reach(
         refuse = remedy_in_keystore(source.path, f"Run {REFUSE_STRANGERS}.")
         text = (
             "processes without an identity may use some names, too, because the governance admits "
-            f"them: whom they influence is not followed. {refuse}"
+            f"them: their influence is not followed. {refuse}"
         )
         notes.append(Note("explain.anybody", text))
     if of_keystore and (holders := _fitting_holders(source, enclave)):

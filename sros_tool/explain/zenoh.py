@@ -912,7 +912,7 @@ class ZenohOfKeystore:
 
     def outcomes(self, question: Question) -> tuple[ZenohAnswer, ...]:
         """Return an answer for each enclave; the answers do not list who is at the other end."""
-        # Imported here, because a question about one enclave needs neither.
+        # Imported here, because a question about one enclave does not need them.
         from sros_tool.explain.who import decide_each, first_allowing_domain
 
         def answer(name: str) -> ZenohAnswer:

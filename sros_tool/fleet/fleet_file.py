@@ -42,7 +42,7 @@ from sros_tool.wording import shortened
 from sros_tool.xml import read_bytes
 
 MAX_BYTES = 4 * 1024 * 1024
-_MOST_GROUPS = 32  # of one robot
+_MOST_GROUPS = 32  # groups of one robot
 _MOST_CROSSING = 1_000
 _VALUES: Mapping[str, Callable[[str], str]] = {
     "namespace": namespace_problem,

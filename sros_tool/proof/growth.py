@@ -1262,7 +1262,7 @@ def undenied_name(denied: Right, stated: Rules) -> str | None:
     if stated.cover(denied):
         return None
     allowed = stated.overlapping(denied._replace(qualifier=ALLOW))
-    if denied.kind == "dds":  # it has no ROS name to search for
+    if denied.kind == "dds":  # such a right has no ROS name to search for
         return None if allowed else denied.name
     names = [right.name for right in (*allowed, *stated.overlapping(denied))]
     return common_name([denied.name], names)
@@ -1398,7 +1398,7 @@ def _assumptions(base: AccessSource, head: AccessSource) -> Iterator[str]:
         elif base.governance is None:
             yield (
                 "BASE is signed with a governance that controls all access, and with encryption "
-                "unless it demands another protection"
+                "unless BASE demands another protection"
             )
         elif head.governance is None:
             yield (

@@ -125,7 +125,7 @@ No policy is larger.
 _PACKED = (b"\x1f\x8b", b"PK\x03\x04", b"\xfd7zXZ", b"BZh", b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf")
 """How files of gzip, ZIP, xz, bzip2, Zstandard and 7z begin."""
 _MOST_NAMESPACES = 20
-_LONGEST = 200  # characters of the target of a link that are shown
+_LONGEST = 200  # characters that are shown of a link's target
 _NOT_USED = (
     "changes and is not reviewed: no reviewed policy uses it. Name it with --policy, leave it out "
     "with"

@@ -34,7 +34,7 @@ from sros_tool.wording import counted
 _NOWHERE = Source("", 0)
 _OF_EVERY_NODE = frozenset({"/rosout", "/parameter_events"})
 _SENDING = ("publish", "call", "request")
-"""The rights to send something first, in the order of the proposals."""
+"""The rights with which an enclave sends without being asked, in the order of the proposals."""
 _PEOPLE = "/operator/*"
 """The enclaves of people, such as those that sros ships: `ros2 topic echo` needs wildcards."""
 _FEW = 3

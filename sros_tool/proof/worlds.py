@@ -224,7 +224,7 @@ class Side:
         for automaton, enclaves in self._wild.items():
             if automaton.may_meet(own_automaton):
                 met.update(enclaves)
-        limit.spend(len(met))  # they are cached
+        limit.spend(len(met))  # the result is cached
         return frozenset(met)
 
     def users_of(self, topic: str) -> list[str]:
@@ -464,7 +464,10 @@ class World:
         return self.crossing.router_of.get(enclave, "") if self.crossing else ""
 
     def written_by(self, enclave: str, excluded_names: NameSet) -> Written:
-        """Return topics that an enclave may write, without ``excluded_names`` (always the same)."""
+        """Return topics that an enclave may write, without ``excluded_names``.
+
+        All calls must have the same ``excluded_names``, because results are cached.
+        """
         if enclave not in self._written:
             names = self.side(True).of.get(enclave, NameSet()) - excluded_names
             around = names.around()

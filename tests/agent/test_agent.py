@@ -308,7 +308,7 @@ def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None
     (problem,) = (problem for problem in done.problems if "/r1/b keeps its files" in problem)
     bring = "`sros distribute_key KEYSTORE --robot r1 DIR --force`"
     assert "is not on this robot. A release has no keys" in problem and bring in problem
-    changed = "1 file that release 1 has was changed or missing here, and replaced: enclaves/r1/a/p"
+    changed = "1 file of release 1 was changed or missing here, and replaced: enclaves/r1/a/p"
     assert sum(changed in problem for problem in done.problems) == 1
     shutil.copytree(r1.folder / "enclaves/r1/a", r1.folder / "enclaves/r1/b")
     (problem,) = (each for each in r1.round().problems if "/r1/b keeps its files" in each)

@@ -376,7 +376,7 @@ def test_who_may_what_counts_processes_without_an_identity(tmp_path: Path) -> No
             assert ("without an identity" in asked.err) is bool(parts), asked
             assert parts in asked.err
     reach = sros("explain", keystore, "--reach", "/a").ok()
-    assert "whom they influence is not followed" in reach.err and refuse in reach.err
+    assert "their influence is not followed" in reach.err and refuse in reach.err
     table = sros("view", keystore, "--format", "markdown").ok().out
     assert "| topic `/x` | everybody, even without an identity, `/a` |" in table
 

@@ -511,7 +511,7 @@ def zenoh_variables(
     variables = zenoh_environment(places, *files)
     override = variables[OVERRIDE]
     if not (folder / KEY_FILE).exists():
-        override, _, _ = override.partition(";")  # only the CA, which comes first
+        override, _, _ = override.partition(";")  # keep only the CA, which is first
     if ignores_rules:
         override = f"{override};{_WITHOUT_RULES}"
     return {**variables, DOMAIN: str(domain), OVERRIDE: override}
