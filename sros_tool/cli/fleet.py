@@ -919,7 +919,10 @@ def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     root = compared_fleet.status.keystore
     time_left = end - compared_fleet.at
     when = f"{end:%Y-%m-%d}" if time_left > timedelta(days=1) else iso(end)
-    label = "first expiry on a robot" if time_left > timedelta(0) else "expired on a robot since"
+    label, others = "first expiry on a robot", f", within 30 days on {counted(len(soon), 'robot')}"
+    if time_left <= timedelta(0):
+        label, more = "expired on a robot since", counted(len(soon) - 1, "more robot")
+        others = f"; expired, or expires within 30 days, on {more}" if soon[1:] else ""
     short_lived = [name for robot in soon for name in robot.short_lived]
     named = short_lived[:_MOST_GROUPS]  # enclave names need no quotes
     named += ["..."] * (len(short_lived) > _MOST_GROUPS)
@@ -933,10 +936,7 @@ def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     bring = f"{command}{_bringing(root, soon)}"
     if not command and all(robot.has_release for robot in soon):
         bring = "new files are published; the column `to do` says what to do"
-    yield (
-        f"{label}: {when} ({first}, {_KINDS.get(kind, kind)}), within 30 "
-        f"days on {counted(len(soon), 'robot')}: {bring}"
-    )
+    yield f"{label}: {when} ({first}, {_KINDS.get(kind, kind)}){others}: {bring}"
 
 
 _KINDS = {"crl": "revocation list"}
