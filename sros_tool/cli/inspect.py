@@ -155,6 +155,7 @@ def _enclave_of(keystore: OpenedKeystore, name: str) -> Path:
 
 def _show_history(keystore: OpenedKeystore, policy: Path | None, as_json: bool) -> int:
     from sros_tool.keystore.describe import history
+    from sros_tool.keystore.ledger import RESTORED
 
     changes = history(keystore, now=now())
     if policy:
@@ -173,7 +174,8 @@ def _show_history(keystore: OpenedKeystore, policy: Path | None, as_json: bool) 
             named = f" (SHA-256 {entry.sha256[:8]})" if entry.what == "ca" else ""
             subject = f"{entry.enclave or entry.subject}{named}"
             source = f"policy {entry.policy[:12]}" if entry.policy else ""
-            words = (subject, until, entry.serial, source, entry.reason)
+            from_backup = "from a backup; entries may be missing" * (entry.what == RESTORED)
+            words = (subject, until, entry.serial, source, entry.reason, from_backup)
             line = "  ".join(word for word in words if word)
             shown = f"{entry.time}  {entry.what:11}  {item.status:10}  {line}"
             echo(shown.rstrip())

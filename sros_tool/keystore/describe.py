@@ -1012,6 +1012,8 @@ class HistoryStatus(StrEnum):
     EXPIRED = "expired"
     DAMAGED = "damaged"
     """Lines of the ledger were missing or changed when this entry was made."""
+    INCOMPLETE = "incomplete"
+    """The keystore came from a backup: what it issued after the backup may be missing."""
     SENT = "sent"
     """Sent to a robot; the keystore keeps no copy."""
     SEALED = "sealed"
@@ -1058,8 +1060,10 @@ def history(keystore: OpenedKeystore, *, now: datetime) -> History:
     settings = _files(keystore, iter((SETTINGS, FLEET)))
 
     def status(entry: Entry) -> HistoryStatus:
-        if entry.what in (GAP, RESTORED):
+        if entry.what == GAP:
             return HistoryStatus.DAMAGED
+        if entry.what == RESTORED:
+            return HistoryStatus.INCOMPLETE
         if entry.what == SEALED:
             return HistoryStatus.SEALED
         if entry.what in ("answer", "release"):

@@ -593,6 +593,8 @@ def test_a_keystore_that_was_restored(publisher: Home) -> None:
     archives.rename(publisher.pub / "targets/robots")
     done = publisher.publish(restored=True)
     assert [note.id for note in done.notes] == ["fleet.revocations-restored"]
+    shown = sros("inspect", publisher.root, "--history").out
+    assert "  restored     incomplete  from a backup; entries may" in shown
     assert "/r5/base" in done.notes[0].text and not (publisher.root / "enclaves/r5/base").exists()
     release = robot.gets()
     assert release.number > latest
