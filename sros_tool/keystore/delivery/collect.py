@@ -759,7 +759,7 @@ class _Renewals:
         if same_key and not is_there and validity_of(present).contains(self._now):
             # Even if it is due again, the robot first has to fetch the certificate that was signed
             # before.
-            return "answered", "its new certificate comes with the next release"
+            return "answered", "the robot has not fetched its new certificate yet"
         # Robots ask in the last third of the validity; half of it is accepted, because clocks may
         # be wrong.
         due = min(

@@ -339,7 +339,8 @@ def refresh_crl(
     change.crl = crl
     with change:
         lists = change.revocation_lists()
-        change.restart = change.names
+        if keystore.revocation_lists or crl:  # a first list without revocations changes nothing
+            change.restart = change.names
         next_update, change.entries = lists.sign((), change.names, incomplete=True)
         change.remarks += lists.remarks
         change.record()
