@@ -90,23 +90,27 @@ class Repository:
 
     # ── references ─────────────────────────────────────────────────────────────────────────
 
-    def exact_commit(self, name: str) -> str:
+    def exact_commit(self, name: str, option: str = "") -> str:
         """Return the full id of the commit with this full id or full reference (refs/…).
 
         Shorter names are refused: git looks them up in several places, and whoever may push a tag
-        can create one that git finds first.
+        can create one that git finds first.  ``option`` is the option of sros that has the name.
 
         Raises:
             UsageError: the name has another form.
             DocumentError: the repository has no such commit.
         """
         if not _HASH.match(name) and not name.startswith("refs/"):
-            candidates = self._references(name)
-            suggestion = f" There is {_candidates_text(candidates)}." if candidates else ""
+            why = "Whoever can create a tag or branch of that name could choose another commit."
+            full = "write the full id of the commit, or a name such as refs/remotes/origin/main."
+            try:
+                found = " ".join(filter(None, (option, self.commit(name))))
+                remedy = f"If git finds the right commit now, write `{found}`; otherwise {full}"
+            except DocumentError as error:
+                why = f"{why} {error.what[:1].upper()}{error.what[1:]}. {error.why}".rstrip()
+                remedy = f"Do not shorten the name: {full}"
             raise UsageError(
-                f"'{name}' is neither the full id of a commit nor a full reference",
-                f"A tag or branch of that name could stand for another commit.{suggestion}",
-                "Write the 40 digits of the commit, or a name such as refs/remotes/origin/main.",
+                f"'{name}' is neither the full id of a commit nor a full reference", why, remedy
             )
         digits = name if _HASH.match(name) else self._target(name)
         if not digits:
@@ -254,11 +258,11 @@ class Repository:
             name = self.merged_into(merge)
         if remote and not name.startswith("refs/") and len(name) in (40, 64):
             self.fetch_missing(name, remote)
-        return self.exact_commit(name)
+        return self.exact_commit(name, "--base")
 
     def head_commit(self, name: str) -> str:
         """Return the full id of the commit to review: ``HEAD``, a full id or a full reference."""
-        return self.commit(name) if name == "HEAD" else self.exact_commit(name)
+        return self.commit(name) if name == "HEAD" else self.exact_commit(name, "--head")
 
     def merged_into(self, merge: str) -> str:
         """Return the id of a merge commit's first parent, on the branch that was merged into.

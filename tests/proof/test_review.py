@@ -1196,8 +1196,15 @@ def test_an_ambiguous_name_is_refused(named: Change, reference: str, name: str, 
     assert after.status == 2, after
     assert f"the name '{name}' is ambiguous" in after.err
     assert said in after.err
-    with pytest.raises(UsageError, match="neither the full id"):
+    with pytest.raises(
+        UsageError, match=r"neither the full id.*could choose another.*is ambiguous"
+    ):
         Repository(named.folder).exact_commit(name)
+    found = named.git("rev-parse", "HEAD").strip()
+    with pytest.raises(
+        UsageError, match=rf"neither .* If git finds .* now, write `--base {found}`"
+    ):
+        Repository(named.folder).base_commit("HEAD", None)
 
 
 def test_a_tag_that_only_looks_like_a_branch_of_the_remote_is_refused(named: Change) -> None:
