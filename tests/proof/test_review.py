@@ -1092,7 +1092,7 @@ def test_private_keys_in_a_commit_are_named(change: Change, made_keystores: Path
     ended = change.review(*words, "--new-access", "allow")
     assert ended.status == 1
     for key in keys:
-        assert f"  '{key}' has a private key, which whoever can read" in ended.out, ended
+        assert f"  '{key}' has a private key, which everybody who can read" in ended.out, ended
     assert "cannot start" not in ended.out, ended
     change.base = change.commit({})
     change.commit({"README": "x"})
