@@ -22,7 +22,7 @@ ENCLAVES, PUBLIC, PRIVATE = "enclaves", "public", "private"
 CLOSED_PROCESSES, CLOSED_POLICY = "processes.json", "policy.xml"
 """Files that `sros close` writes next to its keystore."""
 CLOSED_OBSERVER = "/sros_observer"
-"""The enclave with which `sros close` looks at a closed robot; no policy of the robot has it."""
+"""The enclave with which `sros close` observes a closed robot; no policy of the robot has it."""
 SETTINGS = "sros.toml"
 """The settings of the keystore; keystores of ros2/sros2 do not have this file."""
 FLEET = "fleet.toml"
@@ -30,33 +30,33 @@ FLEET = "fleet.toml"
 CONFIRMED = "confirmed"
 """The folder with the last confirmation of each robot of the fleet."""
 REFUSED = f"{CONFIRMED}/.refused.json"
-"""Why the last messages of robots were refused."""
+"""The file with the reasons why the last messages of robots were refused."""
 FLEET_ROOT = "fleet_root.json"
-"""All versions of the root metadata of what is published for the fleet (TUF)."""
+"""The file with all versions of the root metadata (TUF) that were published for the fleet."""
 PUBLISHED = "published.json"
-"""What was published last for each robot of the fleet, and the versions of the metadata."""
+"""The file with what was last published for each robot of the fleet, and the metadata versions."""
 LEDGER = "ledger.jsonl"
 """The log of issued certificates and documents; keystores of ros2/sros2 do not have it.
 
 For a long ledger, it is a link to the last part, whose name matches `SEALED_LEDGER`.
 """
 SEALED_LEDGER = re.compile(r"ledger\.[0-9]{4,9}\.jsonl")
-"""Names of the parts of a long ledger, which are sealed except for the last one."""
+"""Matches the names of the parts of a long ledger; all parts but the last are sealed."""
 LEDGER_HEAD = "ledger.p7s"
-"""The number of lines of the ledger and the digest of the last one, signed by a CA."""
+"""The file with the ledger's number of lines and the digest of the last one, signed by a CA."""
 LEDGER_INDEX = ".sros-index"
-"""The index of a long ledger; sros makes it again if it is missing or does not match."""
+"""The index of a long ledger, which sros makes again if it is missing or does not fit."""
 
 IDENTITY, PERMISSIONS = "identity", "permissions"
 ROLES = (IDENTITY, PERMISSIONS)
 
 CRL = f"{PUBLIC}/identity_ca.crl.pem"
-"""The revocation list of the identity CA; the file exists after the first revocation."""
+"""The revocation list of the identity CA, which exists after the first revocation."""
 REVOKED = "revoked"
 """The folder for the files of revoked enclaves."""
 
 ROTATION = "rotation.json"
-"""The file that names the replaced CAs; it exists only during a rotation."""
+"""The file that names the replaced CAs, which exists only during a rotation."""
 RETIRED = "retired"
 """The folder for certificates and keys of replaced CAs."""
 STAGE = ".sros-transaction"
@@ -64,7 +64,7 @@ STAGE = ".sros-transaction"
 AGENT = ".agent"
 """The folder of `sros agent` in the security folder of a robot."""
 LOCK = ".sros-lock"
-"""The file that a writing process locks; it exists only while that process writes."""
+"""The file that a writing process locks, which exists only while this process writes."""
 
 GOVERNANCE_XML = f"{ENCLAVES}/governance.xml"
 GOVERNANCE_P7S = f"{ENCLAVES}/governance.p7s"
@@ -80,9 +80,9 @@ REQUIRED_FILES = (
     GOVERNANCE_FILE,
     PERMISSIONS_FILE,
 )
-"""The files that rcl and the RMWs read from an enclave; without one of them no node starts."""
+"""The files that rcl and the RMWs read from an enclave; if one is missing, no node starts."""
 KEY_URI_FILE = "key.p11"
-"""The file in place of ``key.pem`` with the PKCS#11 URI of a key on a token (REP 2015).
+"""The file with the PKCS#11 URI of a key on a token (REP 2015), in place of ``key.pem``.
 
 Source: rmw_dds_common of ROS 2 Jazzy and later (security.cpp); only rmw_fastrtps uses it.
 """
@@ -91,26 +91,29 @@ KEY_FILES = (KEY_FILE, KEY_URI_FILE)
 CRL_FILE = "crl.pem"
 OPTIONAL_FILES = (CRL_FILE,)
 LIST_FILES = (CRL_FILE, IDENTITY_CA_FILE)
-"""The files with revocation lists: in a rotation, that of the second CA is in the file of the CAs.
-"""
+"""The files with revocation lists; in a rotation, the CA file has the list of the second CA."""
 
 SESSION_FILE, ROUTER_FILE = "session.json5", "router.json5"
-"""The Zenoh configurations for the processes of an enclave, and for the router's enclave."""
+"""The Zenoh configurations: for an enclave's processes, and for the router of a router's enclave.
+"""
 ZENOH_SIGNED = {SESSION_FILE: "session.p7s", ROUTER_FILE: "router.p7s"}
-"""Zenoh configurations and their copies signed by the permissions CA, which only sros verifies."""
+"""Maps a Zenoh configuration to its copy signed by the permissions CA, which only sros verifies."""
 ZENOH_FILES = (*ZENOH_SIGNED, *ZENOH_SIGNED.values())
 
 REQUEST = "request.pem"
-"""The signing request of an enclave whose key was made on its robot and stays there."""
+"""The signing request of an enclave whose key was made on its robot, where the key stays."""
 SEAL = "answer.p7s"
-"""The list of all files of an answer with their digests, signed by the permissions CA.
+"""The file with the digests of all files of an answer, signed by the permissions CA.
 
-Without this list, anyone who transports an answer could exchange the governance or a CA in it.  On
-the robot the list stays next to the files: its number tells which answer they came from.
+Without it, anyone who transports an answer could exchange the governance or a CA in it.  On the
+robot, it stays next to the files, and its number shows which answer they came from.
 """
 
 RELEASE_SEAL = "release.p7s"
-"""The name of a robot and the list of all files of its release, signed by the permissions CA."""
+"""The file with a robot's name and the digests of its release's files.
+
+The permissions CA signs it.
+"""
 
 
 def confirmation_file(robot: str) -> str:
@@ -119,7 +122,7 @@ def confirmation_file(robot: str) -> str:
 
 
 def ledger_part(number: int) -> str:
-    """Return the name of a part of a long ledger; the first one has the number 1."""
+    """Return the name of a part of a long ledger; the first part has the number 1."""
     return f"ledger.{number:04}.jsonl"
 
 
@@ -133,7 +136,7 @@ SHARED_FILES = {
     IDENTITY_CA_FILE: ca_certificate(IDENTITY),
     PERMISSIONS_CA_FILE: ca_certificate(PERMISSIONS),
 }
-"""Maps files of an enclave that are normally links to the files of the keystore."""
+"""Maps files of an enclave to the files of the keystore to which they are normally links."""
 
 
 def ca_key(role: str) -> str:
@@ -142,7 +145,7 @@ def ca_key(role: str) -> str:
 
 
 def permissions_ca_for(document: Path) -> Path | None:
-    """Return the path of the permissions CA certificate next to a signed document, or None."""
+    """Return the permissions CA certificate next to a signed document, or None."""
     folder = document.absolute().parent
     places = (folder / PERMISSIONS_CA_FILE, folder.parent / PUBLIC / PERMISSIONS_CA_FILE)
     return next((path for path in places if path.exists()), None)
@@ -164,7 +167,7 @@ def enclave_path(root: Path, name: str) -> Path:
 
 
 def is_own_copy(root: Path, name: str, file: str) -> bool:
-    """Return whether an enclave has its own copy of a file, and no link to the keystore's file."""
+    """Return whether an enclave has its own copy of a file instead of a link to the keystore's."""
     copy, common = enclave_path(root, name) / file, root / SHARED_FILES.get(file, "")
     return file in SHARED_FILES and (
         copy.is_file() and common.is_file() and not copy.samefile(common)
@@ -177,17 +180,20 @@ def fleet_key(role: str) -> str:
 
 
 def key_path(root: Path, place: str) -> Path:
-    """Return the path of a CA key's file; ``place`` is ``file:PATH``, or a path in ``root``."""
+    """Return the path of a CA key's file; ``place`` is ``file:PATH``, or a path below ``root``."""
     return root / place.removeprefix("file:").removeprefix("//")
 
 
 def folder_mode(path: str) -> int:
-    """Return the permission bits of a folder of a keystore: 0700 if it may have keys, else 0755."""
+    """Return the permission bits of a keystore's folder: 0700 if it may contain keys, else 0755."""
     return 0o755 if path in ("", PUBLIC) else 0o700
 
 
 _EARLIER_CA = ("ca.cert.pem", "ca.key.pem")
-"""The CA at the top of a flat keystore, of ros2/sros2 0.6 to 0.8 (ROS 2 Crystal to Eloquent)."""
+"""The CA in the top folder of a flat keystore (ros2/sros2 0.6 to 0.8).
+
+These versions belong to ROS 2 Crystal to Eloquent.
+"""
 
 _TOP_FILES = frozenset((SETTINGS, FLEET, FLEET_ROOT, PUBLISHED, LEDGER, LEDGER_HEAD, ROTATION))
 _OF_IDENTITY = (CERTIFICATE_FILE, KEY_FILE)
@@ -209,10 +215,10 @@ def is_layout_path(path: str) -> bool:
 
 
 def is_keystore(root: Path) -> bool:
-    """Return whether ``root`` is a keystore, with its CAs or exported without them.
+    """Return whether ``root`` is a keystore, either with its CAs or an export without them.
 
     Raises:
-        KeystoreError: this user may not look into the folders of ``root``.
+        KeystoreError: this user must not read the folders of ``root``.
     """
     folder = root / ENCLAVES
     try:
@@ -235,14 +241,14 @@ def is_original_keystore(root: Path) -> bool:
         return any((root / PRIVATE).iterdir())
     except (FileNotFoundError, NotADirectoryError):
         return False
-    except OSError:  # another user's
+    except OSError:  # a folder of another user
         return True
 
 
 def remedy_in_keystore(root: Path, remedy: str) -> str:
-    """Return a remedy with commands for KEYSTORE, adapted to the keystore or export ``root``.
+    """Return a remedy with its commands for KEYSTORE adapted to ``root``, a keystore or an export.
 
-    An export has no CA keys: its remedy says to run the commands in the original keystore.
+    An export has no CA keys, so its remedy says to run the commands in the original keystore.
     """
     if is_original_keystore(root):
         return re.sub(r"\bKEYSTORE\b", lambda _: quote(str(root)), remedy)
@@ -250,16 +256,16 @@ def remedy_in_keystore(root: Path, remedy: str) -> str:
 
 
 def folder_of_closed_robot(root: Path) -> Path | None:
-    """Return the folder of `sros close` that has this keystore or export, or None."""
+    """Return the folder of `sros close` to which this keystore or export belongs, or None."""
     folder = root.parent
     made = all((folder / file).is_file() for file in (CLOSED_PROCESSES, CLOSED_POLICY))
     return folder if made else None
 
 
 def how_to_add_domains(root: Path, domains: str) -> str:
-    """Return advice, as a clause, on how to add a domain to a keystore, or to an export's keystore.
+    """Return advice on how to add a domain to a keystore or an export's keystore, as a clause.
 
-    ``domains`` ("0,5") are all its domains afterwards.
+    ``domains`` are all domains that the keystore should then have, such as "0,5".
     """
     robot = folder_of_closed_robot(root)
     candidates = (root, robot / "keystore") if robot else (root,)
@@ -302,7 +308,7 @@ class UnreadPath(NamedTuple):
 
     @classmethod
     def of(cls, error: OSError) -> UnreadPath:
-        """Return the path that the operating system refused to read, with its reason."""
+        """Return the path that the operating system did not let sros read, with the reason."""
         return cls(os.fsdecode(error.filename), error.strerror or str(error))
 
     def remedy(self, root: Path) -> str:
@@ -320,9 +326,9 @@ def search_enclaves(
 ) -> tuple[tuple[str, ...], tuple[UnreadPath, ...]]:
     """Return the sorted names of the enclaves, and the folders that could not be searched.
 
-    An enclave is a folder that has a certificate or a key.  A link to a folder elsewhere is not
-    followed.  With ``hidden``, folders whose names begin with a dot are searched, too; sros never
-    writes enclaves there, but DDS loads them.
+    An enclave is a folder with a certificate or a key.  Links to folders are not followed.  With
+    ``hidden``, folders whose names begin with a dot are searched, too: sros never writes enclaves
+    there, but DDS loads them.
     """
     top = os.fspath(root / ENCLAVES)
     return _search(top, top, hidden=hidden)
@@ -342,7 +348,7 @@ _Walked: TypeAlias = tuple[str, list[str]]
 
 
 def _names_in(top: str, folders: Iterable[_Walked]) -> tuple[str, ...]:
-    """Return the sorted names of the enclaves among folders in the folder of enclaves ``top``."""
+    """Return the sorted names of the enclaves among folders below ``top``, the folder of enclaves."""
     return tuple(
         sorted(
             folder[len(top) :].replace(os.sep, "/") or "/"
@@ -355,7 +361,7 @@ def _names_in(top: str, folders: Iterable[_Walked]) -> tuple[str, ...]:
 def _walk(top: str, unread: list[UnreadPath], *, hidden: bool = False) -> Iterator[_Walked]:
     """Yield each folder below ``top``, with its files; add unreadable folders to ``unread``.
 
-    With ``hidden``, folders whose names begin with a dot are among them.
+    With ``hidden``, folders whose names begin with a dot are included.
     """
     pending = [top]
     while pending:
@@ -371,7 +377,8 @@ def _walk(top: str, unread: list[UnreadPath], *, hidden: bool = False) -> Iterat
         for entry in entries:
             name = entry.name
             if entry.is_symlink():
-                # No enclave has a name of a file: where it leads is a fault of its folder alone.
+                # A link named like a file is not an enclave: what is wrong with it concerns the
+                # folder around it.
                 of_file = name.endswith(_FILE_TYPES)
                 if (of_file and name not in _OF_IDENTITY) or not _is_folder(entry):
                     files.append(name)
@@ -395,7 +402,7 @@ def _is_inside(path: str, top: str) -> bool:
 
 
 def enclave_names(root: Path, *, hidden: bool = False) -> tuple[str, ...]:
-    """Return the sorted names of the enclaves: every folder that has a certificate or a key.
+    """Return the sorted names of the enclaves, which are the folders with a certificate or a key.
 
     ``hidden`` is as in `search_enclaves`.
 
@@ -411,7 +418,7 @@ def enclave_names(root: Path, *, hidden: bool = False) -> tuple[str, ...]:
 
 
 def enclaves_below(root: Path, name: str) -> tuple[str, ...]:
-    """Return the sorted names of the enclaves in subfolders of the enclave ``name``, without it.
+    """Return the sorted names of the enclaves below the enclave ``name``.
 
     Raises:
         KeystoreError: an enclave may be missing, because a folder cannot be read.
@@ -438,9 +445,9 @@ def has_zenoh_files(root: Path, *, hidden: bool = False) -> bool:
 
 
 def readable_enclaves(root: Path) -> tuple[str, ...]:
-    """Return the sorted names of the enclaves, after checking that all their files can be read.
+    """Return the sorted names of the enclaves after checking that all their files can be read.
 
-    Verbs that write use this.
+    Verbs that write call this function first.
 
     Raises:
         KeystoreError: this user cannot read some file of an enclave, so that the enclave would keep
@@ -457,7 +464,7 @@ def check_readable(root: Path, names: Sequence[str]) -> None:
     """Raise `KeystoreError` if this user cannot read every file of the enclaves ``names``."""
     unread: list[UnreadPath] = []
     walks = (_walk(os.fspath(enclave_path(root, name)), unread) for name in names)
-    # The first folder of a walk is that of the enclave itself.
+    # A walk begins with the folder of the enclave itself.
     folders = chain.from_iterable(islice(walk, 1) for walk in walks)
     for _ in _noting_unreadable(folders, unread):
         pass
@@ -465,7 +472,7 @@ def check_readable(root: Path, names: Sequence[str]) -> None:
 
 
 def _noting_unreadable(folders: Iterable[_Walked], unread: list[UnreadPath]) -> Iterator[_Walked]:
-    """Yield ``folders``, and add their files that cannot be read to ``unread``."""
+    """Yield ``folders``, and add the files in them that cannot be read to ``unread``."""
     for folder, files in folders:
         for name in files:
             path = f"{folder}/{name}"
@@ -502,7 +509,7 @@ def revoked_certificates(root: Path, known: Container[str] = ()) -> tuple[Path, 
 
 
 def _unread_path(path: str) -> Iterator[UnreadPath]:
-    """Yield the path if the system refuses to read it; a broken link counts as missing."""
+    """Yield the path if the system does not let sros read it; a broken link counts as missing."""
     try:
         os.close(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC))
     except OSError as error:
@@ -522,11 +529,11 @@ def _unreadable_folder_error(
 
 
 def hidden_enclaves(root: Path, among: Iterable[str] | None = None) -> tuple[str, ...]:
-    """Return the sorted names of enclaves in hidden folders, which `enclave_names` leaves out.
+    """Return the sorted names of the enclaves in hidden folders, which `enclave_names` leaves out.
 
-    ``among`` are the names from a search with ``hidden``; None searches for them.  Left out are
-    enclaves in the folder of an interrupted transaction, and the folder with an enclave's own files
-    that Kubernetes makes next to the link ``..data`` where it mounts a Secret.
+    ``among`` are the names from a search with ``hidden``; if None, the search is done here.  Two
+    kinds of folders are left out: those of an interrupted transaction, and those that Kubernetes
+    makes next to the link ``..data`` where it mounts a Secret with an enclave's own files.
     """
     names = search_enclaves(root, hidden=True)[0] if among is None else among
     folders = {name: enclave_path(root, name) for name in names if "/." in name}
@@ -540,7 +547,7 @@ def hidden_enclaves(root: Path, among: Iterable[str] | None = None) -> tuple[str
 
 
 def _is_kubernetes_secret(folder: Path) -> bool:
-    """Return whether ``folder`` is of a Kubernetes secret: the enclave links to all its files."""
+    """Return whether Kubernetes made ``folder`` for a Secret: the enclave links to its files."""
     link = folder.parent / "..data"
     try:
         return link.is_symlink() and all(
@@ -563,7 +570,7 @@ def list_enclaves(root: Path) -> tuple[str, ...]:
 def refuse_earlier(root: Path) -> None:
     """Raise `KeystoreError` if ``root`` is a flat keystore of ROS 2 Eloquent or earlier.
 
-    A keystore in today's layout is not refused, even if it also has files of the flat layout.
+    A keystore in the present layout is not refused, even if it also has files of the flat layout.
     """
     if not root.is_dir() or is_keystore(root):
         return
@@ -601,7 +608,7 @@ def check_keystore(root: Path) -> None:
 
 
 def _wrong_path_remedy(root: Path) -> str:
-    """Return the remedy if ``root``, which is no keystore, was named as a keystore."""
+    """Return the remedy if ``root``, which is not a keystore, was given as a keystore."""
     if around := keystore_around(root):
         return f"It is a folder in the keystore '{around}': name that keystore."
     if similar := similar_keystores(root):
@@ -611,15 +618,15 @@ def _wrong_path_remedy(root: Path) -> str:
 
 
 def keystore_around(folder: Path) -> Path | None:
-    """Return the keystore that contains ``folder``, which need not exist; None if none does."""
+    """Return the keystore that contains ``folder``, which may be missing; None if none does."""
     with suppress(KeystoreError):
         return next(filter(is_keystore, Path(os.path.realpath(folder)).parents), None)
     return None
 
 
 def similar_keystores(root: Path) -> list[Path]:
-    """Return the keystores next to ``root`` whose names are similar, without regard to digits."""
-    from difflib import get_close_matches  # for this alone, which is asked last
+    """Return the keystores next to ``root`` with similar names; digits do not count as similar."""
+    from difflib import get_close_matches  # only needed for this error
 
     def without_digits(name: str) -> str:
         return "".join(letter for letter in name if not letter.isdigit())

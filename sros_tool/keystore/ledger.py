@@ -3,22 +3,23 @@
 The file has one JSON object per line; lines are only added.  Entries are part of the transaction
 that issues, so the ledger has exactly the certificates and documents that were installed.
 
-The lines are a chain: ``previous`` is the SHA-256 of the line before, without its line end; on the
-first line with ``previous``, it is the SHA-256 of all lines before, joined by line ends (earlier
-versions of sros wrote no chain).  The signed document ``ledger.p7s`` states the number of lines and
-the SHA-256 of the last line.  So a line that was changed, removed, added or cut off is noticed.  A
-fault that was noticed when a line was added stays visible as an entry ``gap`` before that line.
+The lines are a chain: ``previous`` is the SHA-256 of the line before, without its line end.  On the
+first line that has ``previous``, it is the SHA-256 of all lines before, joined by line ends,
+because earlier versions of sros wrote no chain.  The signed document ``ledger.p7s`` states the
+number of lines and the SHA-256 of the last line.  So a changed, removed, added or truncated line is
+noticed.  If a fault is noticed when a line is added, an entry ``gap`` before the new line records
+the fault.
 
 The head of a long ledger also states the root of its index (`sros_tool.keystore.ledger_index`).  A
-question that the index answers reads only the lines that it names, each verified by its digest, and
-the end of the ledger; other lines that were changed are noticed by whoever reads all of them.
+question that the index can answer reads only the lines to which the index leads, each verified by
+its digest, and the end of the ledger.  Changes in other lines are noticed when all lines are read.
 
-A change that makes the file longer than 16 MiB seals it: it is never written again, as part
-``ledger.0001.jsonl``, and ``ledger.jsonl`` becomes a link to the next part.  Each part begins with
-an entry ``sealed``, which has the number and the SHA-256 of the part before.  Only a reader of all
-lines opens sealed parts, and accepts a part only as it was sealed; all other readers get these
-lines from the index.  Versions of sros that know no parts refuse to follow the link when they
-change a keystore.
+A change that makes the file longer than 16 MiB seals the file: it becomes the part
+``ledger.0001.jsonl``, which is never written again, and ``ledger.jsonl`` becomes a link to the next
+part.  Each part begins with an entry ``sealed`` with the number and the SHA-256 of the part before.
+Sealed parts are only opened to read all lines, and only accepted as they were sealed; other
+questions get these lines from the index.  Versions of sros that do not know parts refuse to follow
+the link when they change a keystore.
 """
 
 from __future__ import annotations
@@ -67,21 +68,25 @@ GAP = "gap"
 SEALED = "sealed"
 RESTORED = "restored"
 REPORTED = "reported"
-"""The ``reason`` of a certificate that only the message of a robot showed: it can be revoked, and
-proves nothing."""
+"""The ``reason`` of a certificate that is known only from a robot's message.
+
+Such a certificate can be revoked, but proves nothing.
+"""
 SAME_KEY = "same key"
-"""The ``reason`` of a CA certificate that has the same key as the CA's previous certificate."""
+"""The ``reason`` of a CA certificate with the same key as the CA's previous certificate."""
 FROM_BEFORE = "from before the ledger"
-"""The ``reason`` of a CA that a rotation replaces, and that the ledger lacked, such as a lost one.
+"""The ``reason`` of a CA that a rotation replaces, but that the ledger lacked.
+
+An example is a ledger from which earlier lines were lost.
 """
 RECORDED_LATE = (SAME_KEY, FROM_BEFORE)
-"""Each ``reason`` of a CA certificate whose key may have issued what earlier lines record."""
+"""The ``reason`` values of a CA certificate whose key may have issued what earlier lines record."""
 
 
 class Entry(NamedTuple):
-    """A line of the ledger: a certificate or document that was issued, or a revocation.
+    """A line of the ledger: an issued certificate or document, or a revocation.
 
-    Times are ISO 8601 in UTC; what does not apply is an empty string.
+    Times are ISO 8601 in UTC.  Fields that do not apply are empty strings.
     """
 
     time: str
@@ -89,39 +94,43 @@ class Entry(NamedTuple):
     what: str
     """What was issued or done: ``ca``, ``certificate``, ``permissions``, ``governance``, ``crl``,
     ``revocation``, ``answer`` (the signed list of the files sent to a robot), ``settings`` (of the
-    keystore), ``fleet``, ``release`` (the list of the robots' releases that were published at the
-    same time), ``sealed`` (the part of the ledger before this line), ``restored`` (the keystore
-    came from a backup, so that entries are missing), or ``gap``: lines before were missing or
-    changed."""
+    keystore), ``fleet``, ``release`` (the list of the robots' releases that were published
+    together), ``sealed`` (the part of the ledger before this line), ``restored`` (the keystore came
+    from a backup, so that entries are missing), or ``gap`` (lines before this one were missing or
+    changed).
+    """
     enclave: str = ""
-    """Name of the enclave; empty if the entry is for no enclave. All later keys are empty, too, if
-    they do not apply."""
+    """Name of the enclave; empty if the entry is not about an enclave.  All later keys are also
+    empty if they do not apply.
+    """
     subject: str = ""
     """Subject of the certificate."""
     serial: str = ""
     """Serial number, in hexadecimal."""
     sha256: str = ""
-    """SHA-256 of the certificate (DER), of the document, or of the sealed part."""
+    """SHA-256 of the certificate (DER), the document, or the sealed part."""
     not_before: str = ""
     """Start of the validity, in UTC."""
     not_after: str = ""
-    """Expiry, in UTC; of a revocation, the expiry of the revoked certificate."""
+    """Expiry, in UTC; for a revocation, the expiry of the revoked certificate."""
     policy: str = ""
-    """SHA-256 of the policy that permissions were made from, with its includes."""
+    """SHA-256 of the policy with its includes from which the permissions were made."""
     reason: str = ""
-    """Reason of a revocation, fault that a gap records, or how a certificate became known if the
-    keystore did not issue it with this line."""
+    """Reason of a revocation; fault that a gap records; or how a certificate became known, if the
+    keystore did not issue it with this line.
+    """
     key: str = ""
     """SHA-256 of the public key (DER) of the certificate, or of the revoked certificate."""
     number: int = 0
-    """Number of an answer or of releases (later ones have higher numbers), last line of a gap,
-    number of the sealed part, or a number above all that the keystore gave before it was
-    restored; else 0."""
+    """Number of an answer or of releases (later ones have higher numbers); last line of a gap;
+    number of the sealed part; or a number above all that the keystore gave before it was restored.
+    Otherwise 0.
+    """
     settings: str = ""
     """The settings of the keystore, as TOML."""
     nodes: str = ""
-    """Nodes (namespaces and names) that the policy of the permissions names, but the permissions
-    lack.
+    """Nodes (namespaces and names) that are in the policy of the permissions, but not in the
+    permissions.
     """
     previous: str = ""
     """SHA-256 of the line before."""
@@ -130,11 +139,10 @@ class Entry(NamedTuple):
 class Ledger(NamedTuple):
     """The readable entries of a ledger, oldest first, and its faults.
 
-    ``gaps`` are clauses about lines that are missing, changed or unreadable; faults from before the
-    current CAs are left out, because nothing that other CAs signed is valid.  ``certain`` are the
-    entries after the last gap: nothing is missing among them.  ``unchained`` is the number of lines
-    from before the chain, some of which may have been removed.  ``lines`` is the number of all
-    lines.
+    ``gaps`` are clauses about missing, changed or unreadable lines.  Faults from before the present
+    CAs are left out, because nothing that earlier CAs signed is valid.  ``certain`` are the entries
+    after the last gap, among which none is missing.  ``unchained`` is the number of lines before
+    the chain, from which lines may have been removed.  ``lines`` is the number of all lines.
     """
 
     entries: tuple[Entry, ...] = ()
@@ -144,18 +152,18 @@ class Ledger(NamedTuple):
     lines: int = 0
 
     def next_number(self) -> int:
-        """Return the number for a new answer, higher than the numbers of all earlier answers."""
+        """Return the number for a new answer, higher than those of all earlier answers."""
         return max([self.lines, *(entry.number for entry in self.entries)]) + 1
 
 
 class _Fault(NamedTuple):
-    """A fault in the lines up to ``line``; ``text`` describes it as a clause."""
+    """A fault in the lines up to the line number ``line``; ``text`` is a clause about it."""
 
     line: int
     text: str
 
 
-# Of one part, and of all parts for whoever reads all lines.
+# These are the limits of one part, and for reading all lines, of all parts together.
 _MOST_BYTES = 4 * 1024**3
 _MOST_LINES = 8_000_000
 _LONGEST_LINE = 4 * 1024**2
@@ -168,18 +176,16 @@ _MOST_BITS = 159
 _MOST_NUMBER = 10**12
 _MOST_KEPT = 16 * 1024 * 1024
 _SEALED_FROM = 16 * 1024 * 1024
-"""Size in bytes from which a part is sealed: each change copies the last part."""
+"""Size in bytes from which a part is sealed, because each change copies the last part."""
 _LINE_BYTES = 450
-"""Length of most lines."""
+"""Usual length of a line, in bytes."""
 _HEAD = re.compile(
     rb"sros ledger [12]\nlines ([0-9]{1,12})\nsha256 ([0-9a-f]{64})\n(?:index ([0-9a-f]{64})\n)?"
 )
 _INDEXED_FROM = 2000
-"""Number of lines from which a ledger has an index; a shorter ledger is read faster than it is
-looked up.
-"""
+"""Number of lines from which a ledger has an index; a shorter ledger is quickly read as a whole."""
 _LINES_PER_LOOKUP = 5
-"""Number of lines that take as long to read as one look-up in the index."""
+"""Number of lines that take as long to read as one look-up in the index takes."""
 _VALUES = {
     "serial": r'"(?P<serial>[0-7][0-9a-f]{39}|[0-9a-f]{1,39})"',
     "number": r"([1-9][0-9]{0,11})",
@@ -195,7 +201,7 @@ _WRITTEN = re.compile(
     )
     + r"\}"
 )
-"""Pattern of a line as `_line` writes it, without escaped characters; a group for each field."""
+"""Matches a line as `_line` writes it, without escaped characters; each field is a group."""
 _quoted = json.encoder.encode_basestring_ascii
 
 
@@ -203,13 +209,13 @@ _quoted = json.encoder.encode_basestring_ascii
 
 
 _CLOCK_TOLERANCE = timedelta(hours=1)
-"""How far behind the clock may be without counting as wrong."""
+"""How far behind the clock may be before it counts as wrong."""
 
 
 def behind_clause(now: datetime, last: datetime | None, event: str) -> str:
-    """Return, as a clause, how far the clock is behind the moment ``last`` of ``event``; "" if not.
+    """Return how far the clock is behind the time ``last`` of ``event``, as a clause, or "".
 
-    A small difference is ignored.
+    Small differences are ignored.
     """
     if last is None or last - now <= _CLOCK_TOLERANCE:
         return ""
@@ -222,8 +228,8 @@ def behind_clause(now: datetime, last: datetime | None, event: str) -> str:
 def certificate_entry(
     now: datetime, label: str, certificate: x509.Certificate, enclave: str = "", reason: str = ""
 ) -> Entry:
-    """Return the entry of an issued certificate; ``label`` is "ca" or "certificate"."""
-    from sros_tool.pki.certificates import key_digest  # only writing needs it
+    """Return the entry for an issued certificate; ``label`` is "ca" or "certificate"."""
+    from sros_tool.pki.certificates import key_digest  # only writing needs this import
 
     validity = validity_of(certificate)
     return Entry(
@@ -252,7 +258,7 @@ def document_entry(
     nodes: str = "",
     number: int = 0,
 ) -> Entry:
-    """Return the entry of the signed document ``message``; ``label`` is its kind, as in `Entry`."""
+    """Return the entry for a signed document; ``label`` is the kind of document, as in `Entry`."""
     return Entry(
         time=iso(now),
         what=label,
@@ -271,11 +277,11 @@ def document_entry(
 
 
 class _Reading(NamedTuple):
-    """The ledger, and the values that are needed to add lines.
+    """The ledger as read, and what is needed to add lines.
 
     ``unrecorded`` are the faults that no entry ``gap`` records yet.  ``previous`` is the digest for
-    the next line; ``ended`` says whether the last line has its line end.  ``sound`` says that
-    every line is chained, and none has a fault.
+    the next line.  ``ended`` says whether the last line has a line end.  ``sound`` says that every
+    line belongs to the chain, and none has a fault.
     """
 
     ledger: Ledger
@@ -287,17 +293,17 @@ class _Reading(NamedTuple):
 
 _EVERY = b""
 _NONE = b"\n"
-"""Values of ``needed_text``: ``_EVERY`` is in every line, ``_NONE`` in no line."""
+"""Values of ``needed_text``: every line contains ``_EVERY``, no line contains ``_NONE``."""
 _GAP, _CA = b'"what":"gap"', b'"what":"ca"'
 
 
 class _Files(NamedTuple):
-    """The ledger and its head at the same moment.
+    """The ledger and its head, as they were at the same moment.
 
-    ``state`` is None without a ledger; ``lines`` is the content of the file, None if it is too long
-    to keep in memory, or follows sealed parts.  ``ledger_index`` is None without an index that
-    fits.  ``part`` is the number of the last part, which is the file; ``later`` is the name of a
-    later part, "" without one.  ``last_lines`` are the last lines of the file, which are not
+    ``state`` is None if there is no ledger.  ``lines`` is the content of the file; None if the file
+    is too long to keep in memory, or follows sealed parts.  ``ledger_index`` is None if no index
+    fits.  ``part`` is the number of the last part, which is the file.  ``later`` is the name of a
+    later part; "" if there is none.  ``last_lines`` are the last lines of the file, which are not
     verified.
     """
 
@@ -313,9 +319,9 @@ class _Files(NamedTuple):
 class LedgerFile:
     """The ledger file of a keystore and its signed head, which are read once.
 
-    ``authorities`` returns the certificates of the CAs that the keystore trusts.  Only a ledger of
-    more than 16 MiB is read again for each question.  ``follow_link`` is False for the process that
-    has locked the keystore.  ``read`` reads the head the first time.
+    ``authorities`` returns the certificates of the CAs that the keystore trusts.  A ledger of more
+    than 16 MiB is read again for each question.  ``follow_link`` is False in the process that has
+    locked the keystore.  ``read`` is the function that reads the head the first time.
     """
 
     def __init__(
@@ -337,7 +343,7 @@ class LedgerFile:
         self._may_restore = not follow_link
 
     def ledger(self) -> Ledger:
-        """Return the ledger; empty for a keystore that has none (of ros2/sros2).
+        """Return the ledger; an empty one for a keystore without a ledger (of ros2/sros2).
 
         Raises:
             KeystoreError: the file cannot be read at all.
@@ -345,9 +351,9 @@ class LedgerFile:
         return self._reading(_EVERY).ledger
 
     def with_field(self, name: str, value: str) -> Ledger:
-        """Return the ledger with at least the entries whose field ``name`` has ``value``.
+        """Return the ledger with at least the entries whose field ``name`` has the value ``value``.
 
-        The chain of all lines is verified as always, but other entries may be left out, to save
+        The chain of all lines is verified as always, but other entries may be left out to save
         time.
 
         Raises:
@@ -358,9 +364,9 @@ class LedgerFile:
         return self._reading(f'"{name}":{_quoted(value)}'.encode(), [(name, value)]).ledger
 
     def with_values(self, name: str, values: Collection[str]) -> Ledger:
-        """Return the ledger, at least the entries whose field ``name`` has one of ``values``.
+        """Return the ledger with at least the entries whose field ``name`` has one of ``values``.
 
-        Without an index, or for very many values, a complete ledger is returned whole.
+        Without an index, or for very many values, the whole ledger is returned.
 
         Raises:
             KeystoreError: the file cannot be read at all.
@@ -380,10 +386,10 @@ class LedgerFile:
         return self.ledger().next_number()
 
     def recorded_enclaves(self) -> Sequence[str] | None:
-        """Return the sorted enclaves whose last certificate was not revoked; None without an index.
+        """Return the sorted enclaves whose last certificate is not revoked; None without an index.
 
-        Some may be missing in the keystore, and enclaves that were put there by hand are not among
-        them.
+        Some of them may be missing in the keystore, and enclaves that somebody copied into it are
+        not included.
         """
         if self._recorded is None:
             names = self.recorded_with()
@@ -391,7 +397,7 @@ class LedgerFile:
         return self._recorded
 
     def recorded_with(self, *parts: str) -> Collection[str] | None:
-        """Return `recorded_enclaves`, unsorted; only those with one of ``parts`` in their names."""
+        """Return `recorded_enclaves`, unsorted, only those with one of ``parts`` in their names."""
         index = self._opened().ledger_index
         try:
             return index.names(parts) if index else None
@@ -400,12 +406,12 @@ class LedgerFile:
 
     @property
     def is_indexed(self) -> bool:
-        """Whether an index finds entries, so that few of them take little time."""
+        """Whether there is an index, so that it takes little time to find few entries."""
         return self._opened().ledger_index is not None
 
     @property
     def is_complete(self) -> bool:
-        """Whether all sealed parts are there, so that all lines can be read."""
+        """Whether no sealed part is missing, so that all lines can be read."""
         return all((self.root / ledger_part(n)).exists() for n in range(1, self._opened().part))
 
     def _opened(self) -> _Files:
@@ -418,10 +424,10 @@ class LedgerFile:
         return self._readings.get(_EVERY) or self._reading(_NONE, ())
 
     def index_with(self, new: int, reading: _Reading) -> IndexUpdate | None:
-        """Return the update of the index for ``new`` more lines; None without an index.
+        """Return the update of the index for ``new`` additional lines; None if there is no index.
 
-        ``reading`` is from `reading_for_append`.  A ledger with a fault gets no index: only a
-        reader of all lines knows what is certain.
+        ``reading`` comes from `reading_for_append`.  A ledger with a fault gets no index, because
+        only reading all lines shows which entries are certain.
         """
         if reading.ledger.lines + new < _INDEXED_FROM or not reading.sound:
             return None
@@ -437,7 +443,7 @@ class LedgerFile:
         """Return the number and the size, in bytes, of the part to which lines are added.
 
         Raises:
-            KeystoreError: there is a later part.
+            KeystoreError: there is a later part, so an earlier ledger was put back.
         """
         files = self._opened()
         if files.later:
@@ -445,21 +451,22 @@ class LedgerFile:
         return files.part, files.state.st_size if files.state else 0
 
     def clock_behind(self, now: datetime) -> str:
-        """Return, as a clause, how far the clock is behind the last entries; "" if it is not."""
+        """Return how far the clock is behind the last entries, as a clause; "" if it is not."""
         return behind_clause(now, self.last_time(), "the last entry of the ledger")
 
     def clock_notes(self, now: datetime) -> Iterator[Note]:
-        """Yield a note if the clock is behind the ledger, so that nothing seems to have expired."""
-        with suppress(SrosError):  # a ledger that cannot be read, which `sros check` reports
+        """Yield a note if the clock is behind the ledger, so that expired files may seem valid."""
+        with suppress(SrosError):  # `sros check` reports a ledger that cannot be read
             if behind := self.clock_behind(now):
                 text = f"{behind}: what has expired may count as valid. Set the clock."
                 yield Note("keystore.clock", text)
 
     def last_time(self) -> datetime | None:
-        """Return the time of the last entries, in UTC; None without an entry.
+        """Return the time of the last entries, in UTC; None if there is no entry.
 
-        The latest entry since the last revocation list counts, so that a later entry with the wrong
-        time hides nothing, and a new list corrects a clock that was ahead.
+        This is the latest time since the last revocation list.  So a later entry with a wrong time
+        does not hide a clock that is behind, and a new list corrects a time from when the clock was
+        ahead.
         """
         times = []
         for line in reversed(self._opened().last_lines):
@@ -481,7 +488,8 @@ class LedgerFile:
     def _reading(self, needed_text: bytes, terms: _Terms | None = None) -> _Reading:
         """Return the ledger; chained lines without ``needed_text`` are verified, not parsed.
 
-        ``terms`` are the field values by which the index finds these lines; None if it cannot.
+        ``terms`` are the field values by which the index finds these lines; None if the index
+        cannot find them.
         """
         if needed_text not in self._readings:
             self._readings[needed_text] = self._reading_with(needed_text, terms)
@@ -501,7 +509,7 @@ class LedgerFile:
                 self._files = files
                 return self._compared_with_head(files, lines)
             reading = self._compared_with_head(files, self._lines(files, needed_text))
-            # A transaction of another process may have ended between the reading of the two files.
+            # Another process may have committed a transaction between reading the two files.
             kept = known is not None and known.lines is not None
             if kept or not reading.unrecorded or self._is_unchanged(files):
                 self._files = files
@@ -509,7 +517,7 @@ class LedgerFile:
             self._files = None
 
     def _restore_index(self) -> bool:
-        """Remove a damaged index once, under the lock of the keystore, to make it again."""
+        """Remove a damaged index once; the process that locks the keystore makes it again."""
         may_restore, self._may_restore, self._files = self._may_restore, False, None
         if may_restore:
             from sros_tool.folders import Folder
@@ -546,10 +554,10 @@ class LedgerFile:
             return _Files(head, state, lines, None, part, later, last)
 
     def _index(self, file: BinaryIO, head: _Head) -> LedgerIndex | None:
-        """Return the index that the head states; None without one for a ledger with this end.
+        """Return the index that the head states; None if no index fits the end of this ledger.
 
-        Under the lock of the keystore, an index that is missing, or of another version of sros, is
-        made again.
+        A process that has locked the keystore makes a missing index, or one of another version of
+        sros, again.
         """
         is_long = head.lines >= _INDEXED_FROM
         if not head.index_root and (self._follow_link or not is_long):
@@ -569,10 +577,10 @@ class LedgerFile:
         return index if ends_so else None
 
     def _indexed_lines(self, files: _Files, terms: _Terms | None) -> _Lines | None:
-        """Return the lines that the index finds; None if it is not there or finds none of them.
+        """Return the lines that the index finds; None if it is missing or cannot find ``terms``.
 
         Raises:
-            IndexDamagedError: the index, or a line that it leads to, was changed.
+            IndexDamagedError: the index, or a line to which it leads, was changed.
         """
         if files.ledger_index is None or files.head is None or terms is None:
             return None
@@ -592,7 +600,7 @@ class LedgerFile:
         return _Lines(entries, numbers, (), head.lines, 0, True, head.last, head.last, ended=True)
 
     def _read_head(self, read_content: Callable[[Path, str], bytes]) -> _Head | None:
-        """Return the head of the ledger; None without one."""
+        """Return the head of the ledger; None if there is none."""
         path = self.root / LEDGER_HEAD
         if not path.exists():
             return None
@@ -608,7 +616,7 @@ class LedgerFile:
         return _Head(int(stated[1]), stated[2].decode(), index_root=(stated[3] or b"").decode())
 
     def _is_unchanged(self, files: _Files) -> bool:
-        """Return whether ledger and head on disk did not change since they were read."""
+        """Return whether the ledger and the head on disk are unchanged since they were read."""
         state = None
         with suppress(OSError):
             state = (self.root / LEDGER).stat()
@@ -637,7 +645,7 @@ class LedgerFile:
     def _every_line(
         self, last_part: BinaryIO, after_part: Callable[[str], None] = lambda _: None
     ) -> Iterator[bytes]:
-        """Yield the lines of all parts (the last is open), and call ``after_part`` after each.
+        """Yield the lines of all parts (the last is open); call ``after_part`` after each part.
 
         Raises:
             KeystoreError: a sealed part is missing, or is not as it was sealed.
@@ -673,9 +681,9 @@ class LedgerFile:
         )
 
     def _new_index(self, last_part: BinaryIO, head: _Head | None) -> tuple[IndexUpdate, bool]:
-        """Return the index of all lines, and whether they are the chain that ``head`` signs.
+        """Return an index of all lines, and whether the lines are the chain that ``head`` signs.
 
-        ``last_part`` is the last part, from the same reading as ``head``: between two readings,
+        ``last_part`` must be from the same reading as ``head``, because between two readings,
         another process that can write to the keystore could exchange a part.
 
         Raises:
@@ -727,14 +735,14 @@ class LedgerFile:
     def _open(self, name: str = LEDGER) -> BinaryIO | None:
         """Return the ledger file, or its part ``name``, open for reading; None if there is none.
 
-        While a transaction is being committed, the file is a link.  The process that has locked the
-        keystore does not follow it: the link could lead to a file outside the keystore.
+        While a transaction is committed, the file is a link.  The process that has locked the
+        keystore does not follow the link, because it could lead out of the keystore.
         """
         path = self.root / name
         try:
             if self._follow_link:
                 return _checked_file(open_at_once(path))
-            from sros_tool.folders import Folder  # a question does not load what writes
+            from sros_tool.folders import Folder  # reading alone does not import modules that write
 
             with Folder(self.root) as folder:
                 target = folder.link_target(name) or ""
@@ -754,9 +762,9 @@ class LedgerFile:
             ) from error
 
     def _without_lines(self, *, file_exists: bool) -> _Reading:
-        """Return the reading of a ledger file that is missing or has no line.
+        """Return the reading of a ledger file that is missing or has no lines.
 
-        It is a fault unless the keystore never had a ledger, as a keystore of ros2/sros2.
+        This is a fault, except in a keystore that never had a ledger (of ros2/sros2).
         """
         had_ledger = any((self.root / file).exists() for file in (SETTINGS, LEDGER_HEAD))
         if not file_exists and not had_ledger:
@@ -767,14 +775,13 @@ class LedgerFile:
     def _later_than(self, part: int, last: os.stat_result | None = None) -> str:
         """Return the name of a part of the ledger after the part ``last``; "" if there is none.
 
-        ``part`` is the number of the last part, which may have another name, or be a copy of its
-        file.
+        ``part`` is the number of the last part.  Its file can also have another name, or be a copy.
         """
         if not self.root.exists():
             return ""
         for name in sorted(filter(SEALED_LEDGER.fullmatch, os.listdir(self.root)), reverse=True):
             number = int(name.split(".")[1])
-            with suppress(OSError):  # a link of a transaction that is not committed yet
+            with suppress(OSError):  # a link of a transaction that is not yet committed
                 state = (self.root / name).stat()
                 is_last = last and os.path.samestat(state, last)
                 is_longer = number == part and last and state.st_size > last.st_size
@@ -804,7 +811,7 @@ def _lines_in(file: BinaryIO) -> Iterator[bytes]:
 
 
 def _sealed_before(file: BinaryIO) -> Entry | None:
-    """Return the entry of the sealed part before ``file``, which is its first line, or None."""
+    """Return the first entry in ``file`` if it records the sealed part before, or None."""
     line = file.readline(_LONGEST_LINE)
     file.seek(0)
     entry = _parse(line.removesuffix(b"\n")) if b'"what":"sealed"' in line else None
@@ -829,11 +836,11 @@ def _entry_at(posting: Posting, index: LedgerIndex, last_part: BinaryIO) -> Entr
 
 
 _Terms: TypeAlias = Collection[tuple[str, str]]
-"""Fields of entries, each with a value."""
+"""Names of an entry's fields, each with a value."""
 
 
 def _last_line(file: BinaryIO, size: int) -> str:
-    """Return the digest of the last line of a ledger of ``size`` bytes; "" for another size."""
+    """Return the digest of the last line of a ledger of ``size`` bytes; "" if the size differs."""
     if os.fstat(file.fileno()).st_size != size:
         return ""
     file.seek(max(0, size - _LONGEST_LINE))
@@ -845,8 +852,8 @@ class _Lines(NamedTuple):
     """The entries in a ledger with the ``numbers`` of their lines, and the faults of the chain.
 
     ``unchained`` is the number of lines before the chain, ``lines`` the number of all lines.
-    ``signed`` is the digest of the line that the head states as the last; the rest is as in
-    `_Reading`.
+    ``signed`` is the digest of the line that is the last one by the head.  The other fields are as
+    in `_Reading`.
     """
 
     entries: tuple[Entry, ...]
@@ -863,18 +870,19 @@ class _Lines(NamedTuple):
 def _read_lines(
     lines: Iterable[bytes], needed_text: bytes, stated: int, maximum: int, most_bytes: int
 ) -> _Lines | None:
-    """Return the lines of a ledger; None if they exceed ``maximum`` lines or ``most_bytes`` bytes.
+    """Return the lines of a ledger; None if they are more than ``maximum``, or ``most_bytes`` long.
 
     ``stated`` is the number of lines that the head states; ``needed_text`` is as in `LedgerFile`.
     """
     entries: list[Entry] = []
     numbers = array("Q")
     faults: list[_Fault] = []
-    damaged = 0  # how many lines before this one are no entries
+    damaged = 0  # number of lines directly before this one that are not entries
     unchained = number = size = 0
     chained = False
     before = line = b""
-    last = signed = ""  # the digests of the line before, and of the line number ``stated``
+    # The digests of the previous line, and of the line with the number ``stated``.
+    last = signed = ""
     all_before = hashlib.sha256()
     for number, line in enumerate(lines, 1):
         size += len(line)
@@ -891,7 +899,7 @@ def _read_lines(
             and _GAP not in text
             and _CA not in text
         ):
-            pass  # it is as it was when the head was signed, or a later line does not fit
+            pass  # either unchanged since the head was signed, or a later line does not fit
         elif (entry := _parse(text)) is None:
             damaged += 1
         else:
@@ -939,7 +947,7 @@ def _not_entries_fault(last: int, count: int) -> _Fault:
 
 
 def _checked_file(file: BinaryIO) -> BinaryIO:
-    """Return ``file``; close it and raise OSError if it is too large or no regular file."""
+    """Return ``file``; close it and raise OSError if it is too large or not a regular file."""
     state, error = os.fstat(file.fileno()), None
     if not stat.S_ISREG(state.st_mode):
         error = OSError(errno.EINVAL, "it is not a regular file")
@@ -965,7 +973,7 @@ def _too_large_error(path: Path) -> KeystoreError:
 
 
 def _parse(line: bytes) -> Entry | None:
-    """Return the ledger entry in a line; None if the line is not an entry."""
+    """Return the ledger entry in a line; None if there is none."""
     match = _WRITTEN.fullmatch(line.decode()) if line.isascii() else None
     if not match or (match["serial"] and not match["serial"].strip("0")):
         return _parse_any(line)
@@ -973,7 +981,7 @@ def _parse(line: bytes) -> Entry | None:
         ""
     )[:11]
     number, settings, nodes, previous = match.groups("")[11:]
-    # Texts that many lines have are in the memory once.
+    # Texts that many lines have in common are kept in memory once.
     return Entry(
         intern(time),
         intern(kind),
@@ -994,7 +1002,7 @@ def _parse(line: bytes) -> Entry | None:
 
 
 def _parse_any(line: bytes) -> Entry | None:
-    """Return the entry in a line that is not written as `_line` does; None as in `_parse`."""
+    """Return the entry in a line that `_line` did not write in this form; None if there is none."""
     if not line.startswith(b"{"):
         return None
     try:
@@ -1021,7 +1029,8 @@ def _first_ca_line(
 ) -> int:
     """Return the number of the first ledger line about any of these CAs.
 
-    It is 0 if one of the CAs has no line, or was recorded only after it had issued something.
+    The result is 0 if one of the CAs has no line, or was recorded only after it had issued
+    something.
     """
     wanted = {digest(authority) for authority in authorities}
     lines: dict[str, int] = {}
@@ -1034,7 +1043,7 @@ def _first_ca_line(
 class _Head(NamedTuple):
     """The signed head of a ledger: number of lines, digest of the last line, or a fault.
 
-    ``index_root`` is the root of the index, "" for a ledger without one.
+    ``index_root`` is the root of the index; "" if the ledger has no index.
     """
 
     lines: int = 0
@@ -1044,9 +1053,9 @@ class _Head(NamedTuple):
 
 
 def _head_fault(head: _Head | None, lines: int, signed: str, *, is_chained: bool) -> _Fault | None:
-    """Return the fault between a ledger and its signed head; None if they agree.
+    """Return the fault if a ledger and its signed head disagree, or None.
 
-    ``signed`` is the digest of the ledger's line that the head states as the last.
+    ``signed`` is the digest of the ledger's line that is the last one by the head.
     """
     if not head:
         text = f"{LEDGER_HEAD}, which signs its end, is missing"
@@ -1082,11 +1091,11 @@ def append(
     now: datetime,
     file: LedgerFile,
 ) -> None:
-    """Stage the ledger with ``entries`` added at its end, and its signed head.
+    """Stage the ledger with ``entries`` added, and its signed head.
 
-    ``sign`` signs the head with a CA, as `Authority.sign` does.  ``file`` is the ledger as it was
-    read under the lock.  Faults that are not recorded yet are added first, so that the new head
-    does not hide them.
+    ``sign`` signs the head with a CA, like `Authority.sign`.  ``file`` is the ledger as read under
+    the lock.  Faults that are not recorded yet are added first, so that the new head does not hide
+    them.
     """
     present = file.reading_for_append()
     gaps = [Entry(iso(now), GAP, reason=e.text, number=e.line) for e in present.unrecorded]
@@ -1107,8 +1116,8 @@ def append(
 
     transaction.write_parts(ledger_part(number) if is_part else LEDGER, content())
     if SEALED_LEDGER.fullmatch(named) and named != ledger_part(number):
-        transaction.remove(named)  # somebody renamed the last part
-    for _ in links:  # of a dry run, which writes nothing
+        transaction.remove(named)  # somebody has renamed the last part
+    for _ in links:  # only in a dry run, which does not write the lines
         pass
     if index and seals:
         index.seal(ledger_part(number))
@@ -1121,7 +1130,7 @@ def append(
     head = f"lines {lines}\nsha256 {links.previous}\n"
     root = ""
     if index:
-        with suppress(SrosError):  # a damaged index is made again by the next change
+        with suppress(SrosError):  # the next change makes a damaged index again
             root = index.root()
             transaction.after_commit(index.save)
     head = f"sros ledger 2\n{head}index {root}\n" if root else f"sros ledger 1\n{head}"
@@ -1129,10 +1138,10 @@ def append(
 
 
 class _Links:
-    """Iterator over the lines of new entries; each line gets the digest of the line before.
+    """An iterator over the lines of new entries; each line gets the digest of the previous one.
 
     ``previous`` is the digest of the last line so far, ``count`` the number of lines so far.  The
-    lines are added to ``index``.
+    lines are also added to ``index``.
     """
 
     def __init__(
@@ -1144,7 +1153,7 @@ class _Links:
         self._index = index
 
     def add(self, entry: Entry) -> None:
-        """Add an entry at the end; the lines of all earlier entries must have been read."""
+        """Add an entry at the end, after the lines of all earlier entries were read."""
         self._entries = iter((entry,))
 
     def __iter__(self) -> Iterator[bytes]:
@@ -1158,7 +1167,7 @@ class _Links:
 
 
 def _line(entry: Entry, previous: str) -> bytes:
-    """Return an entry as a line of compact JSON; ``previous`` is the digest of the line before."""
+    """Return an entry as compact JSON; ``previous`` is the digest of the previous line."""
     filled = ((name, getattr(entry, name)) for name in Entry._fields[:-1])
     parts = [
         f'"{name}":{_quoted(value) if isinstance(value, str) else value}'

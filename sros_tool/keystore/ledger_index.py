@@ -1,18 +1,19 @@
 """The index of a long ledger: it finds the lines about an enclave, a key or a document.
 
-It is an SQLite file next to the ledger, so that a change of one enclave need not read what was
-recorded about all others.  It is only a cache, and input like any other file: the signed head of
-the ledger states its `root`, the digest of all that it says, and every part that is read is
-compared with it.  An index that is missing, damaged, forged, or of another state of the ledger is
-not used, and is made again from the ledger when the keystore is next changed.
+The index is an SQLite file next to the ledger.  With it, a change of one enclave need not read what
+was recorded about all others.  The index is only a cache, and trusted as little as any other file:
+the signed head of the ledger states its `root`, the digest of its whole content, and every part
+that is read is compared with the root.  An index that is missing, damaged, forged, or of another
+state of the ledger is not used, and is made again from the ledger when the keystore is next
+changed.
 
-A *term* is the value of a field of an entry, such as the name of an enclave.  A *posting* says
-that a line has a term, where the line is, and what its digest is.  Postings are kept in buckets by
-the first bits of their terms, each with the names of the enclaves whose postings are in it and
-whose last certificate was not revoked; the root is the digest of the digests of all buckets.
+A *term* is the value of a field of an entry, such as the name of an enclave.  A *posting* says that
+a line has a term, where the line is, and what its digest is.  Postings are kept in buckets, by the
+first bits of their terms.  A bucket also has the names of those enclaves with postings in it whose
+last certificate was not revoked.  The root is the digest of the digests of all buckets.
 
-The index also has the lines of the sealed parts of the ledger, so that only a reader of all lines
-needs the files of those parts; a line is compared with the digest in its posting.
+The index also has the lines of the sealed parts of the ledger, so that the files of these parts are
+only needed for reading all lines.  Each line is compared with the digest in its posting.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ _EMPTY = hashlib.sha256().digest() * 2
 """The digests of the names and of the postings of an empty bucket."""
 _FIELDS = ("enclave", "serial", "sha256", "key")
 _FREQUENT = ("certificate", "permissions")
-"""Kinds of entries that are half of a ledger each, so that no index helps to find them."""
+"""Kinds of entries that each make up half of a ledger, so that no index helps to find them."""
 _SCHEMA = (
     "CREATE TABLE buckets (bucket INTEGER PRIMARY KEY, names BLOB NOT NULL, "
     "postings BLOB NOT NULL)",
@@ -57,7 +58,7 @@ _SETTINGS = ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0")
 
 
 class Posting(NamedTuple):
-    """Where a line is in the ledger: its number, its first byte, its length without line end.
+    """The place of a line in the ledger: its number, first byte, and length without line end.
 
     ``digest`` is the SHA-256 of the line.
     """
@@ -71,9 +72,9 @@ class Posting(NamedTuple):
 class IndexState(NamedTuple):
     """The state of the ledger that an index describes.
 
-    ``lines`` and ``size`` are its lines and bytes, ``number`` is the highest number of an entry,
-    ``last`` is the SHA-256 of the last line, in hexadecimal.  ``sealed`` and ``sealed_size`` are
-    the lines and bytes of the sealed parts.
+    ``lines`` and ``size`` are the numbers of its lines and bytes.  ``number`` is the highest number
+    of an entry.  ``last`` is the SHA-256 of the last line, in hexadecimal.  ``sealed`` and
+    ``sealed_size`` are the numbers of lines and bytes in the sealed parts.
     """
 
     lines: int
@@ -134,7 +135,7 @@ def _split(names: bytes) -> list[str]:
 def _terms(entry: IndexedEntry) -> Iterator[bytes]:
     for name in _FIELDS:
         value = getattr(entry, name)
-        # Earlier versions recorded no keys: these certificates are found by the empty key.
+        # Earlier versions recorded no keys; their certificates are found by the empty key.
         if value or (name == "key" and entry.what == "certificate"):
             yield _term(name, value)
     if entry.what not in _FREQUENT:
@@ -142,7 +143,7 @@ def _terms(entry: IndexedEntry) -> Iterator[bytes]:
 
 
 class LedgerIndex:
-    """An index whose root hash is stated in the signed head of the ledger."""
+    """An index whose root the signed head of the ledger states."""
 
     def __init__(self, path: Path, state: IndexState, digests: bytes) -> None:
         self.state = state
@@ -153,9 +154,9 @@ class LedgerIndex:
 
     @classmethod
     def open(cls, root: Path, lines: int, last: str, stated: str) -> Self | None:
-        """Return the index of the keystore ``root``; None if it is not as the head states.
+        """Return the index of the keystore ``root``; None if the head states another one.
 
-        The head states the number of ``lines``, the digest of the ``last`` one and the root of the
+        The head states the number of ``lines``, the digest of the ``last`` line and the root of the
         index.
         """
         path = root / LEDGER_INDEX
@@ -174,11 +175,11 @@ class LedgerIndex:
 
     @property
     def digests(self) -> bytes:
-        """The SHA-256 of the names and of the postings of every bucket, one after the other."""
+        """The SHA-256 of the names and of the postings of every bucket, concatenated."""
         return self._digests
 
     def postings(self, name: str, value: str) -> Iterator[Posting]:
-        """Yield the postings of the lines whose field ``name`` has this value, oldest first.
+        """Yield the postings of the lines whose field ``name`` has the value, oldest first.
 
         Raises:
             IndexDamagedError: the bucket has changed since the head was signed.
@@ -193,7 +194,7 @@ class LedgerIndex:
             at = postings.find(term, at + 1)
 
     def line(self, number: int) -> bytes:
-        """Return a line of the sealed parts, for the caller to compare with its digest.
+        """Return a line of the sealed parts; the caller compares it with its digest.
 
         Raises:
             IndexDamagedError: the index does not have the line.
@@ -204,9 +205,9 @@ class LedgerIndex:
         return rows[0][0]
 
     def names(self, parts: Iterable[str] = ()) -> list[str]:
-        """Return the enclaves whose last certificate in the ledger was not revoked, unsorted.
+        """Return the enclaves whose last certificate in the ledger is not revoked, unsorted.
 
-        With ``parts``, only names with one of these texts in them are returned.
+        With ``parts``, only names that contain one of these texts are returned.
 
         Raises:
             IndexDamagedError: the names have changed since the head was signed.
@@ -240,14 +241,14 @@ class LedgerIndex:
             raise IndexDamagedError(f"'{self._path}' cannot be read") from error
 
     def _checked_bucket(self, data: Any, number: int) -> bytes:
-        """Return the content of the bucket ``number``, if its digest is as recorded."""
+        """Return the content of the bucket ``number``, after comparing it with its digest."""
         digest = self._digests[number * _DIGEST : (number + 1) * _DIGEST]
         if type(data) is not bytes or hashlib.sha256(data).digest() != digest:
             raise IndexDamagedError(f"'{self._path}' does not match the head of the ledger")
         return data
 
     def _read_only(self) -> sqlite3.Connection:
-        """Return the connection of this process: SQLite's does not survive a fork."""
+        """Return the connection of this process; SQLite's connections do not survive a fork."""
         if self._connection is None or self._process != os.getpid():
             _check_file(self._path)
             self._connection = _connect(self._path, "ro")
@@ -258,7 +259,7 @@ class LedgerIndex:
 class IndexUpdate:
     """The index of the ledger in a keystore's ``folder``, to which lines are added.
 
-    ``base`` is the current index; without one, all lines of the ledger have to be added.
+    ``base`` is the present index; if it is None, all lines of the ledger must be added.
     """
 
     def __init__(self, folder: Path, base: LedgerIndex | None) -> None:
@@ -273,7 +274,7 @@ class IndexUpdate:
         self._sealed: list[str] = []
 
     def add(self, entry: IndexedEntry, line: bytes) -> None:
-        """Add the next line of the ledger, without its line end."""
+        """Add the next line of the ledger; ``line`` has no line end."""
         lines, size, number, *_ = self.state
         digest = hashlib.sha256(line)
         for term in _terms(entry):
@@ -292,15 +293,15 @@ class IndexUpdate:
         )
 
     def seal(self, part: str) -> None:
-        """Note that all lines so far are in sealed parts of the ledger, the last in ``part``."""
+        """Note that all lines so far are in sealed parts of the ledger, the last one ``part``."""
         self.state = self.state._replace(sealed=self.state.lines, sealed_size=self.state.size)
         self._sealed.append(part)
 
     def root(self) -> str:
-        """Return the root of the index with all lines that were added, in hexadecimal.
+        """Return the root of the index with all added lines, in hexadecimal.
 
         Raises:
-            IndexDamagedError: the current index has changed since the head was signed.
+            IndexDamagedError: the present index has changed since the head was signed.
         """
         digests = bytearray(self._base.digests if self._base else _EMPTY * _BUCKETS)
         changed: dict[int, dict[str, bool]] = {bucket: {} for bucket in self._added}
@@ -318,10 +319,11 @@ class IndexUpdate:
         return self.state.root(self._digests)
 
     def save(self) -> None:
-        """Write the index to the keystore, after `root` and the commit of the ledger.
+        """Write the index to the keystore; call this after `root` and the commit of the ledger.
 
-        Nothing is written by root in a keystore of another user, who could lead it to another file;
-        then, and if the process stops here, the next change makes the index again.
+        If root runs this in a keystore of another user, nothing is written, because the user could
+        lead the write to another file.  In this case, or if the process stops here, the next change
+        makes the index again.
         """
         try:
             if not _is_own(self._folder):
@@ -340,7 +342,7 @@ class IndexUpdate:
                 folder.unlink(LEDGER_INDEX, missing_ok=True)
 
     def _make(self) -> None:
-        from sros_tool.folders import Folder  # a question does not load what writes
+        from sros_tool.folders import Folder  # reading alone does not import modules that write
 
         with Folder(self._folder) as folder:
             folder.unlink(_NEW, missing_ok=True)
@@ -371,15 +373,15 @@ class IndexUpdate:
 
 
 def _is_own(folder: Path) -> bool:
-    """Return whether ``folder`` belongs to this user, and nobody else can write to it."""
+    """Return whether ``folder`` belongs to this user, and no other user can write to it."""
     state = folder.stat()
     return state.st_uid == os.geteuid() and not state.st_mode & 0o022
 
 
 def _remove_journals(keystore_folder: Path, name: str) -> None:
-    """Remove the files that SQLite would read next to an index; this version writes none.
+    """Remove the files that SQLite would read next to an index, which this version never writes.
 
-    A journal names files that SQLite removes, and a link would lead it to another file.
+    A journal names files that SQLite removes, and a link would lead SQLite to another file.
     """
     from sros_tool.folders import Folder
 
@@ -399,8 +401,8 @@ def _check_file(path: Path) -> None:
 def _connect(path: Path, mode: str, *, is_new: bool = False) -> sqlite3.Connection:
     """Return a connection that only reads and writes the tables of `_SCHEMA`.
 
-    A file with other tables, views or triggers is refused, because queries could then run what is
-    in it.  A file that is only read is taken as it is, without locks and journals next to it.
+    A file with other tables, views or triggers is refused, because queries could run code in them.
+    If the file is only read, no lock and no journal next to it is used.
     """
     immutable = "&immutable=1" if mode == "ro" else ""
     place = f"file:{quote(os.path.abspath(path))}?mode={mode}{immutable}"  # noqa: PTH100
@@ -422,5 +424,5 @@ def _connect(path: Path, mode: str, *, is_new: bool = False) -> sqlite3.Connecti
 
 
 def merged_postings(postings: Iterable[Iterable[Posting]]) -> Sequence[Posting]:
-    """Return postings of several terms in the order of their lines, each line once."""
+    """Return postings of several terms in the order of their lines, without duplicates."""
     return sorted({posting.number: posting for of_term in postings for posting in of_term}.values())

@@ -1,10 +1,10 @@
-"""The frame of every change of a keystore, and the base class of the results.
+"""The steps that every change of a keystore shares, and the base class of the results.
 
 The order is the same for every verb: lock and recover, open the keystore once, note files that were
 edited by hand, determine the new state, prove, sign and stage it, update Zenoh configurations,
 write the ledger, check that vendors accept the enclaves, and put everything in place at once.  A
-verb determines the new state; this module does the rest.  As it updates Zenoh configurations in the
-same transaction, DDS and Zenoh enforce the same rights at any moment.
+verb determines the new state; this module does the rest.  Because Zenoh configurations are updated
+in the same transaction, DDS and Zenoh enforce the same rights at any moment.
 """
 
 from __future__ import annotations
@@ -98,25 +98,25 @@ class ChangeOptions(TypedDict, total=False):
     now: Required[datetime]
     """Time of the change."""
     keyring: Keyring
-    """Opens the keys of the CAs."""
+    """The keyring with which the keys of the CAs are opened."""
     allow_refusal: Sequence[Vendor]
     """Vendors whose nodes may stop working."""
     dry_run: bool
-    """Change nothing, but return the result that the change would have."""
+    """Change nothing; the result is the one that the change would have."""
 
 
 _NOTED = timedelta(days=1)
-"""How much earlier than requested a certificate of a CA service may expire without a note."""
+"""How much earlier than requested a CA service's certificate may expire without a note."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Changed:
-    """The result of a change of a keystore; of a dry run, the result that it would have.
+    """The result of a change of a keystore, or the result that a dry run would have.
 
-    ``outcomes`` maps enclaves to outcomes such as ``created`` or ``renewed``.  ``rights`` has the
+    ``outcomes`` maps enclaves to outcomes such as ``created`` or ``renewed``.  ``rights`` are the
     rights that enclaves gain and lose.  ``works_until`` is the latest expiry of replaced files, or
-    None if no replaced file works any more; ``may_work_longer`` says that files which the ledger
-    lacks may work longer, because the keystore was restored from a backup.  ``revoked`` is the
+    None if no replaced file works any more.  ``may_work_longer`` says that files may work longer
+    which the ledger lacks, because the keystore was restored from a backup.  ``revoked`` is the
     number of revoked certificates.  ``restart`` are the enclaves whose processes have to be
     restarted, ``zenoh`` are the Zenoh configurations.  ``remarks`` are notes on open tasks.
     """
@@ -135,16 +135,16 @@ class Changed:
     notes: tuple[Note, ...] = ()
 
     def names(self, outcome: str) -> tuple[str, ...]:
-        """Return the names of the enclaves with this outcome."""
+        """Return the names of the enclaves with an outcome."""
         return tuple(name for name, done in self.outcomes.items() if done == outcome)
 
 
 class KeystoreChange:
-    """A keystore that is being changed: a context manager, from the lock to the commit.
+    """A change of a keystore: a context manager, from the lock to the commit.
 
     Every part of the keystore is read once, when it is first needed.  A verb may set ``template``,
-    ``domains``, ``fleet`` and the CAs to their new state, with which everything is signed and
-    recorded.  Without `finish`, nothing changes.
+    ``domains``, ``fleet`` and the CAs to their new state; everything is then signed and recorded
+    with these.  Nothing changes before `finish`.
 
     ``entries`` are for the ledger.  ``notes``, ``remarks``, ``revoked`` (number of revoked
     certificates) and ``restart`` (enclaves whose processes have to be restarted) are for the
@@ -166,7 +166,7 @@ class KeystoreChange:
         Args:
             root: the keystore.
             now: the time of the change.
-            keyring: opens the keys of the CAs.
+            keyring: the keyring for the keys of the CAs.
             allow_refusal: vendors whose nodes may stop working.
             dry_run: change nothing.
             new_keystore: the keystore does not exist yet.
@@ -233,7 +233,7 @@ class KeystoreChange:
         return Authorities(self.identity, self.permissions)
 
     def open_authorities(self) -> None:
-        """Open both CAs now, with the key places in the current settings."""
+        """Open both CAs now, at the key places in the settings."""
         self.authorities  # noqa: B018 - read once
 
     def _authority(self, role: str) -> Authority:
@@ -251,7 +251,7 @@ class KeystoreChange:
 
     @cached_property
     def fleet(self) -> Fleet | None:
-        """The fleet of the keystore, None without one; raises if its file was edited."""
+        """The fleet of the keystore, or None; raises an error if the fleet file was edited."""
         return checked_fleet(self.keystore)
 
     @cached_property
@@ -261,7 +261,7 @@ class KeystoreChange:
 
     @cached_property
     def known(self) -> KnownKeys:
-        """The keys of present and revoked enclaves."""
+        """The keys of enclaves, present and revoked."""
         return KnownKeys(self.keystore)
 
     @cached_property
@@ -270,7 +270,7 @@ class KeystoreChange:
         return RecordedRights(self.keystore)
 
     def begin_issuing(self, domain: int | None) -> None:
-        """Open the CAs and the governance, and note edits by hand, before enclaves are issued.
+        """Open the CAs and the governance before enclaves are issued, and note manual edits.
 
         Raises:
             KeystoreError: a CA or the governance cannot be used, or the governance is not for
@@ -281,13 +281,13 @@ class KeystoreChange:
         self.notes += self.edit_notes()
 
     def check_domain(self, domain: int | None) -> None:
-        """Raise `KeystoreError` if a ``domain`` is given, and the governance is not for it."""
+        """Raise `KeystoreError` if ``domain`` is given and the governance is not for it."""
         check_domain(self.domains, domain, self.root)
 
     def write_fleet(self, fleet: Fleet, patterns: Collection[str]) -> Fleet:
-        """Stage ``fleet``, with ``patterns`` added, as the keystore's fleet; return it.
+        """Stage ``fleet``, with ``patterns`` added, as the keystore's fleet, and return it.
 
-        A Zenoh network gets the routers of its robots.
+        If there is a Zenoh network, it gets the routers of the fleet's robots.
         """
         before = None if self.is_new else fleet_before_change(self.keystore)
         fleet, entries = write_fleet(self.transaction, self.keystore, fleet, patterns, self.now)
@@ -305,7 +305,7 @@ class KeystoreChange:
     ) -> ZenohNetwork:
         """Return a network with the routers of the fleet's robots, except those that are revoked.
 
-        ``before`` is the fleet until now, whose routers the network has.
+        ``before`` is the previous fleet, whose routers are in the network.
         """
         if self.fleet is None:
             return network
@@ -318,7 +318,7 @@ class KeystoreChange:
         return with_routers_of_robots(network, before, self.fleet, gone)
 
     def set_network(self, network: ZenohNetwork) -> None:
-        """Stage settings with another Zenoh network, unless it is the current one.
+        """Stage settings with another Zenoh network, if it differs from the present one.
 
         Raises:
             KeystoreError: the settings or other files were edited by hand.
@@ -338,7 +338,7 @@ class KeystoreChange:
         self.entries.append(write_settings(self.transaction, self.template, self.now))
 
     def edit_notes(self) -> tuple[Note, ...]:
-        """Return a note on files that were edited by hand, which this change does not carry out."""
+        """Return notes on manually edited files, whose edits this change does not carry out."""
         return edit_notes(self.keystore, self.governance)
 
     def unrevoked_key(self, name: str, certificate: x509.Certificate) -> PublicKey:
@@ -353,7 +353,7 @@ class KeystoreChange:
         return public
 
     def tokens(self, places: Mapping[str, TokenUri]) -> EnclaveTokens:
-        """Return the keys of enclaves on tokens, at ``places`` by enclave."""
+        """Return the keys of enclaves on tokens; ``places`` maps enclaves to the keys' places."""
         return EnclaveTokens(
             places, self.keyring.secrets, self.known, self.authorities, self.dry_run
         )
@@ -362,8 +362,8 @@ class KeystoreChange:
         """Return a writer of enclaves that uses the new settings and CAs.
 
         Raises:
-            KeystoreError: earlier certificates are to be revoked, too, and a CA service has to sign
-                the revocation list.
+            KeystoreError: ``revoke_old`` is set, but only a CA service can sign the revocation
+                list.
         """
         if revoke_old and self.identity.service:
             raise KeystoreError(
@@ -403,7 +403,7 @@ class KeystoreChange:
     ) -> None:
         """Revoke all earlier certificates of the enclaves whose certificates are ``superseded``.
 
-        The enclaves ``names`` (default: all) get the revocation list, and have to be restarted.
+        The enclaves ``names`` (default: all) get the revocation list, and must be restarted.
         """
         if not superseded:
             return
@@ -431,11 +431,11 @@ class KeystoreChange:
             issued: the new permissions of enclaves.
             gone_enclaves: the enclaves that are revoked.
             replaced: the enclaves whose earlier certificates are revoked.
-            stated: the policies of enclaves, whose lines errors name.
-            created: new enclaves, which have no running process yet.
+            stated: the policies of enclaves, for the lines that errors name.
+            created: new enclaves, which have no running processes yet.
 
         Raises:
-            PolicyError: an enclave's rights cannot be stated to Zenoh.
+            PolicyError: Zenoh cannot express the rights of an enclave.
             KeystoreError: the enclave of the router is missing.
         """
         if self.template.zenoh is None:
@@ -475,7 +475,7 @@ class KeystoreChange:
         self.notes += self.zenoh.notes
 
     def _permissions_certificate(self) -> x509.Certificate:
-        """Return the certificate of the permissions CA, without its key if nothing needs it."""
+        """Return the permissions CA's certificate; its key is opened only if it is needed."""
         if "permissions" in self.__dict__:
             return self.permissions.certificate
         return self.keystore.ca_certificate(PERMISSIONS)
@@ -483,7 +483,7 @@ class KeystoreChange:
     # ── the flip ───────────────────────────────────────────────────────────────────────────
 
     def record(self, signer: Authority | None = None) -> None:
-        """Stage the ledger with the new entries, signed by the identity CA or ``signer``.
+        """Stage the ledger with the new entries, signed by the identity CA or by ``signer``.
 
         If the identity CA is a CA service, the permissions CA signs.  In a keystore of ros2/sros2,
         entries for its existing files come first.
@@ -507,28 +507,29 @@ class KeystoreChange:
 
     @property
     def is_guess(self) -> bool:
-        """Whether certificates are placeholders, as in a dry run with a CA service."""
+        """Whether certificates are only placeholders, as in a dry run with a CA service."""
         return self.dry_run and bool(self._entries_of_ca_service())
 
     @property
     def moment(self) -> datetime:
-        """The time of the change, or a later begin of validity of a CA service's certificates."""
+        """The time of the change, or the later beginning of a CA service's certificates."""
         return max(
             [self.now, *(parse_iso(entry.not_before) for entry in self._entries_of_ca_service())]
         )
 
     def _entries_of_ca_service(self) -> list[Entry]:
         """Return the ledger entries of the certificates that a CA service issued."""
-        identity: Authority | None = self.__dict__.get("identity")  # none is opened for this
+        # Only a CA that was already opened counts.
+        identity: Authority | None = self.__dict__.get("identity")
         if identity is None or identity.service is None:
             return []
         return [entry for entry in self.entries if entry.what == "certificate"]
 
     def _check_served(self) -> None:
-        """Note certificates of a CA service that expire earlier than was asked.
+        """Note certificates of a CA service that expire earlier than requested.
 
         Raises:
-            KeystoreError: a serial number was used before: a revocation would revoke both
+            KeystoreError: a serial number was used before, so that a revocation would revoke both
                 certificates.
         """
         if not (issued := self._entries_of_ca_service()):
@@ -557,8 +558,8 @@ class KeystoreChange:
     def finish(self, *, command: str = "", revoked_before: Collection[int] = ()) -> None:
         """Commit the change, unless vendors would refuse enclaves that they accept today.
 
-        ``command`` says for error messages why the change needs a revocation list, such as
-        ``revoke``; ``revoked_before`` are serial numbers that an earlier list revoked already.
+        ``command`` is the command that needs a revocation list, such as ``revoke``, for error
+        messages.  ``revoked_before`` are serial numbers that an earlier list already revoked.
 
         Raises:
             KeystoreError: nodes of a vendor would stop working.
@@ -582,7 +583,7 @@ class KeystoreChange:
         self.transaction.commit()
 
     def _note_strangers(self) -> None:
-        """Add a note if a file of CAs keeps a CA that a sound ledger does not know."""
+        """Add a note if a CA file has a CA that is not in the ledger, unless this has gaps."""
         written = (change.path for change in self.transaction.changes)
         replaced = any(path.startswith(f"{PUBLIC}/") and "_ca.cert" in path for path in written)
         if replaced or self.keystore.ledger_with("what", "ca").gaps:
@@ -601,7 +602,7 @@ class KeystoreChange:
         return another_ca_remedy(self.keystore, command)
 
     def result(self, kind: Callable[..., Result], **more: Any) -> Result:
-        """Return the result, of class ``kind``; ``more`` has the fields of this verb alone."""
+        """Return the result as a ``kind``; ``more`` are the fields that only this verb has."""
         shared: dict[str, Any] = {
             "root": self.root,
             "dry_run": self.dry_run,
@@ -617,7 +618,7 @@ class KeystoreChange:
 
 
 def _short_lived_notes(fleet: Fleet, template: Template) -> Iterator[Note]:
-    """Yield a note on robots whose enclaves the settings let expire early, such as a person's."""
+    """Yield a note on robots whose enclaves expire early by the settings, such as a person's."""
     short_lived: dict[str, str] = {}
     for robot in fleet.robots.values() if template.short_lived else ():
         names = enclaves_of(fleet, robot)
@@ -648,14 +649,15 @@ _ADOPTED = "taken over"
 def _take_over_records(
     transaction: Transaction, keystore: OpenedKeystore, now: datetime, entries: Iterable[Entry]
 ) -> list[Entry]:
-    """Return ``entries`` after entries for the files that ros2/sros2 made; stage the settings.
+    """Return ``entries`` preceded by entries for the files of ros2/sros2, and stage settings.
 
-    The first write of sros to a keystore of ros2/sros2 creates settings, with the values in force,
-    and a ledger that begins with the existing files.  Nothing shows whether files were removed
-    before: the recorded files are trusted as they are, and the entries and the message say so.
+    When sros first writes to a keystore of ros2/sros2, it creates settings with the values in
+    force, and a ledger that begins with the existing files.  Nothing shows whether files were
+    removed before, so the recorded files are trusted as they are, and the entries and the message
+    say so.
 
-    Only certificates and permissions that the CAs of the keystore signed are recorded.  For a
-    keystore of sros, ``entries`` are returned as they are.
+    Only certificates and permissions that the keystore's CAs signed are recorded.  For a keystore
+    of sros, the result is ``entries``.
     """
     added = list(entries)
     if not keystore.is_of_ros2:
@@ -673,7 +675,7 @@ def _entries_for_ros2_files(
     authorities = dict.fromkeys(keystore.ca_certificate(role) for role in ROLES)
     for authority in authorities:
         yield certificate_entry(now, "ca", authority, reason=_ADOPTED)
-    with suppress(SrosError):  # a missing one is reported by the verb
+    with suppress(SrosError):  # the verb reports a missing one
         message = keystore.read(GOVERNANCE_P7S, "governance document")
         yield document_entry(now, "governance", message)._replace(reason=_ADOPTED)
     for name in names:
@@ -691,7 +693,7 @@ def _settings_of_ros2(
     transaction: Transaction, keystore: OpenedKeystore, now: datetime
 ) -> Iterator[Entry]:
     present = present_settings(keystore)
-    if protection_for(present.governance):  # else settings would say another protection
+    if protection_for(present.governance):  # otherwise the settings would state another protection
         yield write_settings(transaction, present.settings, now)
 
 
@@ -701,7 +703,10 @@ def _stage(
     changed: Sequence[Drifted],
     authority: Authority,
 ) -> dict[str, bytes]:
-    """Stage changed configurations and their signed documents on all cores; map them to content."""
+    """Stage changed Zenoh configurations and their signed documents, and map paths to content.
+
+    All cores sign together.
+    """
 
     def stage(part: Sequence[Drifted]) -> list[bytes]:
         documents = [files[drift.path] for drift in part]
@@ -724,7 +729,7 @@ def _stage(
 
 
 def remove_zenoh(transaction: Transaction) -> tuple[str, ...]:
-    """Stage the removal of all configurations of a keystore; return their enclaves."""
+    """Stage the removal of all Zenoh configurations of a keystore; return their enclaves."""
     stale = list(stale_files(transaction.root, (), transaction.enclaves))
     for drift in stale:
         _remove(transaction, drift.path)
@@ -741,7 +746,7 @@ def _remove(transaction: Transaction, path: str) -> None:
 
 
 def _left_out_notes(left_out: Mapping[str, str]) -> Iterable[Note]:
-    """Yield a note for each reason, with the enclaves that have it."""
+    """Yield a note for each reason, with all enclaves that have it."""
     names_of: defaultdict[str, list[str]] = defaultdict(list)
     for name, why in left_out.items():
         names_of[why.rstrip(".")].append(name)
@@ -757,7 +762,7 @@ def _left_out_notes(left_out: Mapping[str, str]) -> Iterable[Note]:
 def _revoked_names(
     ledger: Ledger, names: Sequence[str], now: datetime, replaced: Collection[str]
 ) -> Iterable[Note]:
-    """Yield a note on enclave names that revoked certificates also have, until these expire."""
+    """Yield a note on names of enclaves that revoked certificates also have, until they expire."""
     entries = ledger.entries
     revoked = {entry.serial for entry in entries if entry.what == "revocation"}
     revoked_again = sorted(

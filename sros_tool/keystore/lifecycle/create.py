@@ -1,7 +1,7 @@
 """Creation of keystores and enclaves: CAs, governance, settings, keys and permissions.
 
-Enclaves that exist are completed, and get the permissions of new policies.  A policy can demand a
-stricter governance than the keystore has.
+Existing enclaves get their missing files and the permissions of new policies.  A policy can demand
+a stricter governance than the keystore has.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ class Creation(Changed):
 
     ``outcomes`` has enclaves that were created, changed (with new permissions), completed (with
     missing files) and kept.  ``restart`` are the enclaves whose processes still trust revoked
-    certificates, or still have the old governance or old Zenoh rules.
+    certificates, or still use the old governance or old Zenoh rules.
     """
 
     template: Template
@@ -159,12 +159,12 @@ def create_keystore(
 ) -> Creation:
     """Create a keystore for ``domains`` (default: 0) from ``template``.
 
-    ``imported_cas`` maps roles ("identity", "permissions") to PEM certificates of existing CAs,
-    whose keys the keyring of the ``options`` opens.
+    ``imported_cas`` maps roles ("identity", "permissions") to the PEM certificates of existing CAs,
+    whose keys are opened with the keyring in ``options``.
 
     Raises:
-        KeystoreError: ``root`` has a keystore or parts of one: enclaves of an older CA would not
-            work with a new CA.
+        KeystoreError: ``root`` has a keystore or parts of a keystore, because enclaves of an older
+            CA would not work with a new CA.
     """
     if not options.get("dry_run"):
         recover_keystore(root)
@@ -174,7 +174,8 @@ def create_keystore(
         _write_keystore(change, template, domains, imported_cas)
         change.record()
         change.notes += change.authorities.notes
-        if imported_cas and not change.identity.service:  # which would issue for the example
+        # A CA service would issue a certificate for the example.
+        if imported_cas and not change.identity.service:
             change.notes += imported_notes(
                 change.transaction, template, change.authorities, domains, change.now
             )
@@ -205,8 +206,8 @@ def create_enclaves(
 
     An existing enclave keeps its key and its permissions, and gets its missing files.  ``domain``
     is the caller's ROS_DOMAIN_ID; the governance must name it.  ``key`` is the ``pkcs11:`` URI of
-    the key, which is created on the token if it does not exist; without ``object`` in the URI, the
-    label of the key is the name of its enclave.
+    the key, which is created on the token if it does not exist.  If the URI has no ``object``, the
+    key's label is the name of the enclave.
     """
     return generate_artifacts(
         root,
@@ -230,8 +231,8 @@ def create_permission(
 ) -> Creation:
     """Replace the permissions of existing enclaves with their rights in ``policy``, all or none.
 
-    Whoever kept the replaced permissions can use them until they expire.  ``revoke_old`` prevents
-    that: the enclaves get new certificates for the same keys, and all earlier certificates are
+    Whoever kept the replaced permissions can use them until they expire, unless ``revoke_old`` is
+    set: then the enclaves get new certificates for the same keys, and all earlier certificates are
     revoked.  With ``keep_same``, permissions that state the same rights are kept, as by
     `generate_artifacts`.
     """
@@ -266,13 +267,13 @@ def generate_artifacts(
     """Create the named enclaves and the enclaves of policies, with permissions, all or nothing.
 
     If a policy names an existing enclave, the enclave's permissions are replaced, and with
-    ``revoke_old`` its certificate, as by `create_permission`.  Permissions that state the same
-    rights and do not expire soon are kept (`EnclaveWriter.would_change_only_dates`), with
-    ``revoke_old`` only if no other permissions fit the certificate.  The keystore protects each
-    name at least as the policies demand.  If the keystore does not exist and ``create`` is given,
-    it is created from that template.
+    ``revoke_old`` also its certificate, as by `create_permission`.  Permissions that state the same
+    rights and do not expire soon are kept (`EnclaveWriter.would_change_only_dates`).  With
+    ``revoke_old``, this requires that no other permissions fit the certificate.  The protection of
+    each name is raised to what the policies demand.  If the keystore does not exist and ``create``
+    is given, it is created from that template.
 
-    Policies for a fleet have to be for the same fleet, which the keystore records; a new keystore
+    All policies for a fleet must be for the same fleet, which the keystore records.  A new keystore
     is for the domains of the robots.
 
     Raises:
@@ -373,7 +374,7 @@ def _revoked_before(
     """Return a note for each revoked enclave that is created again because it is ``named``.
 
     Raises:
-        KeystoreError: a revoked enclave is only in a policy, from which nobody removed it.
+        KeystoreError: a revoked enclave is not named, but still in a policy.
     """
     existing, known, root = frozenset(change.names), change.known, change.root
     missing = [name for name in wanted_names if name not in existing]
@@ -408,7 +409,7 @@ def refuse_other_template(root: Path, template: Template) -> None:
 
 
 class _StatedEnclaves(Mapping[str, Enclave | None]):
-    """Map from enclaves to their rights in policies; fleet policies are expanded lazily."""
+    """Maps enclaves to their rights in policies; policies for a fleet are expanded when needed."""
 
     def __init__(self, sources: Mapping[str, Mapping[str, Enclave] | None]) -> None:
         self._sources = sources
@@ -430,7 +431,7 @@ class _StatedEnclaves(Mapping[str, Enclave | None]):
 def _rights_by_enclave(
     names: Sequence[str], policies: Sequence[Policy | FleetPolicy]
 ) -> Mapping[str, Enclave | None]:
-    """Map enclaves to their rights in the policies, None for an enclave without a policy.
+    """Map enclaves to their rights in the policies; None for an enclave without a policy.
 
     Raises:
         PolicyError: two policies state different rights for an enclave.
@@ -471,12 +472,12 @@ def _prepare_change(
 
     Args:
         change: the change of the keystore.
-        domain: the domain that the governance has to name; None for any.
+        domain: a domain that the governance must name; None for any.
         fleet: the fleet to stage as the keystore's fleet; None for no change.
         patterns: the paths of enclaves in policies for the fleet.
         stated: the enclaves that get the permissions of a policy.
-        protections: the protection that policies demand; the governance is changed if it gives
-            less.
+        protections: the protection that policies demand; a governance with less protection is
+            changed.
     """
     change.begin_issuing(domain)
     if fleet is not None:
@@ -498,11 +499,11 @@ def _write_keystore(
 ) -> None:
     """Stage a new keystore: its CAs, its governance and its settings."""
 
-    _check_free(change.root)  # another process may have created it meanwhile
+    _check_free(change.root)  # another process may have created it in the meantime
     if template.zenoh:
         check_network(template.zenoh)
     for span in (template.certificate_validity, template.permissions_validity):
-        window(change.now, span)  # raises if the CAs could not issue anything
+        window(change.now, span)  # raises an error if the CAs could not issue anything
     change.template, change.domains, change.fleet = template, domains, None
     authorities = create_authorities(
         change.transaction, template, change.keyring, change.now, imported_cas
@@ -521,7 +522,8 @@ def _check_free(root: Path) -> None:
     if is_keystore(root):
         raise _already_exists_error(root)
     refuse_earlier(root)
-    if os.path.realpath(root) == "/":  # unlike Path.resolve, it does not fail at a loop of links
+    # Unlike Path.resolve, realpath does not fail for circular links.
+    if os.path.realpath(root) == "/":
         raise KeystoreError(
             "the root of the file system cannot be a keystore", "", "Choose another path."
         )
@@ -537,7 +539,7 @@ def _check_free(root: Path) -> None:
         )
     remains = [part for part in (PUBLIC, PRIVATE, ENCLAVES) if (root / part).exists()]
     if remains:
-        if is_keystore(root):  # another process has just completed it
+        if is_keystore(root):  # another process has just created it
             raise _already_exists_error(root)
         raise KeystoreError(
             f"'{root}' already contains parts of a keystore",
@@ -548,7 +550,7 @@ def _check_free(root: Path) -> None:
 
 
 def _place_notes(root: Path) -> Iterator[Note]:
-    """Yield a note if users other than this user and root can replace a new keystore."""
+    """Yield a note if other users than this user and root can replace a new keystore."""
     trusted = frozenset({0, os.geteuid()})
     replaceable = list(replaceable_on_the_way(root, trusted))
     if root.exists() and (why := other_writers(root.stat(), trusted)):
@@ -571,7 +573,7 @@ def _already_exists_error(root: Path) -> KeystoreError:
 
 
 def _check_typo(root: Path) -> None:
-    """Refuse a name that looks like a typo of a keystore next to it."""
+    """Raise an error if the name of a keystore looks like a mistyped name of one next to it."""
     for similar in similar_keystores(root):
         raise UsageError(
             f"'{root}' does not exist, and '{similar.name}' next to it is a keystore",
@@ -588,14 +590,15 @@ def write_governance(
 ) -> None:
     """Sign, stage and record the governance of a keystore that is made from settings.
 
-    Enclaves in ``names`` that have a copy of the document instead of a link get the new one, too.
+    Enclaves in ``names`` that have a copy of the document instead of a link also get the new
+    document.
     """
     document, label = render_governance(governance), "the governance document"
     check_meaning(parse_governance(document), governance, label)
     message = change.permissions.sign(document, label)
     change.transaction.write(GOVERNANCE_XML, document)
     change.transaction.write(GOVERNANCE_P7S, message)
-    # The governance of the keystore itself is in the folder of the enclave /.
+    # The folder of the enclave / has the governance of the keystore itself.
     below = [name for name in names if name != "/"]
     write_copies(change.transaction, below, GOVERNANCE_FILE, message)
     change.entries.append(document_entry(change.now, "governance", message))
@@ -606,11 +609,11 @@ def _raise_protection(
 ) -> None:
     """Stage a governance and settings with more protection, if policies demand more.
 
-    ``stated_protections`` are the statements of policies about the protection of names.
+    ``stated_protections`` is the protection of names that policies state.
 
     Raises:
         PolicyError: the statements contradict each other, or the settings.
-        KeystoreError: the keystore has no settings that can state it, or its files were edited by
+        KeystoreError: the keystore has no settings for the protection, or its files were edited by
             hand.
     """
     root, template, governance = change.root, change.template, change.governance
@@ -664,7 +667,8 @@ def refuse_less_protected(
 ) -> None:
     """Raise `KeystoreError` if a policy demands more protection than the governance gives.
 
-    Used when requests are signed, because all robots would need a changed governance.
+    This check is for signing requests, where the governance must not change, because all robots
+    would need it.
     """
     root = keystore.root
     for name, level in less_protected(governance, stated_protections):
@@ -690,7 +694,7 @@ def _zenoh_notes(template: Template) -> tuple[Note, ...]:
 
 
 def restart_note(mismatch: Mismatch, *, revoked: bool = False) -> Note:
-    """Return a note on the processes to restart and their order; vendors agree (tested)."""
+    """Return a note on which processes to restart and in which order (tested; vendors agree)."""
     return Note("keystore.restart", _restart_text(mismatch, revoked=revoked))
 
 
@@ -742,20 +746,19 @@ def write_enclaves(
     places: Mapping[str, TokenUri] = MappingProxyType({}),
     progress: Progress | None = None,
 ) -> tuple[ReplacedRights, ...]:
-    """Create or complete enclaves, sign the permissions of their policies, and commit the change.
+    """Create or complete enclaves, sign the permissions by their policies, and commit the change.
 
     In a keystore with a Zenoh network, the enclaves of its routers are created, too.
 
     Args:
         change: the change of the keystore.
-        wanted_enclaves: maps enclaves to their policies, or None.
+        wanted_enclaves: maps enclaves to their policies, or to None.
         revoke_old: also replace and revoke the certificates of enclaves that get other permissions.
         keep_same: keep permissions that already state the rights of a policy.
         places: maps enclaves to the places of new keys on tokens; other new keys are in files.
         progress: called with the name of each enclave that is done.
 
-    Returns:
-        The rights that enclaves gain and lose with their new permissions.
+    Returns: The rights that enclaves gain and lose with their new permissions.
     """
     network = change.template.zenoh
     if routers := set(network.router_names() if network else ()).difference(change.names):
@@ -799,7 +802,7 @@ def write_enclaves(
 
 @dataclass(frozen=True, slots=True)
 class _EnclaveOutcome:
-    """The outcome for an enclave; ``superseded`` is its old certificate, if it gets revoked."""
+    """The outcome for an enclave; ``superseded`` is its old certificate, if to be revoked."""
 
     outcome: str
     notes: tuple[Note, ...]
@@ -808,7 +811,7 @@ class _EnclaveOutcome:
 
 
 class _EnclaveMaker:
-    """Maker of enclaves, one at a time, within a change."""
+    """Makes enclaves one at a time, within a change."""
 
     def __init__(
         self,
@@ -830,7 +833,7 @@ class _EnclaveMaker:
         self._keep_same = keep_same
 
     def make(self, name: str, policy: Enclave | None) -> _EnclaveOutcome:
-        """Stage the missing files of an enclave, and permissions for ``policy`` if not None."""
+        """Stage the missing files of an enclave, and if ``policy`` is not None, its permissions."""
         change, root = self._change, self._root
         present = present_files(root, name)
         before = len(change.transaction.changes)
@@ -877,9 +880,9 @@ class _EnclaveMaker:
         return _EnclaveOutcome("completed" if completed else "kept", notes)
 
     def _may_have_others(self, name: str, certificate: x509.Certificate) -> bool:
-        """Return whether other files issued for an enclave may still work, by the ledger.
+        """Return whether other files of an enclave may still work, by the ledger.
 
-        These are an earlier certificate, or other permissions for the subject of the current
+        These are an earlier certificate, or other permissions for the subject of the present
         certificate.
         """
         certificates, permissions = self._recorded_credentials.get(name, (set(), []))
@@ -892,9 +895,10 @@ class _EnclaveMaker:
 
     @cached_property
     def _recorded_credentials(self) -> Mapping[str, tuple[set[int], list[str]]]:
-        """The serials of each enclave's certificates, and the subjects of its permissions.
+        """Maps enclaves to their certificates' serial numbers and their permissions' subjects.
 
-        Expired and revoked certificates are left out.  It is empty if the ledger may lack some.
+        Expired and revoked certificates are left out.  The map is empty if entries may be missing
+        in the ledger.
         """
         keystore, now = self._change.keystore, iso(self._change.now)
         working: dict[str, tuple[set[int], list[str]]] = {}
@@ -903,7 +907,7 @@ class _EnclaveMaker:
             was_restored = any(
                 entry.what == RESTORED for entry in keystore.ledger_with("what", RESTORED).entries
             )
-        except SrosError:  # a sealed part of the ledger is elsewhere
+        except SrosError:  # a sealed part of the ledger is in an archive
             return working
         if ledger.gaps or ledger.unchained or was_restored or may_have_later_releases(keystore):
             return working
@@ -933,7 +937,7 @@ class _EnclaveMaker:
         yield Note("keystore.rights-lost", text)
 
     def _is_kept(self, certificate: x509.Certificate, rights: StatedRights) -> bool:
-        """Return whether an enclave's permissions can stay, because they already state ``rights``.
+        """Return whether an enclave's permissions can stay because they already state ``rights``.
 
         Raises:
             KeystoreError: the key of the enclave was revoked, so DDS would not accept the
@@ -945,7 +949,8 @@ class _EnclaveMaker:
         change.unrevoked_key(name, certificate)
         folder = enclave_path(self._root, name)
         signed_path, xml = folder / PERMISSIONS_FILE, folder / "permissions.xml"
-        if signed_path.is_symlink() or xml.is_symlink():  # to what others may change
+        # A link could lead to a file that others can change.
+        if signed_path.is_symlink() or xml.is_symlink():
             return False
         try:
             message = change.keystore.read(signed_path, "permissions document")
@@ -955,7 +960,7 @@ class _EnclaveMaker:
             signed = change.keystore.files.signed(message)
             signed.verify(change.permissions.certificate)
             validity = Window(parse_iso(entry.not_before), parse_iso(entry.not_after))
-        except (SrosError, ValueError):  # not what `write` would leave
+        except (SrosError, ValueError):  # these are not files that `write` would leave as they are
             return False
         text = signed.text
         return self._writer.would_change_only_dates(
@@ -965,10 +970,10 @@ class _EnclaveMaker:
     def _identity(
         self, name: str, existing_files: set[str], *, replaced: bool
     ) -> NewIdentity | x509.Certificate:
-        """Return the certificate of an enclave, or the subject and key for a new certificate.
+        """Return an enclave's certificate, or the subject and key for a new one.
 
-        If the enclave has signed permissions, the new certificate gets their subject, unless they
-        are ``replaced`` in this step.
+        If the enclave has signed permissions, the new certificate gets their subject, unless the
+        permissions are ``replaced`` in this step.
 
         Raises:
             KeystoreError: the certificate cannot be used, or the current permissions are not the
@@ -1062,7 +1067,7 @@ class _EnclaveMaker:
         )
 
     def _robots_or_names(self, names: Collection[str]) -> str:
-        """Return the arguments that select enclaves: robots of which all are chosen, and others."""
+        """Return arguments that select enclaves: robots that are complete, and other enclaves."""
         words, left = [], list(names)
         fleet = load_fleet(self._change.keystore)
         for robot in fleet.robots.values() if fleet and len(names) > 1 else ():
@@ -1074,14 +1079,14 @@ class _EnclaveMaker:
 
 
 def _is_file(path: Path, content: bytes) -> bool:
-    """Return whether the file at ``path`` exists and has this content."""
+    """Return whether there is a file at ``path`` with this content."""
     with suppress(SrosError):
         return read_bytes(path, "permissions document") == content
     return False
 
 
 def _default_rights(template: Template, name: str) -> Enclave:
-    """Return the rights of a new enclave without a policy; the basics for a router."""
+    """Return the rights of a new enclave without a policy; for a router, only the basic rights."""
     if template.zenoh and name in template.zenoh.router_names():
         template = replace(template, default_permissions=NODE_BASICS)
     return default_rights(template, name)
@@ -1090,7 +1095,7 @@ def _default_rights(template: Template, name: str) -> Enclave:
 def _permissions_subjects(path: Path, authority: x509.Certificate) -> Iterator[x509.Name]:
     """Yield the subjects of the grants in signed permissions.
 
-    Yield none if the permissions cannot be read, or if ``authority`` did not sign them.
+    There are none if the permissions cannot be read, or if ``authority`` did not sign them.
     """
     try:
         signed = smime.parse(read_bytes(path, "permissions document"))

@@ -56,11 +56,11 @@ def renew(
 ) -> Changed:
     """Renew the named enclaves, and the enclaves that are due by ``expiring``, all or nothing.
 
-    The new certificate is for the same key; with ``new_key``, for a new key; with ``key``, for the
-    key on a token, as in `create_enclaves`.  The signed rights do not change.  All files are
+    The new certificate is for the same key.  With ``new_key``, it is for a new key; with ``key``,
+    for a key on a token, as in `create_enclaves`.  The signed rights do not change.  All files are
     replaced at once.  Whoever has the key can use a replaced certificate until it or its last
-    permissions expire, or it is revoked; ``revoke_old`` revokes all earlier certificates of the
-    renewed enclaves, and gives them subjects that no earlier permissions fit.
+    permissions expire, or until it is revoked.  With ``revoke_old``, all earlier certificates of
+    the renewed enclaves are revoked, and the new ones get subjects that no earlier permissions fit.
 
     Raises:
         KeystoreError: enclaves cannot be renewed (the error names all of them), or vendors would
@@ -80,7 +80,8 @@ def renew(
                 raise missing_enclave_error(change.keystore, name, change.names)
         wanted = dict.fromkeys(names)
         if expiring is not None:
-            # A short-lived enclave, such as a person's, ends unless somebody renews it by its name.
+            # A short-lived enclave, such as a person's, is meant to end unless somebody renews it
+            # by name.
             others = [name for name in change.names if name not in wanted]
             short_lived = [
                 name for name in others if change.template.longest_validity(name) is not None
@@ -89,8 +90,9 @@ def renew(
             if short_lived:
                 text = f"short-lived, and renewed only if named: {first_few(short_lived, 3)}"
                 change.notes.append(Note("renew.short-lived", text))
-        if not wanted:  # no CA key is asked for
-            _ = change.keystore.authority_files  # raises an error for an export, never renewed
+        if not wanted:  # then no CA key is opened
+            # Raises an error for an export, which is never renewed.
+            _ = change.keystore.authority_files
             change.notes += change.keystore.ledger_file.clock_notes(change.now)
             with suppress(SrosError):
                 change.notes += change.edit_notes()
@@ -113,7 +115,7 @@ def renew(
                 f"on {iso(writer.expiry)}, so that they are renewed each time: choose a shorter "
             )
             change.notes.append(Note("renew.due-again", f"{text}time, or a longer validity."))
-        with suppress(SrosError):  # its governance is not what is renewed
+        with suppress(SrosError):  # the governance is not part of a renewal
             change.notes += change.edit_notes()
         if not (new_key or places):
             change.notes += change.known.shared_notes(renewed)
@@ -136,7 +138,7 @@ def renew(
 
 
 def _due(change: KeystoreChange, names: Container[str], threshold: Threshold) -> Iterator[str]:
-    """Yield those of the enclaves ``names`` that are due for renewal.
+    """Yield the enclaves among ``names`` that are due for renewal.
 
     Raises:
         KeystoreError: enclaves cannot be read; the error names all of them.
@@ -149,7 +151,7 @@ def _due(change: KeystoreChange, names: Container[str], threshold: Threshold) ->
 
 
 class _Renewer:
-    """Renewer of enclaves, one at a time; ``notes`` are about their keys."""
+    """Renews enclaves one at a time; ``notes`` are about their keys."""
 
     def __init__(
         self,
@@ -169,7 +171,7 @@ class _Renewer:
         self._unique = unique
 
     def renew(self, names: Sequence[str], progress: Progress | None) -> list[Superseded]:
-        """Renew the enclaves ``names``; return the replaced certificates.
+        """Renew the enclaves ``names``, and return the replaced certificates.
 
         Raises:
             KeystoreError: enclaves cannot be read; the error names all of them.
@@ -191,10 +193,10 @@ class _Renewer:
         return Superseded.record(name, state.certificate, issued.certificate, now)
 
     def _issuance(self, state: Credentials) -> Issuance:
-        """Return what to issue for an enclave, after verifying its current files."""
+        """Return what to issue for an enclave, after verifying its present files."""
         name = state.name
         rights = checked_rights(state, self._change.authorities, self._change.recorded)
-        # Once earlier permissions were cut off by a unique subject, they stay cut off.
+        # If a unique subject made earlier permissions useless, they must not become useful again.
         unique = self._unique or has_unique_part(state.certificate.subject)
         subject = enclave_subject(name, unique=unique)
         if name in self._tokens.places:
@@ -234,7 +236,7 @@ class _Renewer:
 def checked_rights(
     state: Credentials, authorities: Authorities, recorded: RecordedRights
 ) -> SignedRights:
-    """Return the rights of an enclave, to sign them again, after verifying its files.
+    """Return the rights of an enclave, after verifying its files, for signing them again.
 
     Raises:
         KeystoreError: the CAs of the keystore did not issue the certificate, or the permissions are

@@ -1,7 +1,7 @@
 """The rights that an enclave gains and loses when its permissions are replaced.
 
-DDS Security 1.1 cannot revoke permissions: whoever kept replaced permissions, with a certificate
-that they fit, can use them until they expire (ros2/sros2 issue 275).
+DDS Security 1.1 cannot revoke permissions: whoever kept replaced permissions and a certificate with
+the same subject can use them until they expire (ros2/sros2 issue 275).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from sros_tool.wording import first_few
 
 @dataclass(frozen=True, slots=True)
 class EarlierPermissions:
-    """The permissions of an enclave before they are replaced, and its certificate."""
+    """The permissions of an enclave before their replacement, and the enclave's certificate."""
 
     certificate: x509.Certificate
     grant: Grant
@@ -55,28 +55,30 @@ class ReplacedRights:
     """Rights that were added, and denials that were taken away."""
     works_until: datetime | None
     """Expiry, in UTC, of the enclave's last permissions in the ledger, which work for anyone who
-    kept them with their certificate; null if they no longer work."""
+    kept them with their certificate; null if no permissions work any more.
+    """
     lost_domains: str = ""
-    """ROS domains, such as 0,7, for which the enclave no longer has permissions."""
+    """ROS domains, such as 0,7, for which the enclave has no permissions any more."""
     gained_domains: str = ""
-    """ROS domains for which the enclave has permissions now, and had none before."""
+    """ROS domains for which the enclave has permissions now, but had none before."""
     may_work_longer: bool = False
-    """Whether the keystore is older than its robots, or was restored from a backup, so that
-    permissions that the ledger lacks may work longer."""
+    """Whether permissions that the ledger lacks may work longer, because the keystore is older than
+    its robots, or was restored from a backup.
+    """
 
     def revoked(self) -> ReplacedRights:
-        """Return these rights as they are once the enclave's earlier certificate is revoked."""
+        """Return the same rights after the revocation of the enclave's earlier certificate."""
         return replace(self, works_until=None)
 
     def lost_text(self, fleet: Fleet | None = None) -> str:
-        """Return the rights and domains that are lost, as text; "" for none.
+        """Return the lost rights and domains as text; "" if there are none.
 
         Rights to names that differ only in the robot of ``fleet`` share an entry.
         """
         return self._text(self.lost, self.lost_domains, fleet)
 
     def gained_text(self, fleet: Fleet | None = None) -> str:
-        """Return the rights and domains that are gained, as text, like `lost_text`; "" for none."""
+        """Return the gained rights and domains as text, like `lost_text`; "" if there are none."""
         return self._text(self.gained, self.gained_domains, fleet)
 
     def _text(self, rights: Sequence[Right], domains: str, fleet: Fleet | None) -> str:
@@ -96,7 +98,8 @@ def earlier_permissions(
 ) -> EarlierPermissions | None:
     """Return the current permissions of an enclave; None if DDS would refuse them.
 
-    ``authority`` is the permissions CA, ``certificate`` the enclave's, if it was read already.
+    ``authority`` is the permissions CA.  ``certificate`` is that of the enclave, if it was already
+    read.
     """
     with suppress(SrosError):
         certificate = certificate or keystore.certificate_of(name)
@@ -112,8 +115,8 @@ def replaced_rights(
 ) -> ReplacedRights:
     """Return the rights gained and lost when ``grant`` replaces ``earlier_permissions``.
 
-    `with_ledger` says whether other permissions of the enclave work longer than
-    ``earlier_permissions``.
+    Other permissions of the enclave may work longer than ``earlier_permissions``; `with_ledger`
+    adds this.
     """
     difference = compare(grant_rights(name, earlier_permissions.grant), grant_rights(name, grant))
     lost: list[Right] = []
@@ -123,7 +126,7 @@ def replaced_rights(
             taken = (sign == "-") == (right.qualifier is ALLOW)
             (lost if taken else gained).append(right)
     end = validity_of(earlier_permissions.certificate).not_after
-    with suppress(SrosError):  # an expiry before the beginning
+    with suppress(SrosError):  # the expiry is before the beginning
         end = min(end, earlier_permissions.grant.validity.not_after)
     before, after = earlier_permissions.grant.domains().closed(), grant.domains().closed()
     lost_domains, gained_domains = (
@@ -139,10 +142,10 @@ def replaced_rights(
 def with_ledger(
     keystore: OpenedKeystore, replaced_rights: Collection[ReplacedRights], now: datetime
 ) -> tuple[ReplacedRights, ...]:
-    """Return the replaced rights, each with the latest expiry that the ledger has for its enclave.
+    """Return the replaced rights with the latest expiry that the ledger has for their enclave.
 
-    The ledger may have permissions that work longer than those that are replaced: a robot has them
-    if the keystore was restored from a backup.
+    The ledger may have permissions that work longer than the replaced ones: a robot has them if the
+    keystore was restored from a backup.
     """
     if not replaced_rights:
         return ()
@@ -169,9 +172,10 @@ def certificates_until(
 ) -> datetime | None:
     """Return until when the last replaced certificate works; None if none was replaced.
 
-    A certificate needs permissions for its subject.  If the new certificate of the enclave has
-    another subject, no more permissions for the replaced one are signed, and it works until the
-    last ones expire.  Zenoh, and a domain into which everybody may join, need no permissions.
+    A certificate needs permissions for its subject.  If an enclave's new certificate has another
+    subject, no more permissions are signed for the replaced certificate, which therefore works
+    until its last permissions expire.  In Zenoh, and in a domain that everybody may join, a
+    certificate needs no permissions.
     """
     needs_permissions = False
     with suppress(SrosError):
@@ -190,14 +194,14 @@ def certificates_until(
 def lacks_some(keystore: OpenedKeystore) -> bool:
     """Return whether the ledger may lack certificates and permissions that the keystore issued.
 
-    The keystore is then older than its robots, or was restored from a backup.
+    If so, the keystore is older than its robots, or was restored from a backup.
     """
     return bool(restored_at(keystore) or may_have_later_releases(keystore))
 
 
 @dataclass(frozen=True, slots=True)
 class Superseded:
-    """A replaced certificate, and the digest of the key and the subject of the new certificate."""
+    """A replaced certificate, with the key digest and the subject of the new certificate."""
 
     name: str
     old: Entry
@@ -208,7 +212,7 @@ class Superseded:
     def record(
         cls, name: str, old: x509.Certificate, new: x509.Certificate, now: datetime
     ) -> Superseded:
-        """Return the record that the certificate ``new`` replaced ``old`` at ``now``."""
+        """Return the record that the certificate ``new`` replaced ``old`` at the time ``now``."""
         entry = certificate_entry(now, "certificate", old, name)
         key = key_digest(new.public_key())  # type: ignore[arg-type]
         return cls(name, entry, key, subject_text(new.subject))
@@ -233,7 +237,7 @@ def _described_rights(rights: Sequence[Right]) -> list[str]:
 
 
 def lasting_text(root: Path, replaced_rights: Sequence[ReplacedRights]) -> str:
-    """Return sentences on lost rights that still work, and how to end that; "" if none work."""
+    """Return sentences on lost rights that still work and how to end them; "" without any."""
     lasting = [
         rights
         for rights in replaced_rights

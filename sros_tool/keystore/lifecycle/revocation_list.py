@@ -1,6 +1,6 @@
 """Signing of the revocation lists of a keystore, in the files that DDS reads.
 
-``crl.pem`` in every enclave is the list of the issuing identity CA.  During a rotation there is a
+In every enclave, ``crl.pem`` is the list of the issuing identity CA.  During a rotation, there is a
 second identity CA, whose list is in the file of the identity CAs.  Fast DDS 2.9.1 trusts both CAs
 and reads lists in that file, but reads only one list in ``crl.pem``; Cyclone DDS 0.10.2 trusts only
 the issuing CA (all tested).
@@ -78,10 +78,11 @@ from sros_tool.validity import BACKDATE, Window, iso
 
 
 class Forgotten:
-    """Files that a keystore signed but no longer knows, as after a backup was restored.
+    """Lists and certificates that a keystore issued but has lost, as after restoring a backup.
 
-    An identity CA of the keystore signed these ``lists`` and ``certificates``, so they are true
-    wherever they come from.  Certificates map serial numbers (hexadecimal) to ledger entries.
+    An identity CA of the keystore signed these ``lists`` and ``certificates``, so they are
+    authentic wherever they come from.  ``certificates`` maps serial numbers (hexadecimal) to ledger
+    entries.
     """
 
     def __init__(self, keystore: OpenedKeystore, now: datetime) -> None:
@@ -96,10 +97,10 @@ class Forgotten:
         self._seen: set[bytes] = set()
 
     def add_certificate(self, certificate: x509.Certificate, reason: str = "") -> bool:
-        """Add the certificate of an enclave, unless it has expired; return whether it counts.
+        """Add an enclave's certificate, unless it has expired; return whether it was added.
 
-        `restore_revocations` records it if the ledger lacks it.  ``reason`` is `REPORTED` if the
-        keystore's own seal does not show that it belongs to this keystore.
+        `restore_revocations` records the certificate if the ledger lacks it.  ``reason`` is
+        `REPORTED` if no seal of the keystore shows that the certificate belongs to this keystore.
         """
         try:
             name = check_enclave_name(common_name_of(certificate.subject))
@@ -113,10 +114,10 @@ class Forgotten:
         return True
 
     def unknown_certificates(self, keystore: OpenedKeystore) -> dict[str, Entry]:
-        """Return the certificates that ``keystore`` neither issued nor revoked, as far as it knows.
+        """Return the certificates that ``keystore`` does not know as issued or revoked.
 
         A certificate that the ledger has only from a robot's message is included if a sealed
-        release shows it now.
+        release now shows it.
         """
         recorded = keystore.ledger_file.with_values("serial", self.certificates).entries
         known = {
@@ -165,7 +166,7 @@ class Forgotten:
 
 @dataclass(frozen=True, slots=True)
 class SignedList:
-    """A signed revocation list as PEM, its expiry ``end`` in UTC, and its ledger entry."""
+    """A signed revocation list (PEM), its expiry ``end`` in UTC, and its ledger entry."""
 
     document: bytes
     end: datetime
@@ -180,7 +181,7 @@ def sign_list(
     template: Template,
     now: datetime,
 ) -> SignedList:
-    """Return a new signed revocation list, which expires with its CA at the latest."""
+    """Return a newly signed revocation list, which expires no later than its CA."""
     validity = validity_of(authority.certificate)
     moment = now.replace(microsecond=0)
     begin = max(moment - BACKDATE, validity.not_before)
@@ -198,15 +199,16 @@ def sign_list(
 
 
 def _carried_over(old: RevocationList | None, expiries: Mapping[int, str]) -> list[Revoked]:
-    """Return the entries of the ``old`` list that the next list has to repeat.
+    """Return the entries of the ``old`` list that the next list must repeat.
 
-    These are the certificates that had not expired when the old list was issued: by RFC 5280, 3.3,
+    These are the certificates that had not expired when the old list was issued.  By RFC 5280, 3.3,
     an entry stays until it was on a list after the certificate's expiry.  ``expiries`` maps serial
-    numbers to expiries (ISO 8601, UTC); an entry without an expiry is always repeated.
+    numbers to expiries (ISO 8601, UTC); an entry without a known expiry is always repeated.
     """
     if old is None:
         return []
-    # thisUpdate is up to BACKDATE before the signing, so some entries are kept a little longer.
+    # thisUpdate is up to BACKDATE before the time of signing, so some entries are repeated longer
+    # than needed.
     issued = iso(old.this_update)
     return [entry for entry in old.revoked if expiries.get(entry.serial, issued) >= issued]
 
@@ -214,9 +216,9 @@ def _carried_over(old: RevocationList | None, expiries: Mapping[int, str]) -> li
 class RevocationListSigner:
     """Signer of the revocation lists of all trusted identity CAs, within a transaction.
 
-    ``present`` is the list before the change; None if there is none, or no trusted identity CA
-    signed it.  ``given`` is the list (PEM) that a CA service signed, for a keystore with one.
-    ``remarks`` are notes on lists that could not be signed or used, and on certificates
+    ``present`` is the list before the change; None if there is no list, or no trusted identity CA
+    signed it.  ``given`` is the list (PEM) that a CA service signed, if the keystore has a CA
+    service.  ``remarks`` are notes on lists that could not be signed or used, and on certificates
     that may be missing from the ledger.
     """
 
@@ -252,9 +254,9 @@ class RevocationListSigner:
     def recipients(self) -> Sequence[str] | None:
         """Return the enclaves that already have the list; None if some may lack it.
 
-        In a keystore with an index, these are the enclaves that the ledger has, once a first list
-        was signed: each enclave that is made later gets it.  In a rotation, files of all enclaves
-        may have to change.
+        If the ledger has an index and a first list was signed, these are the enclaves in the
+        ledger, because each enclave that is made later gets the list.  In a rotation, files of all
+        enclaves may have to change.
         """
         if not self.present or read_rotation(self._keystore).stage is not RotationStage.NONE:
             return None
@@ -267,22 +269,24 @@ class RevocationListSigner:
     ) -> list[Entry]:
         """Return the ledger entries for revoking all valid certificates of enclaves.
 
-        `sign` then remarks if the ledger may lack some of these certificates.
+        If the ledger may lack some of these certificates, `sign` adds a remark.
 
         Args:
-            last: maps the enclaves to their current certificates.
-            reason: the reason, as RFC 5280 spells it.
-            keep: maps enclaves to the digests of keys that stay valid, though the certificates do
+            last: maps the enclaves to their present certificates.
+            reason: the reason, as in RFC 5280.
+            keep: maps enclaves to the digests of keys that stay valid although the certificates do
                 not.
         """
         listed = {entry.serial for entry in self.present.revoked} if self.present else set()
-        # Not those that only the list has: somebody may have copied it from a robot.
+        # Revocations that only the list has do not count: somebody may have copied the list from a
+        # robot.
         ledger = self._keystore.ledger_with("what", "revocation").entries
         recorded = {int(e.serial, 16) for e in ledger if e.what == "revocation"}
         revocations = []
         moment = iso(self._now)
         present = last
-        if keep is not None:  # an expired certificate needs no revocation to be replaced
+        # A certificate that has expired need not be revoked when it is replaced.
+        if keep is not None:
             present = {name: entry for name, entry in last.items() if entry.not_after >= moment}
         for name, valid in self._still_valid(last, present, listed).items():
             for serial, entry in valid.items():
@@ -326,9 +330,9 @@ class RevocationListSigner:
     ) -> dict[str, dict[int, Entry]]:
         """Map each enclave to its certificates that have not expired, by serial number.
 
-        The certificates are read from the ledger, from the folder ``revoked`` (a new list after a
-        lost one lacks them), and from ``present``, because the ledger lacks certificates that
-        ros2/sros2 issued.  Serial numbers in ``listed_serials`` are not looked for in the folder.
+        The certificates come from the ledger, from the folder ``revoked`` (which a new list after a
+        lost one lacks), and from ``present``, because the ledger lacks certificates that ros2/sros2
+        issued.  Serial numbers in ``listed_serials`` are not searched in the folder.
         """
         certificates: dict[str, dict[int, Entry]] = {name: {} for name in names}
         moment = iso(self._now)
@@ -353,7 +357,7 @@ class RevocationListSigner:
         return certificates
 
     def _recorded_as_moved(self, listed_serials: Collection[int]) -> Container[str]:
-        """Return ``listed_serials``, and numbers in ``revoked`` that the ledger certainly has."""
+        """Return ``listed_serials``, and those in ``revoked`` that the ledger certainly has."""
         known = {f"{serial:x}" for serial in listed_serials}
         ledger = self._keystore.ledger_file
         if not ledger.is_indexed:
@@ -394,8 +398,8 @@ class RevocationListSigner:
     def _list_if_authentic(self, crl: RevocationList | None) -> RevocationList | None:
         """Return ``crl`` if a trusted identity CA signed it; else None, with a remark.
 
-        Whoever can write the file, but not sign, could otherwise have the CA sign entries that
-        revoke other enclaves, or that keep a certificate from being revoked.
+        Without this check, whoever can write the file but not sign it could make the CA sign
+        entries that revoke other enclaves, or that prevent a revocation.
         """
         file = self._keystore.identity_file
         own = (self._authority.certificate,)
@@ -419,10 +423,10 @@ class RevocationListSigner:
     ) -> tuple[datetime, list[Entry]]:
         """Sign and stage the lists; return their first expiry (UTC) and the new ledger entries.
 
-        ``revocations`` are the entries of new revocations; the enclaves ``names`` get the lists,
-        except the `recipients`, who have them.  The numbers of the lists are at least ``least``.
-        Each list has all serial numbers: the ledger does not say which of two CAs issued a
-        certificate, and a serial number of the other CA does no harm.
+        ``revocations`` are the entries of new revocations.  The enclaves ``names`` get the lists,
+        except the `recipients`, who already have them.  The numbers of the lists are at least
+        ``least``.  Each list has all serial numbers, because the ledger does not say which of two
+        CAs issued a certificate, and a serial number of the other CA does no harm.
 
         Raises:
             KeystoreError: a revocation needs the key of the old CA, which is missing, and
@@ -465,7 +469,8 @@ class RevocationListSigner:
         listed = {entry.serial for entry in kept}
         kept += [entry for entry in new_entries if entry.serial not in listed]
         if authority.service:
-            # Its list may also have certificates of others, which it drops once they expired.
+            # A CA service's list may also have other certificates, and drops certificates that have
+            # expired.
             moment, recorded = iso(self._now), self._keystore.ledger_with("what", "revocation")
             own = {
                 int(entry.serial, 16) for entry in recorded.entries if entry.what == "revocation"
@@ -475,19 +480,19 @@ class RevocationListSigner:
             }
             new = {entry.serial for entry in new_entries}
             return self._list_of_service(authority, needed & (own | new))
-        # Without an earlier list that is authentic: above every number that was used, because each
-        # list that is signed adds an entry to the ledger, and at most 2 to the number.
+        # Without an authentic earlier list, this number is above all that were used: each signed
+        # list adds an entry to the ledger, and at most 2 to the number.
         lists = self._keystore.ledger_with("what", "crl").entries
         used = 2 * sum(entry.what == "crl" for entry in lists)
         number = max(old.number + 1 if old else used + 1, least)
         return sign_list(authority, kept, number=number, template=self._template, now=self._now)
 
     def _list_of_service(self, authority: Authority, serials: Set[int]) -> SignedList:
-        """Return the list of the CA service, after verifying it.
+        """Return the CA service's list, after verifying it.
 
         Raises:
-            KeystoreError: the list was not given, the identity CA did not sign it, it is not later
-                than the current list, is not valid now, or does not revoke all ``serials``.
+            KeystoreError: the list is missing, the identity CA did not sign it, it is not later
+                than the present list, it is not valid now, or it does not revoke all ``serials``.
         """
         numbers = ", ".join(sorted(f"{serial:x}" for serial in serials)) or "nothing"
         remedy = (
@@ -522,10 +527,11 @@ class RevocationListSigner:
         )
 
     def _lost_revocations(self, expiries: Mapping[int, str]) -> list[Revoked]:
-        """Return the revocations that the current list lacks.
+        """Return the revocations that the present list lacks.
 
-        If it is the last list, these are only those for which `unlisted_revocations` refuses an
-        export: it rightly lacks certificates of CAs that were replaced.
+        If the present list is the last one, these are only those because of which
+        `unlisted_revocations` refuses an export, because a list need not have certificates of
+        replaced CAs.
         """
         entries = self._keystore.ledger_file.with_values("what", ("revocation", "crl")).entries
         count = max(
@@ -562,9 +568,9 @@ class RevocationListSigner:
         incomplete: bool,
         least: int,
     ) -> SignedList | None:
-        """Sign the list of the second identity CA, and stage it in the file of the identity CAs.
+        """Sign the second identity CA's list, and stage it in the file of the identity CAs.
 
-        Return None if there is no second CA, or its list cannot be signed.
+        The result is None if there is no second CA, or its list cannot be signed.
         """
         rotation = read_rotation(self._keystore)
         file = self._keystore.identity_file
@@ -578,16 +584,16 @@ class RevocationListSigner:
         sha256 = replaced.new if coming else replaced.old
         (other,) = [candidate for candidate in certificates if digest(candidate) == sha256]
         if coming and crls_confusable(certificates[0], other):
-            return None  # in this case all processes have to be restarted together anyway
+            return None  # then all processes have to be restarted together anyway
         old = self._list_if_authentic(self._keystore.embedded_list(file))
         try:
             authority = self._open(other, replaced, is_coming=coming)
         except KeystoreError as error:
-            # The new CA has issued nothing yet; the next stage of the rotation signs its list.
+            # The new CA has not issued anything yet; the next stage of the rotation signs its list.
             if not coming:
                 self._handle_missing_key(other, error, new_entries, old, incomplete=incomplete)
             return None
-        # The next stage replaces the current list with this one, so its number must be higher.
+        # In the next stage, this list replaces the present one, so its number must be higher.
         if coming:
             least = max(least, (self.present.number if self.present else 0) + 2)
         signed = self._sign(authority, old, () if coming else new_entries, expiries, least)
@@ -600,7 +606,7 @@ class RevocationListSigner:
         self, certificate: x509.Certificate, replaced: Replacement, *, is_coming: bool
     ) -> Authority:
         place = replaced.key if is_coming else replaced.old_key_place(certificate)
-        # The places in the environment variables are for the key of the issuing CA.
+        # The environment variables name places for the key of the issuing CA, not of this one.
         keyring = replace(self._keyring, places={})
         key = keyring.open(self._keystore, IDENTITY, replace(self._template, identity_key=place))
         if not same_key(certificate, key):
@@ -624,7 +630,7 @@ class RevocationListSigner:
         """Add a remark that the old CA's list was not signed.
 
         Raises:
-            KeystoreError: there are new revocations, and ``incomplete`` is not set.
+            KeystoreError: there are new revocations, but ``incomplete`` is not set.
         """
         name = authority_text(old_ca)
         if new_entries and not incomplete:
@@ -649,7 +655,7 @@ class RevocationListSigner:
 
 
 def _link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
-    """Stage the link ``crl.pem`` to the revocation list for each enclave that lacks the link."""
+    """Stage the link ``crl.pem`` to the revocation list for each enclave without it."""
     root, is_first = transaction.root, not os.path.lexists(transaction.root / CRL)
     lacking = []
     for name in names:
@@ -657,7 +663,7 @@ def _link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
         path = f"{enclave_folder(name)}/{CRL_FILE}"
         if is_first and os.path.lexists(folder) and not os.path.lexists(f"{folder}/{CRL_FILE}"):
             lacking.append(name)
-        # Some ways to copy a keystore replace the link by a file, which would never be updated.
+        # Copying a keystore can replace the link by a file, which would never be updated.
         elif transaction.target_after(path) != link_to_list(name):
             transaction.link(path, link_to_list(name))
     if lacking:
@@ -667,7 +673,7 @@ def _link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
 def another_ca_remedy(keystore: OpenedKeystore, purpose: str) -> str:
     """Return the remedy, as a sentence, if DDS refuses the lists of the identity CA.
 
-    ``purpose`` is the command to repeat afterwards, such as ``revoke``.
+    ``purpose`` is the command to repeat afterwards, such as "revoke".
     """
     file = keystore.identity_file
     words = ["sros rotate_ca", quote(str(keystore.root))]

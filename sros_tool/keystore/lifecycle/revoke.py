@@ -1,4 +1,4 @@
-"""Revocation of enclaves: certificates go on the list, files to the folder ``revoked``."""
+"""Revocation of enclaves: certificates go on the list, and files to the folder ``revoked``."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ _FILES = (
 _PRIVATE = "key.pem"
 _SHOWN = 5
 REVOKED_AGAIN = "fleet.revocations-restored"
-"""The kind of note of `restored_note`."""
+"""The id of the note that `restored_note` returns."""
 REPLACED_AFTER_BACKUP = "fleet.replaced-after-backup"
-"""The kind of note on enclaves of which a restored keystore has only revoked certificates."""
+"""The id of a note on enclaves of which a restored keystore has only revoked certificates."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,13 +76,13 @@ def revoke(
 ) -> Revocation:
     """Revoke the certificates of enclaves and move their files to ``revoked`` in the keystore.
 
-    All certificates of an enclave that have not expired are revoked, as far as its folder, the
-    ledger or the folder ``revoked`` has them: an attacker with the key could use an earlier
-    certificate, too.  If the ledger may lack certificates, a remark says so.  The other enclaves
-    get ``crl.pem``, a link to the list.  During a rotation of the identity CA, both CAs sign a
-    list; if the key of the old CA is missing, ``until_retired`` accepts that Fast DDS trusts its
-    certificates until that CA is retired.  If a CA service is the identity CA, ``crl`` is the list
-    (PEM) that it signed.
+    All certificates of an enclave that have not expired are revoked, because an attacker with the
+    key could also use an earlier certificate.  They are found in the enclave's folder, the ledger
+    and the folder ``revoked``; if the ledger may lack certificates, a remark says so.  The other
+    enclaves get ``crl.pem``, a link to the list.  During a rotation of the identity CA, both CAs
+    sign a list; if the key of the old CA is missing, ``until_retired`` accepts that Fast DDS trusts
+    the old CA's certificates until this CA is retired.  If the identity CA is a CA service, ``crl``
+    is the list (PEM) that the service signed.
 
     Raises:
         KeystoreError: an enclave does not exist, the identity CA did not issue its certificate, the
@@ -135,12 +135,12 @@ def restore_revocations(
     """Revoke again all certificates on revocation lists that the keystore signed and lost.
 
     The next list has a higher number than the lost lists.  Enclaves that were revoked are moved to
-    ``revoked`` again, even if they were renewed since; enclaves of which only an earlier
-    certificate was replaced stay.  The key of a replaced certificate is revoked, too, unless a
+    ``revoked`` again, even if they were renewed since then.  Enclaves that only had an earlier
+    certificate replaced stay.  The key of a replaced certificate is revoked, too, unless a
     certificate that the ledger lacked has the same key.  Certificates that the ledger lacks are
-    recorded, so that they can be revoked; those of a revoked enclave are revoked at once.  The
-    ledger records that the keystore was restored, with a number that the ledger never had: the
-    seconds since 1970.
+    recorded, so that they can be revoked; those of a revoked enclave are revoked immediately.  The
+    ledger also records that the keystore was restored, with a number that it never had: the seconds
+    since 1970.
 
     Raises:
         KeystoreError: as `revoke`.
@@ -154,7 +154,7 @@ def restore_revocations(
             for entry in crl.revoked
             if entry.serial not in known
         }
-        # A CA service knows its certificates, also those of other sites.
+        # A CA service knows its certificates, including those of other sites.
         unknown = (
             {} if change.identity.service else forgotten_lists.unknown_certificates(change.keystore)
         )
@@ -172,7 +172,7 @@ def restore_revocations(
         }
         replaced_keys = _replaced_keys(issued, unknown, reasons)
         names = {enclave for enclave, _ in replaced_keys}
-        # A restored keystore may have certified them again since.
+        # A restored keystore may have certified these keys again since then.
         for entry in change.keystore.ledger_file.with_values("enclave", names).entries:
             is_known = entry.serial in reasons or int(entry.serial or "0", 16) in known
             if (entry.enclave, entry.key) in replaced_keys and not is_known:
@@ -184,7 +184,8 @@ def restore_revocations(
         done = {entry.serial for entry in revocations}
         for serial, reason in reasons.items():
             if serial not in done:
-                # Without the enclave, which may be there with another certificate.
+                # This entry names no enclave, because the enclave may have another certificate
+                # here.
                 entry = Entry(iso(change.now), "revocation", serial=serial, reason=reason)
                 of = issued.get(serial)
                 if of and (reason != SUPERSEDED or (of.enclave, of.key) in replaced_keys):
@@ -221,9 +222,9 @@ def restore_revocations(
 def _replaced_keys(
     issued: Mapping[str, Entry], unknown: Mapping[str, Entry], reasons: Mapping[str, str]
 ) -> set[tuple[str, str]]:
-    """Return enclave and key of each ``issued`` certificate that was replaced with its key.
+    """Return (enclave, key) of each ``issued`` certificate that was replaced together with its key.
 
-    ``unknown`` are certificates from after the backup; they are valid unless ``reasons`` has them.
+    ``unknown`` are certificates from after the backup, which are valid unless ``reasons`` has them.
     """
     kept = {(of.enclave, of.key) for serial, of in unknown.items() if serial not in reasons}
     replaced = {(of.enclave, of.key) for s, of in issued.items() if reasons[s] == SUPERSEDED}
@@ -233,10 +234,10 @@ def _replaced_keys(
 def _key_revoked_by_enclave(
     change: KeystoreChange, revoked: Container[int], keys: Container[str], removed: Container[str]
 ) -> dict[str, bool]:
-    """Map the other enclaves with a ``revoked`` certificate to whether their key is revoked."""
+    """Map other enclaves with a ``revoked`` certificate to whether their key is revoked, too."""
     replaced = {}
     for name in change.names:
-        with suppress(SrosError):  # of an enclave without a certificate
+        with suppress(SrosError):  # the enclave has no certificate
             certificate = change.keystore.certificate_of(name)
             if name not in removed and certificate.serial_number in revoked:
                 key = key_digest(certificate.public_key())  # type: ignore[arg-type]
@@ -261,7 +262,7 @@ def _replaced_notes(change: KeystoreChange, replaced: Mapping[str, bool]) -> Ite
 
 
 def _reasons_of_revoked(change: KeystoreChange, unknown: Mapping[str, Entry]) -> dict[str, str]:
-    """Map serial numbers of revoked enclaves' certificates to the reasons of the revocations."""
+    """Map the serial numbers of revoked enclaves' certificates to the reasons for revocation."""
     enclaves = {entry.enclave for entry in unknown.values()}
     reasons = {
         entry.enclave: entry.reason
@@ -277,7 +278,7 @@ def _reasons_of_revoked(change: KeystoreChange, unknown: Mapping[str, Entry]) ->
 
 
 def _unknown_note(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Note:
-    """Return a note on certificates that are recorded now, or would be."""
+    """Return a note on certificates that are recorded now, or would be without ``dry_run``."""
     would = "would be" if change.dry_run else "are"
     text = (
         f"the keystore issued {counted(len(unknown), 'certificate')} that its ledger lacks: it was "
@@ -314,9 +315,9 @@ def refresh_crl(
 ) -> Changed:
     """Sign the revocation list again, so that it is valid for longer.
 
-    Its entries are kept, except certificates that expired before the current list was signed.  If
-    a CA service is the identity CA, its new list ``crl`` (PEM) replaces the current list; else
-    ``crl`` is a list that a keystore from a backup has lost, whose entries are revoked again.
+    The entries are kept, except certificates that expired before the present list was signed.  If
+    the identity CA is a CA service, its new list ``crl`` (PEM) replaces the present list.
+    Otherwise, ``crl`` is a list that was lost with a keystore, whose entries are revoked again.
 
     Raises:
         KeystoreError: no identity CA of the keystore signed ``crl``; or as `revoke`.
@@ -334,7 +335,7 @@ def refresh_crl(
             )
         if forgotten.add(crl):
             return restore_revocations(root, forgotten, **options)
-        crl = b""  # the keystore has all of it
+        crl = b""  # the keystore already has everything on this list
     change = KeystoreChange(root, **options)
     change.crl = crl
     with change:
@@ -389,9 +390,9 @@ def _router_error(change: KeystoreChange, router: str) -> KeystoreError:
 
 
 def _move_to_revoked(change: KeystoreChange, name: str) -> Entry:
-    """Stage the move of an enclave's files to ``revoked``; return the entry of its certificate.
+    """Stage the move of an enclave's files to ``revoked``; return its certificate's entry.
 
-    A folder that has nothing else moves as a whole, unless others could open its key.
+    A folder with nothing else in it moves as a whole, unless other users could then read its key.
     """
     transaction, folder = change.transaction, enclave_folder(name)
     certificate = change.keystore.certificate_of(name)
@@ -419,7 +420,7 @@ def _move_to_revoked(change: KeystoreChange, name: str) -> Entry:
     for file in _FILES:
         path = f"{folder}/{file}"
         if name == "/" and file == "governance.p7s":
-            continue  # the governance of the keystore is in the folder of the enclave /
+            continue  # the folder of the enclave / has the governance of the keystore
         if file not in by_name:
             continue
         if file not in links:

@@ -1,8 +1,8 @@
 """The stages of a CA rotation, and the changes that each stage makes to a keystore.
 
-distribute: enclaves trust the new CA in addition to the old CA.  reissue: the new CA issues all
-certificates and signs all documents again.  retire: enclaves no longer trust the old CA.  Each
-stage is a transaction.
+In the stage ``distribute``, enclaves begin to trust the new CA in addition to the old one.  In
+``reissue``, the new CA issues all certificates and signs all documents again.  In ``retire``,
+enclaves stop trusting the old CA.  Each stage is a transaction.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ from sros_tool.validity import Span, Window, span_text, window
 from sros_tool.wording import first_few
 
 _SHOWN = 10
-"""Largest number of robots that an error names."""
+"""Maximum number of robots that an error names."""
 _ENCLAVES_SHOWN = 5
 
 
@@ -107,10 +107,10 @@ _ENCLAVES_SHOWN = 5
 class RotationStep(Changed):
     """The result of a rotation step.
 
-    ``stage`` is the stage of the keystore afterwards.  ``files`` are the stems of the CA files that
-    are replaced ("identity_ca", "permissions_ca" or "ca").  ``kept_elsewhere`` are the places of
-    old keys outside of the keystore, which sros never deletes.  ``cut_off`` are robots that have
-    not confirmed the previous stage, and can no longer communicate with the others.
+    ``stage`` is the stage of the keystore afterwards.  ``files`` are the names, without suffixes,
+    of the replaced CA files ("identity_ca", "permissions_ca" or "ca").  ``kept_elsewhere`` are the
+    places of old keys outside of the keystore, which sros never deletes.  ``cut_off`` are robots
+    that have not confirmed the previous stage, and can no longer communicate with the others.
     """
 
     stage: RotationStage
@@ -120,12 +120,12 @@ class RotationStep(Changed):
 
     @property
     def replaces_identity(self) -> bool:
-        """Whether the CA that issues the certificates of robots is replaced, the identity CA."""
+        """Whether the rotation replaces the identity CA, which issues the robots' certificates."""
         return any(file != "permissions_ca" for file in self.files)
 
     @property
     def replaces_seals(self) -> bool:
-        """Whether the CA that seals releases is replaced, the permissions CA."""
+        """Whether the rotation replaces the permissions CA, which seals releases."""
         return any(file != "identity_ca" for file in self.files)
 
 
@@ -147,17 +147,18 @@ def rotate_ca(
 
     If the keystore is already at the stage ``to``, nothing is changed.  ``roles`` ("identity",
     "permissions"; default: both) and the ``validity`` of the new CAs are only used when a rotation
-    begins.  ``new_keys`` names the places of new keys outside
-    of the keystore.  ``existing`` has the certificates (PEM) of CAs that exist already, by role:
-    their keys are at these places.  ``delete_old_key`` deletes old keys that are in the keystore.
-    In a keystore with a fleet, a stage that cuts off robots, because they have not confirmed the
-    previous stage, needs ``allow_unconfirmed``.
+    begins.  ``new_keys`` names the places of new keys outside of the keystore.  ``existing`` maps
+    roles to the certificates (PEM) of CAs that already exist, whose keys are at these places.
+    ``delete_old_key`` deletes old keys in the keystore.  In a keystore with a fleet, a stage that
+    cuts off robots, because they have not confirmed the previous stage, needs
+    ``allow_unconfirmed``.
 
     Raises:
         KeystoreError: a key is missing, an enclave cannot be moved to the new CA, robots would be
             cut off, or vendors would refuse enclaves that they accept today.
-        UsageError: the stage ``to`` is over, or is not the next stage, or has no old key that
-            ``delete_old_key`` could delete; or a rotation that goes on has ``existing`` CAs.
+        UsageError: the stage ``to`` is over, or is not the next stage; ``delete_old_key`` is set,
+            but this stage deletes no old key; or ``existing`` is given for a rotation that has
+            already begun.
     """
     change = KeystoreChange(root, **options)
     with change:
@@ -172,7 +173,7 @@ def rotate_ca(
         rotator = _Rotator(change, rotation, delete_old_key=delete_old_key)
         cut_off: tuple[str, ...] = ()
         if finish or stage not in (rotation.stage, RotationStage.NONE):
-            if rotation.stage is not RotationStage.REISSUE:  # the last stage signs nothing
+            if rotation.stage is not RotationStage.REISSUE:  # the last stage does not sign anything
                 _refuse_edited(change.keystore)
             cut_off = robots_cut_off(change.keystore, rotation, stage, change.now)
             if cut_off and not allow_unconfirmed:
@@ -208,8 +209,9 @@ def robots_cut_off(
 ) -> tuple[str, ...]:
     """Return the sorted names of the robots that the stage ``to`` would cut off from the others.
 
-    These are the robots that have not confirmed the previous stage (`FleetStatus.unconfirmed`), and
-    all robots if stages are left out.  Without a fleet, or by the first stage, no robot is cut off.
+    These are the robots that have not confirmed the previous stage (`FleetStatus.unconfirmed`); if
+    stages are left out, these are all robots.  Without a fleet, and in the first stage, no robot is
+    cut off.
 
     Raises:
         KeystoreError: the fleet file is not the file that sros wrote last.
@@ -217,19 +219,19 @@ def robots_cut_off(
     if to is RotationStage.DISTRIBUTE or checked_fleet(keystore) is None:
         return ()
     status = fleet_status(keystore).with_overdue(now)
-    if _leaves_out_stages(rotation, to):  # at which no robot ever was
+    if _leaves_out_stages(rotation, to):  # no robot was ever at the stage that is left out
         return tuple(robot.robot for robot in status.robots if robot.enclaves)
     return status.unconfirmed
 
 
 def _leaves_out_stages(rotation: Rotation, to: RotationStage) -> bool:
-    """Return whether a rotation goes to a stage that is not the next one."""
+    """Return whether the stage ``to`` is not the next stage of a rotation."""
     stages = list(RotationStage)
     return stages.index(to) - stages.index(rotation.stage) > 1
 
 
 def _no_robot_notes(keystore: OpenedKeystore, names: Iterable[str]) -> Iterator[Note]:
-    """Yield a note on enclaves without a robot in the fleet, whose state no confirmation shows."""
+    """Yield a note on enclaves without a robot, whose state no confirmation shows."""
     fleet = load_fleet(keystore)
     without = [name for name in names if robot_of(fleet, name) is None] if fleet else []
     if without:
@@ -242,7 +244,7 @@ def _no_robot_notes(keystore: OpenedKeystore, names: Iterable[str]) -> Iterator[
 
 
 def _refuse_late_deletion(keystore: OpenedKeystore, stage: RotationStage) -> None:
-    """Raise `UsageError` if the keystore is at ``stage`` already, and has old keys."""
+    """Raise `UsageError` if the keystore is already at ``stage``, and still has old keys."""
     kept = sorted(map(str, (keystore.root / RETIRED).glob("*.key.pem")))
     if stage is RotationStage.DISTRIBUTE or (kept and stage is not RotationStage.NONE):
         raise UsageError(
@@ -292,7 +294,7 @@ def _cut_off_error(
 def _refuse_edited(keystore: OpenedKeystore) -> None:
     """Raise `KeystoreError` if settings or governance were edited: signing would undo the edits."""
     root, governance = keystore.root, None
-    with suppress(SrosError):  # signing it again reports it
+    with suppress(SrosError):  # signing the governance again reports the error
         governance = keystore.governance
     if edits := found_edits(keystore, governance):
         raise KeystoreError(
@@ -303,7 +305,7 @@ def _refuse_edited(keystore: OpenedKeystore) -> None:
 
 
 def _was_replaced(keystore: OpenedKeystore) -> bool:
-    """Return whether the ledger records a CA that another CA replaced."""
+    """Return whether the ledger records that a CA was replaced by another one."""
     names = (keystore.certificates_of(f"{role}_ca") for role in ROLES)
     trusted = {
         subject_text(certificate.subject) for certificates in names for certificate in certificates
@@ -319,7 +321,7 @@ def _was_replaced(keystore: OpenedKeystore) -> bool:
 def _target_stage(
     keystore: OpenedKeystore, rotation: Rotation, to: RotationStage | None
 ) -> RotationStage:
-    """Return the stage to go to; NONE if the keystore is already there.
+    """Return the stage to which to go; NONE if the keystore is already there.
 
     Raises:
         UsageError: the stage ``to`` is over, or is not the next stage.
@@ -362,15 +364,16 @@ def renew_identity_ca(
 ) -> RotationStep:
     """Issue a new certificate for the identity CA, with the same name and key and a later expiry.
 
-    If a CA service is the identity CA, it has ``issued`` the certificate (PEM).
+    If the identity CA is a CA service, ``issued`` is the certificate (PEM) that the service issued.
 
     Nothing else changes: on Cyclone DDS 0.10.2 and Fast DDS 2.9.1 (tested), the certificates that
-    the CA issued have a valid chain to its old and to its new certificate.  A permissions CA cannot
-    be renewed this way: DDS accepts its documents only with the certificate that they embed.
+    the CA issued have valid chains both to its old certificate and to its new one.  A permissions
+    CA cannot be renewed in this way, because DDS accepts documents only with the CA certificate
+    that they embed.
 
     Raises:
         KeystoreError: the keystore has a single CA, a rotation is in progress, or the CA is not
-            self-signed, or its key is weak or missing, or ``issued`` is of another CA.
+            self-signed, its key is weak or missing, or ``issued`` belongs to another CA.
         UsageError: the new certificate would expire before the current one, or is missing.
     """
     change = KeystoreChange(root, **options)
@@ -422,7 +425,7 @@ def renew_identity_ca(
 def _renewed_by_service(
     change: KeystoreChange, old: x509.Certificate, issued: bytes
 ) -> ImportedAuthority:
-    """Return the later certificate that a CA service gave itself, with the same name and key."""
+    """Return a CA service's own new certificate: the same name and key, with later dates."""
     if not (issued and change.keyring.ca_service(change.root, IDENTITY, change.template)):
         raise UsageError(
             "only a CA service issues its own certificate",
@@ -442,10 +445,10 @@ def _renewed_by_service(
 
 
 class _Rotator:
-    """Writer of one rotation step.
+    """Carries out one rotation step.
 
-    ``replacements`` are the CAs that are replaced, ``kept_elsewhere`` the places of old keys
-    outside of the keystore.
+    ``replacements`` are the replaced CAs, ``kept_elsewhere`` the places of old keys outside of the
+    keystore.
     """
 
     def __init__(self, change: KeystoreChange, rotation: Rotation, *, delete_old_key: bool) -> None:
@@ -464,9 +467,9 @@ class _Rotator:
     ) -> RotationStage:
         """Stage all changes up to ``stage``; return the stage of the keystore afterwards.
 
-        If revocations require a revocation list of the new identity CA, and enclaves lack it, only
-        the list is distributed, and the stage stays DISTRIBUTE: as soon as a list exists, Fast DDS
-        2.9.1 refuses every enclave of a CA without a list (tested).
+        If there are revocations, and enclaves lack a revocation list of the new identity CA, only
+        this list is distributed, and the stage stays DISTRIBUTE.  The reason is that Fast DDS
+        2.9.1, once it has a list, refuses every enclave of a CA without a list (tested).
         """
         self._refuse_deletion(stage)  # before a key is made on a token
         if self._rotation.stage is RotationStage.REISSUE:
@@ -484,7 +487,8 @@ class _Rotator:
             entries = self._keystore.ledger_with("what", "ca").entries
             recorded = {entry.sha256 for entry in entries}
             for successor in successors:
-                if digest(successor.new.certificate) not in recorded:  # it was lost since
+                # The entry was lost since the CA was recorded.
+                if digest(successor.new.certificate) not in recorded:
                     self._record_authorities(successor)
             if stage is RotationStage.REISSUE and self._lacks_crl(successors):
                 stage = RotationStage.DISTRIBUTE
@@ -496,7 +500,7 @@ class _Rotator:
         return stage
 
     def _refuse_deletion(self, stage: RotationStage) -> None:
-        """Raise `UsageError` if sros is asked to delete an old key that it does not delete."""
+        """Raise `UsageError` if asked to delete an old key that sros does not delete."""
         if self._delete and stage is RotationStage.DISTRIBUTE:
             raise UsageError(
                 "the stage distribute deletes no key",
@@ -520,10 +524,10 @@ class _Rotator:
         is_here: bool,
         elsewhere: str,
     ) -> None:
-        """Add a note on where the old key of a CA is after ``stage``, and until when to keep it.
+        """Add a note on where the old key of a CA is after ``stage``, and how long to keep it.
 
-        ``is_here`` says whether the keystore has it; ``elsewhere`` is its place outside, or "".  A
-        key that was lost is noted only while revocations need it.
+        ``is_here`` says whether the key is in the keystore; ``elsewhere`` is its place outside, or
+        "".  A lost key is noted only while revocations need it.
         """
         revokes = stage is RotationStage.REISSUE and IDENTITY in roles
         key, place = f"the old key of the {_ca_name(roles)}", f"{self._root}/{retired_key(old)}"
@@ -578,7 +582,7 @@ class _Rotator:
         self._change.entries.append(certificate_entry(now, "ca", successor.new.certificate))
 
     def _note_earlier_expiry(self, old: x509.Certificate, new: x509.Certificate) -> None:
-        """Add a note if the settings make a new CA expire before the old CA.
+        """Add a note if a new CA expires before the old CA because of the settings.
 
         Raises:
             UsageError: a new CA would expire earlier, and the keystore has no settings that choose
@@ -593,7 +597,7 @@ class _Rotator:
                 f"{span_text(self._template.authority_validity)}. --ca-validity chooses "
                 "another validity."
             )
-            # Both CAs usually have the same dates, and one note is enough then.
+            # Both CAs usually have the same dates, and then one note is enough.
             note = Note("keystore.ca-expires-earlier", text)
             if note not in self._change.notes:
                 self._change.notes.append(note)
@@ -617,9 +621,9 @@ class _Rotator:
         return signed.document
 
     def _lacks_crl(self, successors: list[_Successor]) -> bool:
-        """Return whether the distributed identity CA needs a revocation list and has none.
+        """Return whether the distributed identity CA needs a revocation list, but has none.
 
-        This happens if the first revocation was during the stage DISTRIBUTE.
+        This is the case if the first revocation was during the stage DISTRIBUTE.
         """
         return (self._root / CRL).exists() and any(
             self._takes_crl(successor) and not self._keystore.embedded_list(successor.file)
@@ -627,7 +631,7 @@ class _Rotator:
         )
 
     def _takes_crl(self, successor: _Successor) -> bool:
-        """Return whether a new CA's revocation list can be distributed with the CA."""
+        """Return whether a new CA's revocation list can be distributed together with the CA."""
         return IDENTITY in successor.roles and not crls_confusable(
             successor.old[0], successor.new.certificate
         )
@@ -671,8 +675,8 @@ class _Rotator:
     ) -> None:
         """Stage the certificates, governance and permissions that the new CAs issue.
 
-        Keys, subjects and rights do not change, nor do certificates and documents of a CA that is
-        not replaced, so its key is not needed.
+        Keys, subjects and rights do not change.  If one CA is not replaced, its certificates or
+        documents do not change either, so its key is not needed.
         """
         if permissions:
             self._sign_governance(permissions)
@@ -720,7 +724,7 @@ class _Rotator:
                 continue
             signed = self._keystore.files.signed(self._keystore.read(file, "governance document"))
             signed.verify(permissions.old[0])
-            parse_governance(signed.document)  # raises if it is malformed
+            parse_governance(signed.document)  # raises an error if the governance is malformed
             message = permissions.new.sign(signed.document, "the governance document")
             self._transaction.write(path, message)
             self._change.entries.append(document_entry(self._change.now, "governance", message))
@@ -763,9 +767,9 @@ class _Rotator:
         self._transaction.write(f"{RETIRED}/{old.serial_number:x}.cert.pem", pem(old))
 
     def _install_key(self, successor: _Successor, stage: RotationStage) -> str:
-        """Stage the move of the old key to ``retired``, and of the new key to the old key's place.
+        """Stage the moves of the old key to ``retired``, and of the new key to the old key's place.
 
-        Return the place of the old key if it is outside of the keystore, else "".
+        Returns the place of the old key if it is outside of the keystore, else "".
         """
         transaction, root, roles = self._transaction, self._root, successor.roles
         place = f"{PRIVATE}/{successor.file}.key.pem"
@@ -814,7 +818,7 @@ def _issuance(
     identity: _Successor | None,
     permissions: _Successor | None,
 ) -> Issuance | None:
-    """Return the `Issuance` of the new CAs for an enclave; None if it has no certificate yet.
+    """Return what the new CAs issue for an enclave; None if it has no certificate yet.
 
     Raises:
         KeystoreError: the old CA did not issue the certificate or sign the permissions, or the
@@ -824,7 +828,7 @@ def _issuance(
     folder = enclave_path(root, name)
     path = folder / CERTIFICATE_FILE
     if not path.exists():
-        return None  # the new CA issues its first certificate
+        return None  # the new CA will issue the enclave's first certificate
     kept = change.keystore.certificate(path)
     certificate: NewIdentity | x509.Certificate = kept
     if identity:
@@ -867,11 +871,11 @@ def _verified_rights(
 
 @dataclass(frozen=True, slots=True)
 class _Successor:
-    """A new CA, and the certificates of the CA that it replaces.
+    """A new CA, with the certificates of the CA that it replaces.
 
-    ``file`` is the stem of the CA file.  ``old`` is the certificate of the old CA, followed by the
-    other certificates in that file.  ``key`` is the place of the new key: a URI, or a path in the
-    keystore.
+    ``file`` is the name of the CA file without suffixes.  ``old`` is the certificate of the old CA,
+    followed by the other certificates in the file.  ``key`` is the place of the new key: a URI, or
+    a path in the keystore.
     """
 
     file: str
@@ -887,7 +891,7 @@ class _Successor:
 
 @dataclass(frozen=True, slots=True)
 class _WantedAuthorities:
-    """The CAs with which a rotation begins, as for `rotate_ca`."""
+    """The arguments of `rotate_ca` about the CAs with which a rotation begins."""
 
     roles: Sequence[str]
     new_keys: Keyring
@@ -900,8 +904,8 @@ def _make_successors(
 ) -> list[_Successor]:
     """Create the wanted CAs, and stage their keys.
 
-    With ``next_to``, new keys in the keystore get file names next to the current keys; otherwise
-    they replace the current keys.
+    With ``next_to``, new keys in the keystore are written next to the present keys; otherwise, they
+    replace the present keys.
     """
     template, new_keys = change.template, authorities.new_keys
     files = change.keystore.authority_files
@@ -963,7 +967,8 @@ def _make_successor(
     elsewhere = replace(template, identity_key="", permissions_key="")
     given = new_keys.is_encrypted(change.keystore, roles[0], elsewhere) if place else None
     if encrypted and given is None and not (new_keys.encrypt or is_token_uri(place)):
-        change.keyring.open(change.keystore, roles[0], template)  # refuses a mistyped passphrase
+        # A mistyped passphrase is refused now.
+        change.keyring.open(change.keystore, roles[0], template)
         new_keys = replace(new_keys, encrypt=True, secrets=change.keyring.secrets)
     key = new_keys.make(transaction, at, roles[0], elsewhere, compared=True)
     if same_key(old[0], key):
@@ -985,7 +990,7 @@ def _make_successor(
     name = old[0].subject
     if PERMISSIONS not in roles:
         name = common_name(f"{template.authority_name} identity CA {secrets.token_hex(4)}")
-    # Robots tell by the dates which CA replaced which: see `retired_authorities`.
+    # The dates tell robots which CA replaced which (`retired_authorities`).
     first = validity_of(old[0]).not_before
     if existing := next((wanted.existing[r] for r in roles if r in wanted.existing), b""):
         certificate = _existing_ca(change, roles, existing, key, name)
