@@ -653,7 +653,7 @@ def _missing_enclaves_clauses(requirement: Requirement, world: World) -> Iterato
         if pattern[0] == EXCEPT and is_expression(name):
             continue  # an exception for enclaves that do not exist yet
         if not fnmatch.filter(world.enclaves, name):
-            yield f"there is no enclave {pattern}{_meant(name, {*world.enclaves}.__contains__)}"
+            yield f"there is no enclave {pattern}{_meant(name, [frozenset(world.enclaves)])}"
 
 
 def _unused_names(
@@ -669,8 +669,8 @@ def _unused_names(
     for right, name, parts in _restricted_names(requirement):
         verb = "use" if isinstance(requirement, Nobody | Protected) else right
         named = _named_right(right, name)
-        stated = partial(_is_stated, [*_sides(world, right)])
-        known = is_expression(name) or stated(name)
+        stated = [world.stated_names(part.begin, part.end) for part in _parts_of(right)]
+        known = is_expression(name) or any(name in names for names in stated)
         meant = "" if known else _meant(name, stated)
         if not _is_used_by_anybody(world, parts, name, limit):
             other = _OF_OTHER_KIND.get(right, "")
@@ -707,20 +707,9 @@ def _restricted_names(requirement: Requirement) -> Iterator[tuple[str, str, tupl
         yield from ((right, name, parts) for name in names)
 
 
-def _sides(world: World, right: str) -> Iterator[tuple[str, str, Container[str]]]:
-    """Yield the text before and after a name in each topic of a right, and the stated topics."""
-    for part in _parts_of(right):
-        for writes in (True, False):
-            yield part.begin, part.end, world.side(writes).exact
-
-
-def _is_stated(sides: Iterable[tuple[str, str, Container[str]]], name: str) -> bool:
-    return any(f"{begin}{name}{end}" in exact for begin, end, exact in sides)
-
-
-def _meant(name: str, stated: Callable[[str], bool]) -> str:
+def _meant(name: str, stated: Iterable[frozenset[str]]) -> str:
     """Return a clause with a stated name that differs by one slip, or ""."""
-    similar = shortest(filter(stated, _with_one_slip(name)))
+    similar = shortest(one for names in stated for one in names.intersection(_with_one_slip(name)))
     return f" (perhaps {similar} is meant)" if similar else ""
 
 

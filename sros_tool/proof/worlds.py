@@ -344,6 +344,7 @@ class World:
         self._writers_of: dict[str, list[str]] = {}
         self._shared: dict[tuple[str, str], str | None] = {}
         self._written: dict[str, Written] = {}
+        self._stated_names: dict[tuple[str, str], frozenset[str]] = {}
 
     def _with_fitting(self, name: str, access: Mapping[str, TopicAccess]) -> TopicAccess:
         accesses = [
@@ -433,6 +434,17 @@ class World:
             name_set.example(limit, longest=self.longest) for name_set in (*sets[1:], names)
         )
         return next(filter(None, (*stated, *examples)), None)
+
+    def stated_names(self, begin: str, end: str) -> frozenset[str]:
+        """Return the names in the topics that rights state with this text before and after it."""
+        if (begin, end) not in self._stated_names:
+            self._stated_names[begin, end] = frozenset(
+                topic[len(begin) : len(topic) - len(end)]
+                for side in (self._writers, self._readers)
+                for topic in side.exact
+                if topic.startswith(begin) and topic.endswith(end)
+            )
+        return self._stated_names[begin, end]
 
     def use(self, topic_user: TopicUser, topics: Topics, limit: SearchLimit) -> str | None:
         """Return the best example of ``topics`` that an enclave may use, or None."""
