@@ -168,7 +168,7 @@ def _init(
     if not authorities and not trusts_any(folder):
         raise UsageError(
             f"'{folder}' has no permissions CA, so this robot could trust no release",
-            "No enclave is there that was delivered.",
+            "No delivered enclave is there.",
             "Bring the enclaves of this robot first, with `sros distribute_key` or an Ansible "
             "play; or, if their keys were made here by `sros create_request`, name the CA with "
             "--ca.",

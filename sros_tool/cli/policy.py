@@ -175,7 +175,7 @@ def merge_policy(
 
 _MOST_ADDED = 20
 _MOST_OF_ENCLAVE = 2
-"""A merge lists up to so many rights; if there are more, so many of each enclave."""
+"""The most rights that a merge lists; if there are more, the most of each enclave."""
 
 
 def _print_added(merged: Merged) -> None:

@@ -126,7 +126,7 @@ def _check_folder(robot: LocalRobot) -> None:
 
 
 def _ignore_in_git(robot: LocalRobot) -> list[FileChange]:
-    """Write which files of the folder are not for git, unless something says it already."""
+    """Write a .gitignore for files that are not for git, unless the folder has a .gitignore."""
     file = robot.folder / ".gitignore"
     if os.path.lexists(file):
         return []

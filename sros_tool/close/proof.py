@@ -170,7 +170,7 @@ def _unsigned_policy_text(robot: LocalRobot) -> str:
         return ""
     remedy = f"`{robot.close_command}` checks and signs it"
     if not robot.keystore.exists():
-        remedy = "bring the policy here that was signed, or sign this one where the keystore is"
+        remedy = "bring the signed policy here, or sign this policy where the keystore is"
     return (
         f"; '{robot.policy}' differs from the signed permissions of "
         f"{first_few(changed, MOST_NAMES)}, which the processes use: {remedy}"

@@ -43,7 +43,7 @@ from sros_tool.values import DryRun, FileChanges, Words, shows
 from sros_tool.wording import first_few
 
 _LONGEST_PATH = 300
-"""Number of characters of a path that another process chose, in texts."""
+"""Most characters that a text shows of a path that another process chose."""
 
 _LOOK_SECONDS = 0.2
 """How often processes are looked at until they are as they should be."""
@@ -371,7 +371,7 @@ class CloseState(NamedTuple):
         return dict(sorted(due, key=lambda entry: all(map(self._may_be_last, entry[1]))))
 
     def _may_be_last(self, process: ClosedProcess) -> bool:
-        """Return whether others with a new key or new rights are to be restarted before."""
+        """Return whether processes with a new key or new rights are to be restarted first."""
         why = self.outdated.get(process.enclave, "")
         return why.endswith(_ACCEPTS_REVOKED) and process.enclave != ROUTER
 

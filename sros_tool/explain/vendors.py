@@ -352,7 +352,7 @@ def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[N
 
 
 def _note_on_fitting_permissions(evaluator: Evaluator, answer: Answer) -> Iterator[Note]:
-    """Yield a note if a denied enclave could use another enclave's permissions, which allow it."""
+    """Yield a note if permissions of another enclave fit a denied enclave, and allow the access."""
     if answer.allowed or not answer.question.right:
         return
     holders = [
@@ -702,7 +702,7 @@ class VendorOfKeystore(NamedTuple):
         return tuple(o for o in self._with_holders(outcomes) if o.enclave in asked)
 
     def _with_holders(self, outcomes: Sequence[VendorOutcome]) -> tuple[VendorOutcome, ...]:
-        """Return the outcomes; denied ones name the allowed enclaves whose permissions also fit."""
+        """Return the outcomes; denials name allowed enclaves whose permissions also fit."""
         certified = {o.enclave: o.subject for o in outcomes if o.subject and not o.allowed}
         granted = {o.enclave: [o.granted] for o in outcomes if o.granted}
         vendors = {self.vendor, *(self.stated(o.enclave) or self.vendor for o in outcomes)}

@@ -78,7 +78,7 @@ class EnclaveOutcome(Protocol):
 
     @property
     def by_permissions_of(self) -> Sequence[str]:
-        """The other enclaves whose permissions fit this enclave's certificate and allow it."""
+        """Other enclaves whose permissions fit this enclave's certificate, and allow the access."""
 
 
 _Outcome = TypeVar("_Outcome", bound=EnclaveOutcome)
