@@ -348,7 +348,7 @@ _Walked: TypeAlias = tuple[str, list[str]]
 
 
 def _names_in(top: str, folders: Iterable[_Walked]) -> tuple[str, ...]:
-    """Return the sorted names of the enclaves among folders below ``top``, the folder of enclaves."""
+    """Return the sorted names of the enclaves among folders below ``top``, their common folder."""
     return tuple(
         sorted(
             folder[len(top) :].replace(os.sep, "/") or "/"
