@@ -396,6 +396,21 @@ class KnownKeys:
                         enclaves.add(common_name_of(certificate.subject))
         return enclaves.intersection(names)
 
+    def shown_after_restore(self, names: Collection[str]) -> Sequence[Entry]:
+        """Return the certificates of enclaves that the keystore issued after its last backup.
+
+        Messages of robots or published releases showed them to the restored keystore.
+        """
+        restored = self._keystore.ledger_with("what", RESTORED).entries
+        times = {entry.time for entry in restored if entry.what == RESTORED}
+        return [
+            entry
+            for entry in self._keystore.ledger_file.with_values("enclave", names).entries
+            if entry.what == "certificate"
+            and entry.enclave in names
+            and (entry.reason == REPORTED or entry.time in times)
+        ]
+
     def missing_key_notes(self) -> Iterator[Note]:
         """Yield a note if the ledger may lack keys that were revoked."""
         if gaps := self._keystore.ledger_with("what", "revocation").gaps:

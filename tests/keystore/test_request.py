@@ -25,10 +25,13 @@ from sros_tool.keystore.delivery.robot import create_request, import_answer
 from sros_tool.keystore.delivery.signing import Signed, certify_requests, sign_request
 from sros_tool.keystore.describe import history
 from sros_tool.keystore.issuing.keyring import Keyring
+from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import SEAL, list_enclaves
+from sros_tool.keystore.ledger import REPORTED, certificate_entry
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, create_permission
 from sros_tool.keystore.lifecycle.renew import renew
-from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
+from sros_tool.keystore.lifecycle.revocation_list import Forgotten
+from sros_tool.keystore.lifecycle.revoke import refresh_crl, restore_revocations, revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
@@ -292,6 +295,34 @@ def test_a_revoked_enclave_comes_back_only_if_it_is_named(
     assert snapshot(home) == before
     signed = sign_request(home, request, now=NOW, only_enclaves=[NAME])
     assert "keystore.revoked-before" in {each.id for each in signed.notes}
+
+
+def test_a_restored_keystore_revokes_only_the_earlier_key_of_new_hardware(
+    home: Path, tmp_path: Path
+) -> None:
+    """A message of the robot showed the certificate that was issued after the backup."""
+    backup = copy_of(home, tmp_path / "backup")
+    earlier = OpenedKeystore(home).certificate_of("/base")
+    revoke(home, ["/base"], now=NOW)
+    request = create_request(tmp_path / "new", "/base").file.read_bytes()
+    sign_request(home, request, now=NOW, only_enclaves=["/base"])
+    later = OpenedKeystore(home).certificate_of("/base")
+    with pytest.raises(KeystoreError, match="has another key"):
+        sign_request(backup, request, now=NOW, renew=True)
+    forgotten = Forgotten(OpenedKeystore(backup), NOW)
+    assert forgotten.add_certificate(later, REPORTED)
+    restore_revocations(backup, forgotten, now=NOW)
+
+    done = revoke(copy_of(backup, tmp_path / "revoked"), ["/base"], now=NOW)
+    assert "revoke.later-keys" in {note.id for note in done.notes}
+    with pytest.raises(KeystoreError, match="add --renew"):
+        sign_request(backup, request, now=NOW)
+    sign_request(backup, request, now=NOW, renew=True)
+    assert not (backup / "enclaves/base/key.pem").exists()
+    renew(backup, ["/base"], now=LATER, revoke_old=True)
+    known = KnownKeys(OpenedKeystore(backup))
+    keys = [certificate_entry(NOW, "certificate", each).key for each in (earlier, later)]
+    assert [known.is_revoked(key) for key in keys] == [True, False]
 
 
 def other_subject(

@@ -378,12 +378,12 @@ class _Signer:
         change, root, name = self._change, self._root, request.name
         known, authority = change.known, change.permissions.certificate
         stated = self._stated_rights[name].enclave
-        _check_name(change.keystore, request, renew)
+        _check_name(change.keystore, known, request, renew)
         if stated is not None:
             refuse_less_protected(change.keystore, change.governance, stated_protections([stated]))
         present = change.keystore.certificate_of(name) if renew else None
         _check_key(request, known, present)
-        if not (self._replace_keys and self._keep_only_key_of(request)):
+        if not self._keep_only_key_of(request):
             _check_same_key(change.keystore, request, present)
         if not renew and not named and known.revoked_before([name]):
             raise KeystoreError(
@@ -423,7 +423,8 @@ class _Signer:
     def _keep_only_key_of(self, request: SigningRequest) -> bool:
         """Remove the enclave's private key in the keystore unless it is the key of the request.
 
-        Returns whether the keystore had a key file.
+        This needs ``replace_keys``, or a keystore from a backup that certified the key of the
+        request since.  Returns whether the keystore had a key file that fits or is removed.
         """
         keystore, name = self._change.keystore, request.name
         path = keystore.folder(name) / KEY_FILE
@@ -431,6 +432,8 @@ class _Signer:
             return False
         key = load_key(keystore.read(path, "private key"), f"'{path}'")
         if key.public_key() != request.public_key:
+            if not (self._replace_keys or _is_shown(self._change.known, request)):
+                return False
             self._change.transaction.remove(f"{enclave_folder(name)}/{KEY_FILE}")
             text = (
                 f"{name}: its new key was made on the robot and stays there; its earlier key was "
@@ -496,13 +499,21 @@ def _check_free(answer: Path, force: bool) -> None:
         )
 
 
-def _check_name(keystore: OpenedKeystore, request: SigningRequest, renew: bool) -> None:
+def _is_shown(known: KnownKeys, request: SigningRequest) -> bool:
+    """Return whether a restored keystore certified the key of a request after its last backup."""
+    key = key_digest(request.public_key)
+    return any(entry.key == key for entry in known.shown_after_restore([request.name]))
+
+
+def _check_name(
+    keystore: OpenedKeystore, known: KnownKeys, request: SigningRequest, renew: bool
+) -> None:
     name = request.name
     exists = keystore.has_enclave(name)
     if exists and not renew:
         intended = (
             "add --renew"
-            if _is_certified(keystore, request)
+            if _is_certified(keystore, request) or _is_shown(known, request)
             else f"for example because the robot has new hardware, first {_revoke(keystore, name)}"
         )
         raise KeystoreError(

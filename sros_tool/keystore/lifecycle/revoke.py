@@ -111,8 +111,10 @@ def revoke(
         recipients = lists.recipients()
         everybody = change.names if recipients is None else recipients
         change.restart = tuple(name for name in everybody if name not in gone)
+        revocations = lists.revocations(last, reason)
+        change.notes += _later_keys_notes(change, last, {entry.serial for entry in revocations})
         next_update, change.entries = lists.sign(
-            lists.revocations(last, reason), change.restart, incomplete=until_retired
+            revocations, change.restart, incomplete=until_retired
         )
         change.remarks += lists.remarks
         _drop_routers(change, gone)
@@ -125,6 +127,26 @@ def revoke(
         next_update=next_update,
         reason=reason,
     )
+
+
+def _later_keys_notes(
+    change: KeystoreChange, last: Mapping[str, Entry], revoked: Container[str]
+) -> Iterator[Note]:
+    """Yield a note on revoked keys that a restored keystore certified after its last backup."""
+    names = {
+        entry.enclave
+        for entry in change.known.shown_after_restore(last)
+        if entry.serial in revoked and entry.key != last[entry.enclave].key
+    }
+    if names:
+        would = "would be" if change.dry_run else "are"
+        yield Note(
+            "revoke.later-keys",
+            f"the keystore was restored from a backup, and knows later keys of "
+            f"{first_few(sorted(names), _SHOWN)} only since, such as those of new hardware. They "
+            f"{would} revoked, too, and are not certified again: create new keys on the robot. "
+            "docs/howto/keystore_is_lost.md says how to revoke only the earlier keys.",
+        )
 
 
 def restore_revocations(
