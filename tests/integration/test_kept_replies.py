@@ -13,7 +13,7 @@ import pytest
 from sros_tool.pki import smime
 from sros_tool.pki.keys import load_key
 from tests.integration.kept import replies
-from tests.integration.kept.forms import form_of
+from tests.integration.kept.forms import form_of, form_of_text
 from tests.integration.kept.replies import AGAIN, answered
 from tests.support.harness import certificate, copy_of, policy_text, publish, sros
 from tests.support.long_form import drawn
@@ -42,9 +42,14 @@ def test_what_is_made_alike_has_one_form(
     first: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     made = [make(tmp_path_factory.mktemp("made") / "ks", BOTH) for _ in range(3)]
-    # The random part of a CA's name consists of digits alone in one of 43 keystores.
+    # The random part of an enclave's subject consists of digits alone in one of 900 keystores.
     assert len({form(each) for each in (first, *made)}) < 3
     assert "BEGIN CERTIFICATE" in form(first)
+
+
+def test_the_random_part_of_the_name_of_a_ca_may_be_digits_alone() -> None:
+    forms = {form_of_text(f"CN=sros identity CA {part}", NOW) for part in ("12345678", "1234abcd")}
+    assert len(forms) == 1
 
 
 def edit(name: str, old: bytes, new: bytes) -> Callable[[Path], object]:

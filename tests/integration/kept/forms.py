@@ -40,7 +40,7 @@ FILES = (
 _BASE64 = re.compile(rb"(?:^[A-Za-z0-9+/]{4,76}\r?\n)*^[A-Za-z0-9+/]{2,76}={0,2}\r?\n", re.M)
 _DATE = re.compile(r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d):(\d\d)")
 _RANDOM = re.compile(
-    r"(?<![0-9A-Za-z])(?=[0-9]*[a-fA-F])(?:[0-9a-f]{8,}|[0-9A-F]{8,})(?![0-9A-Za-z])"
+    r"(?<![0-9A-Za-z])(?:(?<= CA )|(?=[0-9]*[a-fA-F]))(?:[0-9a-f]{8,}|[0-9A-F]{8,})(?![0-9A-Za-z])"
 )
 _BOUNDARY = re.compile(rb'boundary="([^"\r\n]+)"')
 _QUARTER = 900
