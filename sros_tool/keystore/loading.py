@@ -1,7 +1,7 @@
 """Reasons why a DDS vendor refuses to load an enclave or a CA.
 
-Vendors differ by the traits in `sros_tool.dds.decision.vendors`.  `sros_tool.keystore.reader` finds
-the faults that all vendors refuse; they are not checked here again.
+Vendors differ by the traits in `sros_tool.dds.decision.vendors`.  Faults that all vendors refuse
+are found by `sros_tool.keystore.reader`, and not checked here again.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ _VENDOR_SPECIFIC = frozenset(
         *_OF_LISTS.values(),
     }
 )
-"""Faults of `OpenedEnclave` for which only some vendors refuse an enclave."""
+"""Faults in an `OpenedEnclave` for which only some vendors refuse the enclave."""
 _UNREADABLE = (Fault.NOT_SIGNED, Fault.CERTIFICATE_MALFORMED)
 CRASHES = (Fault.CA_CRASH, Fault.CERTIFICATE_CRASH)
 """Faults that crash a process."""
@@ -93,9 +93,9 @@ _ON_READING = (
     Fault.CRL_MALFORMED,
     *CRASHES,
 )
-"""Faults that a process meets before it verifies a chain."""
+"""Faults that a process finds before it verifies a chain."""
 _OF_CA = (Fault.SIGNATURE_HASH, Fault.CA_CHAIN)
-"""Faults in the file of a CA that a process meets together with ``_ON_READING``."""
+"""Faults in the file of a CA that a process finds together with ``_ON_READING``."""
 
 
 def leaves_open(problems: Iterable[Problem]) -> bool:
@@ -115,15 +115,15 @@ def vendor_problems(
 ) -> tuple[Problem, ...]:
     """Return the problems for which a vendor refuses to load an enclave at the time ``moment``.
 
-    They are in the order in which a process meets them.  Only signature and size of governance and
-    permissions are checked here; problems in their content are taken from ``state``.
+    The problems are in the order in which a process finds them.  Of governance and permissions,
+    only signature and size are checked here; problems in their content are taken from ``state``.
     """
     specific = [problem for problem in state.problems if _is_vendor_specific(problem, state)]
     kept = [problem for problem in state.problems if problem not in specific]
     if state.token and not traits.reads_tokens:
         text = f"{traits.title} does not read it, and there is no {KEY_FILE}"
         kept.append(Problem(KEY_URI_FILE, text, Fault.KEY_ON_TOKEN))
-    # Files that every vendor refuses already: do not report a second problem.
+    # In files that every vendor refuses anyway, no second problem is reported.
     known = {
         problem.file
         for problem in kept
@@ -142,7 +142,7 @@ def vendor_problems(
     for side in _SIDES:
         of_side = [fault for fault in faults if fault.file in side]
         files = {problem.file for problem in of_side}
-        if files & {*side[:2]}:  # a CA that is at fault is so for the first file that needs it
+        if files & {*side[:2]}:  # a fault of a CA counts for the first file that needs the CA
             files.add(side[0])
         if of_side and of_side[0].fault in CRASHES:
             kept.append(of_side[0])
@@ -155,7 +155,7 @@ def vendor_problems(
 
 
 def _check_order(problem: Problem) -> int:
-    """Return the sort key of a problem: the order in which a process notices problems."""
+    """Return the sort key of a problem, by the order in which a process finds problems."""
     if problem.fault in BEFORE_DDS:
         return 0
     early = (*_ON_READING, *_OF_CA) if problem.file == IDENTITY_CA_FILE else _ON_READING
@@ -185,8 +185,8 @@ def _is_vendor_specific(problem: Problem, state: OpenedEnclave) -> bool:
 class _Trust(NamedTuple):
     """The CA files of a keystore, as a vendor reads them.
 
-    ``authorities`` and ``signers`` are the certificates of the identity CA's and the permissions
-    CA's file, in order; empty if the file cannot be read.
+    ``authorities`` are the certificates in the file of the identity CA, and ``signers`` those in
+    the file of the permissions CA, in order; empty if the file cannot be read.
     """
 
     authorities: Certificates
@@ -195,7 +195,7 @@ class _Trust(NamedTuple):
     refused: tuple[Problem, ...]
 
 
-@lru_cache(maxsize=16)  # of some keystores, for all vendors
+@lru_cache(maxsize=16)  # for a few keystores and all vendors
 def _trust(
     traits: VendorTraits,
     identity_ca: bytes | None,
@@ -253,12 +253,12 @@ def _faults(traits: VendorTraits, state: OpenedEnclave, moment: datetime) -> Ite
 
 
 def _content(traits: VendorTraits, data: bytes) -> bytes:
-    """Return the part of a file with certificates or lists that the vendor reads."""
+    """Return the part that a vendor reads of a file with certificates or lists."""
     return read_as_text(data) if traits.reads_files_as_text else data
 
 
 def _certificates(traits: VendorTraits, data: bytes, file: str) -> Certificates:
-    """Return the certificates that the vendor reads from a file.
+    """Return the certificates that a vendor reads from a file.
 
     Raises:
         PkiError: the vendor cannot read the file.
@@ -277,7 +277,7 @@ def _certificates(traits: VendorTraits, data: bytes, file: str) -> Certificates:
 def _signature_problems(
     traits: VendorTraits, file: str, state: OpenedEnclave, signers: Certificates, moment: datetime
 ) -> Iterator[Problem]:
-    """Yield the reason for which the vendor refuses the signature of a document, if it does."""
+    """Yield the problem for which a vendor refuses the signature of a document, if there is one."""
     if file not in state.files or not signers:
         return
     try:
@@ -291,7 +291,7 @@ def _signature_problems(
 def _authority_fault(
     traits: VendorTraits, certificates: Certificates, moment: datetime
 ) -> tuple[str, Fault] | None:
-    """Return why the vendor refuses a CA file (clause, fault); None if it accepts the file.
+    """Return why a vendor refuses a CA file, as a clause and a fault; None if the file is accepted.
 
     ``certificates`` are all certificates of the file, in order.
     """
@@ -314,7 +314,7 @@ def authority_refusals(
 ) -> dict[Vendor, str]:
     """Map each tested vendor that refuses the certificates or documents of a CA to the reason.
 
-    ``certificates`` are all certificates of the CA file, the issuing CA first.
+    ``certificates`` are all certificates of the CA file, with the issuing CA first.
     """
     refusals = {}
     for vendor in TESTED:
@@ -340,7 +340,7 @@ def authority_refusals(
 
 
 def refusals_text(refusals: Mapping[Vendor, str]) -> str:
-    """Return clauses on the vendors that refuse a CA, with reasons, and on the other vendors."""
+    """Return clauses on the vendors that refuse a CA, with reasons, and on the others."""
     by_text: dict[str, list[str]] = {}
     for vendor, text in refusals.items():
         by_text.setdefault(text, []).append(vendor.title)
@@ -361,9 +361,9 @@ def refusals_text(refusals: Mapping[Vendor, str]) -> str:
 def _signer_fault(
     traits: VendorTraits, signed: smime.SignedDocument, certificates: Certificates, moment: datetime
 ) -> str:
-    """Return a clause on why the vendor refuses a document's signature; "" if it accepts it.
+    """Return why a vendor refuses a document's signature, as a clause; "" if it is accepted.
 
-    ``certificates`` are all certificates of the permissions CA's file, in order.
+    ``certificates`` are all certificates in the file of the permissions CA, in order.
     """
     trusted = _trusted_certificates(traits, certificates)
     if traits.signers is Signers.AUTHORITY:
@@ -426,7 +426,7 @@ def _identity_faults(
     authorities: Certificates,
     moment: datetime,
 ) -> Iterator[Problem]:
-    """Yield the problems of certificate, key or issuer for which the vendor refuses an identity."""
+    """Yield the problems of certificate, key or issuer for which a vendor refuses an identity."""
     if not _hash_fits(traits, certificate):
         pss = certificate.signature_algorithm_oid == SignatureAlgorithmOID.RSASSA_PSS
         text = "it is signed with RSA-PSS" if pss else "it is not signed with SHA-256"
@@ -455,7 +455,7 @@ def _identity_faults(
 
 
 _ALONE = " for RSA-PSS alone"
-_LONGEST_TIMER = timedelta(microseconds=2**63 / 1000)  # of 64 bits of nanoseconds
+_LONGEST_TIMER = timedelta(microseconds=2**63 / 1000)  # what 64 bits of nanoseconds can hold
 
 
 def _list_faults(
@@ -465,7 +465,7 @@ def _list_faults(
     authorities: Certificates,
     moment: datetime,
 ) -> Iterator[Problem]:
-    """Yield the problems of revocation lists for which the vendor refuses a certificate."""
+    """Yield the problems of revocation lists for which a vendor refuses a certificate."""
     lists: list[tuple[x509.CertificateRevocationList, str]] = []
     try:
         if traits.reads_lists_of_authorities:
@@ -486,7 +486,7 @@ def _list_faults(
     if not lists:
         return
     chain, fault = build_chain(certificate, _trusted_certificates(traits, authorities), (), moment)
-    # A fault of the chain is reported already.
+    # A fault of the chain is already reported.
     refusal = (
         None
         if fault

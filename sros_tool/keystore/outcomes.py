@@ -36,10 +36,10 @@ RestartZenoh = Annotated[
 class KeptZenoh:
     """The Zenoh configurations after a change of a keystore.
 
-    ``files`` maps the enclaves to their files in the keystore, ``written`` the paths of staged
-    files to their content, ``nodes`` the enclaves to the nodes that they may announce.
-    ``left_out`` maps enclaves that get no file to the reason, a clause.  ``restart`` are the
-    enclaves whose processes have to be restarted, because their configurations changed.
+    ``files`` maps enclaves to their files in the keystore.  ``written`` maps the paths of staged
+    files to content.  ``nodes`` maps enclaves to the nodes that they may announce.  ``left_out``
+    maps enclaves that get no file to the reason (a clause).  ``restart`` are the enclaves whose
+    processes must be restarted because their configurations changed.
     """
 
     files: Mapping[str, str] = field(default_factory=dict)
@@ -61,10 +61,11 @@ class EnclaveResult(NamedTuple, Generic[Outcome]):
     """Name of the enclave."""
     outcome: Outcome
     folder: Path
-    """Folder of the enclave; in an archive, its path in the archive."""
+    """Folder of the enclave; for an enclave in an archive, its path in the archive."""
     serial: str | None
-    """Serial number of the certificate, in hexadecimal; null if a dry run did not issue it, or it
-    cannot be read."""
+    """Serial number of the certificate, in hexadecimal; null if a dry run did not issue a
+    certificate, or if it cannot be read.
+    """
     sha256: str | None
     """SHA-256 of the certificate (DER), in hexadecimal; null without a certificate."""
     valid_until: datetime | None
@@ -80,12 +81,12 @@ def enclave_result(
         keystore: the keystore, opened after the change.
         name: the name of the enclave.
         outcome: what was done with the enclave, such as ``created``.
-        written: whether its files exist; in a dry run they have no certificate yet.
+        written: whether the enclave's files exist; in a dry run, there is no certificate yet.
         folder: the folder of the enclave, if it is not in the keystore.
     """
     folder = folder or keystore.folder(name)
     if written:
-        with suppress(SrosError):  # an existing enclave that is broken was left as it is
+        with suppress(SrosError):  # an existing enclave that is broken was not changed
             issued = read_credentials(keystore, name)
             number, sha256 = issued.certificate.serial_number, digest(issued.certificate)
             until = issued.lifetime().expires()
@@ -99,7 +100,7 @@ class AuthorityFacts(NamedTuple):
     roles: Sequence[Annotated[str, Words(ROLES)]]
     """Roles of the CA."""
     subject: str | None
-    """Subject of the certificate; null if a dry run did not make it."""
+    """Subject of the certificate; null if a dry run did not make the certificate."""
     serial: str | None
     """Serial number of the certificate, in hexadecimal; null without a certificate."""
     sha256: str | None
@@ -109,7 +110,7 @@ class AuthorityFacts(NamedTuple):
 
 
 def authority_facts(roles: Sequence[str], certificate: x509.Certificate | None) -> AuthorityFacts:
-    """Return the facts about a CA; ``certificate`` is None if a dry run did not make it."""
+    """Return the facts about a CA; None stands for a certificate that a dry run did not make."""
     if certificate is None:
         return AuthorityFacts(roles, None, None, None, None)
     return AuthorityFacts(
@@ -124,7 +125,7 @@ def authority_facts(roles: Sequence[str], certificate: x509.Certificate | None) 
 def trusted_authorities(
     identity: x509.Certificate, permissions: x509.Certificate
 ) -> tuple[AuthorityFacts, ...]:
-    """Return the facts about the CAs that a robot trusts; a single CA appears once."""
+    """Return the facts about the CAs that a robot trusts: once for a single CA with both roles."""
     if identity == permissions:
         return (authority_facts(ROLES, identity),)
     pairs = zip(ROLES, (identity, permissions), strict=True)
@@ -132,5 +133,5 @@ def trusted_authorities(
 
 
 def changes_below(root: Path, changes: Iterable[Change]) -> tuple[FileChange, ...]:
-    """Return ``changes``, whose paths are relative to ``root``, with complete paths."""
+    """Return ``changes`` with complete paths; their own paths are relative to ``root``."""
     return tuple(FileChange(change.action, str(root / change.path)) for change in changes)

@@ -1,7 +1,7 @@
 """An enclave as DDS loads it, and the participant that each vendor creates for it.
 
-Only this module combines the decisions of a vendor: which files it refuses to load, how it reads
-the documents, and whether the participant may join.
+Only this module combines a vendor's three decisions: which files the vendor refuses to load, how it
+reads the documents, and whether the participant may join.
 """
 
 from __future__ import annotations
@@ -72,21 +72,21 @@ _LEFT_TO_THE_VENDOR = frozenset(
 _NO_KEY = (Fault.FILE_MISSING, KEY_FILE)
 
 _PLANNED = timedelta(days=365)
-"""The assumed validity of permissions for a policy that is not signed yet."""
+"""The assumed validity of permissions for a policy that is not yet signed."""
 
 
 class LoadedEnclave(NamedTuple):
     """An enclave as DDS loads it.
 
-    ``governance`` and ``permissions`` are the XML in the signed documents; ``signed`` is the signed
-    permissions, b"" if they are not signed yet.  ``state`` is the state of the files in ``folder``
-    at the time ``at``; None if they do not exist yet.  ``key_elsewhere`` says that the key is on
-    the robot that generated it.
+    ``governance`` and ``permissions`` are the XML in the signed documents.  ``signed`` are the
+    signed permissions; b"" if they are not signed yet.  ``state`` is the state of the files in
+    ``folder`` at the time ``at``; None if they do not exist yet.  ``key_elsewhere`` says that the
+    key is on the robot that generated it.
 
-    ``keystore`` is the keystore of the enclave, and ``policy`` its part of ``policy_file``, if
-    known; with ``has_placeholders``, the policy is for the robots of a fleet.  ``portable`` are its
-    permissions if all vendors read them alike, because sros wrote them.  An enclave that is only
-    planned has no XML: ``portable`` and ``plain_governance`` replace it.
+    ``keystore`` is the enclave's keystore, and ``policy`` the enclave's part of ``policy_file``, if
+    known.  With ``has_placeholders``, the policy is for the robots of a fleet.  ``portable`` are
+    the permissions if all vendors read them alike, because sros wrote them.  An enclave that is
+    only planned has no XML: ``portable`` and ``plain_governance`` replace it.
     """
 
     name: str
@@ -115,21 +115,21 @@ class LoadedEnclave(NamedTuple):
     def joined_domains(self) -> DomainSet | None:
         """The ROS domains that governance and permissions allow; None without a governance.
 
-        `sros run` takes one of these domains.
+        `sros run` chooses one of these domains.
         """
         return (self.state.joined_domains() if self.state else None) or self.domains
 
     def expiries(self) -> tuple[tuple[str, datetime], ...]:
-        """Return the files that expire, apart from the permissions, with their expiry times."""
+        """Return the files that expire, except the permissions, with the times of their expiry."""
         return tuple(_expiries(self.state, self.folder)) if self.state and self.folder else ()
 
     @property
     def as_here(self) -> LoadedEnclave:
-        """The enclave as a process here loads it: a key that is not here is missing."""
+        """The enclave as a process on this machine loads it: a key elsewhere counts as missing."""
         return self._replace(key_elsewhere=self.state.key_on_robot) if self.state else self
 
     def problems(self, traits: VendorTraits) -> tuple[Problem, ...]:
-        """Return the faults, except in documents, that keep a vendor's process from starting."""
+        """Return the faults, except in documents, that prevent a vendor's process from starting."""
         if self.state is None or self.at is None:
             return ()
         return tuple(
@@ -153,13 +153,14 @@ def load_enclave_of(keystore: OpenedKeystore, name: str, *, moment: datetime) ->
 
 
 def deciding_enclave(keystore: OpenedKeystore, name: str, *, moment: datetime) -> LoadedEnclave:
-    """Return an enclave as `load_enclave_of` does, to decide what its documents allow.
+    """Return an enclave as `load_enclave_of` does, for deciding what its documents allow.
 
-    In a copy of a keystore without any keys, its key is not reported as missing.
+    In a copy of a keystore without any keys, the enclave's key is not reported as missing.
     """
     enclave = load_enclave_of(keystore, name, moment=moment)
     lacks_key = enclave.state is not None and KEY_FILE not in enclave.state.files
-    # Others are looked at only if this one lacks its key: a process may not be able to.
+    # Other enclaves are only examined if this one lacks its key, because a process may not be able
+    # to read them.
     if lacks_key and not keystore.has_keys:
         return enclave._replace(key_elsewhere=True)
     return enclave
@@ -188,7 +189,7 @@ def loaded_enclave(
 
 
 def _portable_permissions(permissions: Permissions | None, document: bytes) -> Permissions | None:
-    """Return ``permissions`` if all vendors read the document in the same way; else None."""
+    """Return ``permissions`` if all vendors read the document alike, else None."""
     return permissions if permissions and canonical_permissions(permissions, document) else None
 
 
@@ -202,7 +203,7 @@ def plan_enclave(policy: Enclave, governance: Governance, *, moment: datetime) -
     permissions = permissions_for(
         policy, subject=subject, validity=window(moment, _PLANNED), domains=domains
     )
-    # What all vendors read alike is handed on as it is.
+    # Permissions that all vendors read alike are passed on without rendering and reading them.
     plain = is_plain_permissions(permissions)
     plain_governance = is_plain_governance(governance)
     return LoadedEnclave(
@@ -253,14 +254,14 @@ _ONLY_PEERS_NOTICE = {
     *((vendor, Fault.KEY_ALGORITHM) for vendor in FAST_DDS),
     *((vendor, Fault.DOCUMENT_SIZE) for vendor in FAST_DDS),
 }
-"""Faults that a vendor does not notice in its own process, but all peers do."""
+"""Faults that a vendor's own process does not notice, but all its peers do."""
 
 
 @lru_cache(maxsize=64)  # all enclaves of a keystore have the same governance
 def _governed_as(
     vendor: Vendor, document: Governance | bytes, domain: int
 ) -> GovernedDomain | Refusal:
-    """Return the rules of a governance for a domain, as ``vendor`` reads them, or its refusal."""
+    """Return the rules of a governance for a domain as ``vendor`` reads them, or its refusal."""
     governance: Governance | Refusal
     if isinstance(document, Governance):
         governance = document
@@ -272,7 +273,7 @@ def _governed_as(
 
 
 class JoinContext(NamedTuple):
-    """The ROS domain and the time of joining; ``zone`` is the time zone of the host."""
+    """The ROS domain and the time for joining; ``zone`` is the time zone of the host."""
 
     domain: int
     at: datetime
@@ -280,10 +281,10 @@ class JoinContext(NamedTuple):
 
 
 class RefusalCause(NamedTuple):
-    """A reason why no node of a vendor can run in an enclave, or peers refuse the node.
+    """A reason why no node of a vendor can run in an enclave, or why peers refuse the node.
 
-    ``reason`` is the id of a fault or of a decision; ``text`` is a clause with the name of the
-    file.  ``hits_peers`` says that the processes of peers crash, but not the node's own process.
+    ``reason`` is the id of a fault or decision; ``text`` is a clause that names the file.
+    ``hits_peers`` says that the processes of peers crash, but not the node's own process.
     """
 
     outcome: Outcome
@@ -297,11 +298,11 @@ _OF_GOVERNANCE = {
     *(Fault.GOVERNANCE_MALFORMED.id, "domain-not-in-governance", "no-topic-rule"),
     "unauthenticated-with-rtps-protection",
 }
-"""Ids of decisions that the governance causes, without a fault that names the file."""
+"""Ids of decisions that the governance causes, for which no fault names the file."""
 
 
 def _crashes_before(problem: Problem, governed: GovernedDomain | Refusal) -> bool:
-    """Return whether a process crashes because of its governance before it finds a problem."""
+    """Return whether the governance crashes a process before it finds the problem."""
     return (
         isinstance(governed, Refusal)
         and governed.outcome is Outcome.CRASHES
@@ -314,9 +315,9 @@ class VendorParticipant:
     """The participant of a vendor in an enclave.
 
     ``problems`` are the faults of files for which the vendor, or all peers, refuse the participant.
-    ``governance`` and ``permissions`` are the documents as the vendor reads them, None if it
-    cannot; ``permissions_document`` is the XML of the permissions.  ``refusal`` is the decision
-    that keeps the process from running, or None.
+    ``governance`` and ``permissions`` are the documents as the vendor reads them; None if the
+    vendor cannot read them.  ``permissions_document`` is the XML of the permissions.  ``refusal``
+    is the decision that prevents the process from running, or None.
     """
 
     def __init__(self, vendor: Vendor, enclave: LoadedEnclave, context: JoinContext) -> None:
@@ -327,20 +328,20 @@ class VendorParticipant:
         self.problems = enclave.problems(vendor.traits)
         made = self._make(enclave, context)
         self.access = made if isinstance(made, Access) else None
-        """The rights of the process; None if it does not run, or no peer accepts it."""
+        """The access control of the process; None if it does not run, or no peer accepts it."""
         self.refusal = made if isinstance(made, Decision) else None
 
     def join(self) -> Decision:
-        """Return whether the process starts, and its peers accept it."""
+        """Return the decision whether the process starts and its peers accept it."""
         if self.access is not None:
             return self.access.join()
         assert self.refusal is not None
         return self.refusal
 
     def causes(self) -> tuple[RefusalCause, ...]:
-        """Return why no node can run in the enclave, or peers refuse it; empty if nodes run.
+        """Return why no node can run in the enclave, or why peers refuse it; () if nodes run.
 
-        Rights to topics are not considered here: they are a matter of the policy.
+        Rights to topics are not considered, because they are a matter of the policy.
         """
         join = self.join()
         if join.reason in {problem.fault.id for problem in self.problems}:
@@ -352,7 +353,7 @@ class VendorParticipant:
         if stopped is None and self.access is not None:
             stopped = self.access.governance_refusal(
                 ROS_DISCOVERY_TOPIC
-            )  # every ROS 2 node opens it
+            )  # every ROS 2 node opens this topic
         if stopped is None:
             return ()
         file = GOVERNANCE_FILE if stopped.reason in _OF_GOVERNANCE else PERMISSIONS_FILE
@@ -360,7 +361,7 @@ class VendorParticipant:
         return (RefusalCause(stopped.outcome, stopped.reason, file, text, stopped.hits_peers),)
 
     def _make(self, enclave: LoadedEnclave, context: JoinContext) -> Access | Decision:
-        """Return the rights of the vendor's process, or the decision that keeps it from running."""
+        """Return the access control of the vendor's process, or the decision that stops it."""
         late: Decision | None = None
         governed = _governed_as(
             self.vendor, enclave.plain_governance or enclave.governance, context.domain
@@ -390,7 +391,7 @@ class VendorParticipant:
         )
         if late is None:
             return access
-        # Its own process may still refuse the documents.
+        # Peers refuse it anyway, but its own process may also refuse the documents.
         joined = access.join()
         return joined if joined.outcome in (Outcome.REFUSED, Outcome.CRASHES) else late
 
@@ -402,7 +403,7 @@ class EvaluatedEnclave(NamedTuple):
     participants: tuple[VendorParticipant, ...]
 
     def stopped(self, ignored: Collection[str] = ()) -> str:
-        """Return sentences on why no vendor runs a process in the enclave; "" if a vendor does.
+        """Return why no vendor runs a process in the enclave, as sentences; "" if a vendor does.
 
         Causes whose reason is in ``ignored`` do not count.
         """
@@ -429,13 +430,13 @@ class EvaluatedEnclave(NamedTuple):
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """Clauses on problems that keep a process from running; a key on the robot is none."""
+        """Clauses on problems that stop a process; a key that is on the robot is not a problem."""
         named = tuple(map(str, self.state.problems_in_keystore))
         return named or tuple(filter(None, (self.stopped().removesuffix("."),)))
 
     @property
     def problems_here(self) -> tuple[str, ...]:
-        """Clauses on the problems that keep a process from running here, also a missing key."""
+        """Clauses on problems that stop a process here, where a missing key is a problem, too."""
         return tuple(map(str, self.state.problems)) or self.problems
 
 
@@ -451,7 +452,8 @@ def evaluated(
 ) -> EvaluatedEnclave:
     """Return an opened enclave as ``vendors`` load it at the time ``moment``.
 
-    ``domain`` is the ROS domain to join; None for the first domain of its documents.
+    ``domain`` is the ROS domain to join; None stands for the first domain in the enclave's
+    documents.
     """
     number = domain if domain is not None else next(iter(state.joined_domains() or ()), 0)
     loaded, context = (
@@ -467,9 +469,9 @@ def accepted_state(
 ) -> OpenedEnclave:
     """Return an enclave's state without the faults that at least one of the vendors accepts.
 
-    Documents that a vendor loads count as the enclave's documents if a CA signed them; a document
-    that the enclave signed itself stays a fault, whatever vendor accepts it (CVE-2023-24011).
-    ``participants`` has at least one participant.
+    Documents that a vendor loads count as the enclave's documents if a CA signed them.  A document
+    that the enclave signed itself stays a fault, even if a vendor accepts it (CVE-2023-24011).
+    There must be at least one participant.
     """
     loading = [participant for participant in participants if participant.permissions is not None]
     if not (state.problems and loading):
@@ -498,7 +500,7 @@ def accepted_state(
 def _with_acceptance(
     state: OpenedEnclave, problem: Problem, participants: Sequence[VendorParticipant]
 ) -> Problem:
-    """Return a signature's problem, with the vendors that accept it anyway in its text."""
+    """Return a problem of a signature with a text that names the vendors that accept it anyway."""
     titles: dict[bool, list[str]] = {True: [], False: []}
     for participant in participants:
         titles[problem not in participant.problems].append(participant.vendor.title)
@@ -514,7 +516,7 @@ def _with_acceptance(
 
 
 def _signers(state: OpenedEnclave, file: str) -> set[x509.Certificate | None]:
-    """Return the certificates of a document's signers; None stands for a missing certificate."""
+    """Return the certificates of a document's signers; None stands for one that is missing."""
     with suppress(SrosError):
         signed = state.signed(file)
         data = state.files.get(PERMISSIONS_CA_FILE, b"")
@@ -524,7 +526,7 @@ def _signers(state: OpenedEnclave, file: str) -> set[x509.Certificate | None]:
 
 
 def _signed_by_ca(state: OpenedEnclave, file: str) -> bool:
-    """Return whether all signers of a document have the certificate of a CA."""
+    """Return whether the certificates of all signers of a document are those of CAs."""
     signers = _signers(state, file)
     return bool(signers) and all(signer is not None and _is_ca(signer) for signer in signers)
 

@@ -1,7 +1,7 @@
 """The protection that policies state for names, as the protection of a keystore.
 
-A keystore has one governance, so the statement of one enclave about a name holds for all.  Levels
-are minimums: a name that the keystore protects better stays as it is.
+A keystore has a single governance, so the statement of one enclave about a name applies to all
+enclaves.  Levels are minimums: if the keystore protects a name better, nothing changes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from sros_tool.translate import governance_for, protected_topics
 def contradictions(
     stated_protections: Sequence[StatedProtection],
 ) -> Iterator[tuple[StatedProtection, StatedProtection]]:
-    """Yield each pair of statements with different levels for some common name, in order."""
+    """Yield the pairs of statements that state different levels for a common name, in order."""
     limit = ComparisonLimit()
     signed: dict[str, list[StatedProtection]] = {}
     for protection in stated_protections:
@@ -57,11 +57,11 @@ def contradictions(
 def with_stated(
     protection: DomainProtection, stated_protections: Sequence[StatedProtection]
 ) -> DomainProtection:
-    """Return ``protection``, raised where policies state a stronger one, and never lowered.
+    """Return ``protection``, raised to what policies state, but never lowered.
 
     Raises:
-        PolicyError: statements contradict each other, or a wildcard in the settings matches only a
-            part of a statement's names, so that it is unclear which of both decides.
+        PolicyError: statements contradict each other; or a wildcard in the settings matches only
+            some of the names of a statement, so that it is unclear which of the two decides.
     """
     for stated_protection, other in contradictions(stated_protections):
         raise PolicyError(
@@ -86,7 +86,7 @@ def with_stated(
 def governance_with_stated(
     protection: DomainProtection, stated_protections: Sequence[StatedProtection], domain: int = 0
 ) -> Governance:
-    """Return the governance of a protection in a domain, raised as by `with_stated`.
+    """Return the governance for ``protection`` in a domain, raised as by `with_stated`.
 
     Raises:
         PolicyError: as `with_stated`.
@@ -97,12 +97,12 @@ def governance_with_stated(
 
 
 def governance_for_all(protection: DomainProtection) -> Governance:
-    """Return the governance of a protection for any domain."""
+    """Return the governance for ``protection`` in any domain."""
     return governance_for(protection, DomainSet.of((0, 0)))
 
 
 class _Raising:
-    """The protection of a keystore, while the statements of policies raise it."""
+    """The protection of a keystore while it is raised by the statements of policies."""
 
     def __init__(self, protection: DomainProtection) -> None:
         self._protection = protection
@@ -151,7 +151,7 @@ class _Raising:
     def _deciding_entry(self, topic: str, protection: StatedProtection) -> int | None:
         """Return the number of the settings entry that decides on all names of ``topic``, or None.
 
-        Entries for a part of the names are raised to the stated level.
+        Entries for only some of the names are raised to the stated level.
         """
         wide: list[str] = []
         for name in self._topics.overlapping(topic):
@@ -191,7 +191,8 @@ class _Raising:
             return protection
         if level is Level.ENCRYPT:
             return replace(protection, data=Level.ENCRYPT)
-        # With data=SIGN, Fast DDS loses messages; the submessage has the payload in it.
+        # With data=SIGN, Fast DDS loses messages; the submessage contains the payload, so it is
+        # signed instead.
         return replace(protection, metadata=Level.SIGN)
 
 
@@ -212,10 +213,10 @@ def _strength(level: str) -> int:
 def less_protected(
     governance: Governance, stated_protections: Iterable[StatedProtection]
 ) -> Iterator[tuple[StatedProtection, Level]]:
-    """Yield the statements that a governance does not fulfil, with the level that it gives.
+    """Yield statements to which a governance gives less protection, each with the actual level.
 
-    The level of a name is the lowest of its DDS topics in all domains.  A topic without a rule does
-    not count: no vendor allows its use.
+    The level of a name is the lowest level of its DDS topics in all domains.  A topic without a
+    rule does not count, because no vendor allows its use.
     """
     domains = [_DomainRules(rule) for rule in governance.domain_access_rules]
     for protection in stated_protections:
@@ -231,7 +232,7 @@ def less_protected(
 
 
 class _DomainRules:
-    """The topic rules of a domain, with a fast search for the rules that decide on a topic."""
+    """The topic rules of a domain, with a fast search for those that apply to a topic."""
 
     def __init__(self, rule: DomainRule) -> None:
         self._rtps = rule.rtps_protection_kind
@@ -242,7 +243,7 @@ class _DomainRules:
         self._names = Names(self._rules)
 
     def levels(self, topic: str) -> Iterator[Level]:
-        """Yield the levels of all rules that decide on some name of a topic expression."""
+        """Yield the levels of all rules that apply to some name of a topic expression."""
         for _, rule in sorted(
             (self._rules[name] for name in self._names.overlapping(topic)), key=lambda pair: pair[0]
         ):

@@ -1,8 +1,8 @@
 """The only reader of keystores and enclaves: their files, their grants, and their problems.
 
-It repeats the checks that Fast DDS 2.14.5 and Cyclone DDS 0.10 make when a participant is created,
-and names the cause of a refusal, which vendors seldom do.  `sros_tool.keystore.loading` has the
-differences between vendors.
+The reader repeats the checks that Fast DDS 2.14.5 and Cyclone DDS 0.10 make when a participant is
+created, and names the cause of a refusal, which vendors seldom do.  `sros_tool.keystore.loading`
+has the differences between vendors.
 """
 
 from __future__ import annotations
@@ -100,10 +100,10 @@ _Parsed = TypeVar("_Parsed")
 
 
 class FilesReadOnce:
-    """Cache of files, which reads each file at most once, also through different links.
+    """A cache that reads each file at most once, even if it is reached through different links.
 
-    A path keeps the content that was read first; a file that could not be read fails again.  Once
-    the cache holds 16 MiB it is `full`, and other files are read each time.
+    The content that was read first is kept for a path.  A file that could not be read fails again.
+    Once the cache holds 16 MiB, it is `full`, and other files are read each time.
     """
 
     def __init__(self) -> None:
@@ -136,11 +136,11 @@ class FilesReadOnce:
 
     @property
     def full(self) -> bool:
-        """Whether the cache takes no further files."""
+        """Whether the cache accepts no further files."""
         return self._size > _MOST_KEPT
 
     def _read(self, path: Path, label: str, max_bytes: int) -> bytes:
-        with suppress(OSError, ValueError):  # what is wrong with a path is said by `read_file`
+        with suppress(OSError, ValueError):  # `read_file` reports what is wrong with a path
             data = self._by_file.get(_identity(path.stat()))
             if data is not None and len(data) <= max_bytes:
                 return data
@@ -151,10 +151,10 @@ class FilesReadOnce:
         return data
 
     def signed(self, message: bytes) -> smime.SignedDocument:
-        """Return the signed document in ``message``, which is parsed and verified only once.
+        """Return the signed document in ``message``; each message is parsed and verified only once.
 
         Raises:
-            PkiError: it is not a signed message.
+            PkiError: ``message`` is not a signed message.
         """
         known = self._signed.get(message)
         if known is None:
@@ -180,7 +180,7 @@ def _identity(state: os.stat_result) -> tuple[int, int, int, int]:
 
 
 class _Part(Generic[_Parsed]):
-    """A property of a keystore that is read when it is first used, and never again."""
+    """A property of a keystore that is read when it is first used, and then kept."""
 
     def __init__(self, read: Callable[[OpenedKeystore], _Parsed]) -> None:
         self._read = read
@@ -203,10 +203,11 @@ class OpenedKeystore:
     `OpenedKeystore`.  A part that exists and cannot be read raises the same `SrosError` each time.
 
     Args:
-        root: its folder.
+        root: the folder of the keystore.
         locked: whether this process has locked the keystore, so that links of a transaction in
             progress are not followed.
-        lacks_keys: whether it is a copy that should have no keys, so that `has_keys` is false.
+        lacks_keys: whether the keystore is a copy that should have no keys, so that `has_keys` is
+            false.
     """
 
     def __init__(self, root: Path, *, locked: bool = False, lacks_keys: bool = False) -> None:
@@ -218,16 +219,16 @@ class OpenedKeystore:
         return f"OpenedKeystore({str(self.root)!r})"
 
     def forget(self) -> None:
-        """Forget all parts that were read, so that a change of the keystore is seen."""
+        """Forget all parts that were read, so that changes of the keystore are seen."""
         self.files = FilesReadOnce()
         """Cache of the files that were read, in the keystore and next to it."""
         self._parts: dict[Hashable, object] = {}
 
     def once(self, key: Hashable, read: Callable[[], _Parsed]) -> _Parsed:
-        """Return the result of ``read()``, which is called only the first time for a ``key``.
+        """Return the result of ``read()``, which is called only once for each ``key``.
 
-        An exception is raised again, too.  The result for an enclave is not kept once `files` is
-        full.
+        If it raised an exception, the exception is raised again.  The result for an enclave is not
+        kept once `files` is full.
         """
         if key not in self._parts:
             if self.files.full and isinstance(key, tuple) and key[0] in _OF_ENCLAVES:
@@ -242,12 +243,13 @@ class OpenedKeystore:
         return part  # type: ignore[return-value]
 
     def read(self, path: str | Path, label: str) -> bytes:
-        """Return the content of the file at ``path``; a text is relative to the keystore.
+        """Return the content of the file at ``path``; a text is a path relative to the keystore.
 
         ``label`` describes the file in errors.
 
         Raises:
-            DocumentError: the file does not exist, cannot be read, is too large or not regular.
+            DocumentError: the file does not exist, cannot be read, is too large, or is not a
+                regular file.
         """
         return self.files.read(self._path(path), label)
 
@@ -266,14 +268,15 @@ class OpenedKeystore:
 
     @property
     def is_original(self) -> bool:
-        """Whether it is a keystore with CAs or settings, and not an export for a robot."""
+        """Whether this is a keystore with CAs or settings, not an export for a robot."""
         return any(map(self.has, (PUBLIC, PRIVATE, SETTINGS)))
 
     @property
     def has_all_enclaves(self) -> bool:
-        """Whether every enclave that its CAs issued is here.
+        """Whether every enclave that the keystore's CAs issued is here.
 
-        An export may lack some, and has the governance only in the folders of its enclaves.
+        An export may lack some enclaves, and has the governance only in the folders of its
+        enclaves.
         """
         return is_original_keystore(self.root) or self.has(GOVERNANCE_P7S)
 
@@ -283,8 +286,8 @@ class OpenedKeystore:
 
         Such a keystore has neither settings nor a ledger, and its CAs have no key identifier.  sros
         gives a key identifier to every CA, so removing the ledger of an sros keystore does not make
-        it look like a keystore of ros2/sros2.  Nor does a CA certificate without one: only the key
-        of the CA can sign it.
+        it look like a keystore of ros2/sros2.  Exchanging the CA certificate for one without an
+        identifier does not help either, because only the CA's key can sign it.
         """
         if any(os.path.lexists(self.root / name) for name in (SETTINGS, LEDGER, LEDGER_HEAD)):
             return False
@@ -328,7 +331,7 @@ class OpenedKeystore:
 
     @_Part
     def ledger_file(self) -> LedgerFile:
-        """The file of the ledger, to read some entries or to add entries."""
+        """The file of the ledger, for reading some of its entries or adding entries."""
         return LedgerFile(
             self.root,
             lambda: self._trusted,
@@ -348,7 +351,7 @@ class OpenedKeystore:
     # ── CAs ──
 
     def authority(self, role: str) -> tuple[x509.Certificate, ...]:
-        """Return the certificates in a role's CA file, the issuing CA first; empty without one."""
+        """Return the certificates in a role's CA file, the issuing CA first; () without a file."""
         path = self.root / ca_certificate(role)
 
         def read() -> tuple[x509.Certificate, ...]:
@@ -376,7 +379,7 @@ class OpenedKeystore:
 
     @_Part
     def _trusted(self) -> list[x509.Certificate]:
-        """The certificates of the CAs that the keystore trusts, without unreadable files."""
+        """The certificates of the CAs that the keystore trusts; unreadable files are left out."""
         trusted: list[x509.Certificate] = []
         for role in ROLES:
             with suppress(SrosError):
@@ -385,7 +388,7 @@ class OpenedKeystore:
 
     @_Part
     def authority_files(self) -> Mapping[str, tuple[str, ...]]:
-        """The stem of each CA file, with the roles of its CA.
+        """Maps the name of each CA file, without suffixes, to the roles of its CA.
 
         Raises:
             KeystoreError: a CA file is missing, or is a link to a file outside of the keystore.
@@ -394,7 +397,7 @@ class OpenedKeystore:
         for role in ROLES:
             path = self.root / ca_certificate(role)
             file = path
-            # A link into the stage, left by an interrupted change, stands for the file itself.
+            # A link into the stage that an interrupted change left stands for the file itself.
             if path.is_symlink() and STAGE not in (to := str(path.readlink())):
                 file = path.parent / to
             if not file.is_file() or file.parent != path.parent:
@@ -409,13 +412,13 @@ class OpenedKeystore:
 
     @property
     def identity_file(self) -> str | None:
-        """The stem of the identity CA's file; None for an export, which has no CA files."""
+        """The name, without suffixes, of the identity CA's file; None for an export."""
         with suppress(KeystoreError):
             return next(file for file, roles in self.authority_files.items() if IDENTITY in roles)
         return None
 
     def certificates_of(self, file: str) -> tuple[x509.Certificate, ...]:
-        """Return all certificates of the CA file with this stem, the issuing CA first."""
+        """Return all certificates in a CA file, the issuing CA first; ``file`` has no suffixes."""
         path = self.root / PUBLIC / f"{file}.cert.pem"
         return self.once(
             ("certificates", file),
@@ -423,7 +426,7 @@ class OpenedKeystore:
         )
 
     def embedded_list(self, file: str) -> RevocationList | None:
-        """Return the revocation list in a CA file, after its certificates, or None."""
+        """Return the revocation list in a CA file after the certificates, or None."""
         path = self.root / PUBLIC / f"{file}.cert.pem"
 
         def read() -> RevocationList | None:
@@ -434,7 +437,7 @@ class OpenedKeystore:
 
     @_Part
     def revocation_list(self) -> RevocationList | None:
-        """The revocation list of the issuing identity CA, or None if the keystore has no list."""
+        """The revocation list of the issuing identity CA; None if there is none."""
         path = self.root / CRL
         if not path.exists():
             return None
@@ -442,14 +445,14 @@ class OpenedKeystore:
 
     @property
     def revocation_lists(self) -> tuple[RevocationList, ...]:
-        """The revocation lists that DDS reads: a second one only in a rotation."""
+        """The revocation lists that DDS reads; there is a second one only in a rotation."""
         file = self.identity_file
         lists = (self.revocation_list, self.embedded_list(file) if file else None)
         return tuple(filter(None, lists))
 
     @_Part
     def has_keys(self) -> bool:
-        """Whether any enclave has its key, or says where it is; copies may have none."""
+        """Whether any enclave has its key or says where it is; a copy may have no keys."""
         return not self._lacks_keys and any(
             os.path.lexists(enclave_path(self.root, name) / file)
             for name in enclave_names(self.root, hidden=True)
@@ -463,7 +466,7 @@ class OpenedKeystore:
         """The governance that DDS loads, verified with the permissions CA of the keystore.
 
         Raises:
-            KeystoreError: it is missing or malformed, or its signature does not verify.
+            KeystoreError: the governance is missing or malformed, or its signature does not verify.
         """
         return self.governance_by(self.ca_certificate(PERMISSIONS))
 
@@ -471,7 +474,7 @@ class OpenedKeystore:
         """Return the governance that DDS loads, after verifying that ``authority`` signed it.
 
         Raises:
-            KeystoreError: it is missing or malformed, or its signature does not verify.
+            KeystoreError: the governance is missing or malformed, or its signature does not verify.
         """
         return self.once(("governance", authority), lambda: self._governance_by(authority))
 
@@ -514,7 +517,7 @@ class OpenedKeystore:
     def identity(self, name: str, *, now: datetime) -> EnclaveIdentity:
         """Return the certificate of an enclave, and the faults of its identity files.
 
-        It reads neither governance nor permissions: Zenoh needs none of them.
+        Governance and permissions are not read, because Zenoh needs neither of them.
         """
         folder = self.folder(name)
         return self.once(
@@ -530,7 +533,7 @@ class OpenedKeystore:
         return self.certificate(self.folder(name) / CERTIFICATE_FILE)
 
     def signed_grant(self, name: str, subject: str) -> SignedGrant:
-        """Return an enclave's permissions and their grant to ``subject``, not verified yet.
+        """Return an enclave's permissions and their grant to ``subject``; neither is verified.
 
         Raises:
             SrosError: the file is not a signed permissions document.
@@ -574,10 +577,10 @@ def read_certificate(path: Path) -> x509.Certificate:
 
 
 class SignedGrant(NamedTuple):
-    """A signed permissions document, not verified yet, and its grant to a subject.
+    """A signed permissions document and its grant to a subject; neither is verified.
 
     ``digest`` is the SHA-256 of the whole file, in hexadecimal.  ``grant`` is the first grant to
-    the subject, the only one that DDS reads; None if there is none.
+    the subject, the only one that DDS reads; None if the document has no grant to the subject.
     """
 
     signed: smime.SignedDocument
@@ -622,7 +625,7 @@ class Problem(NamedTuple):
 
 @dataclass(frozen=True)
 class OpenedEnclave:
-    """The content of an enclave's files that could be read, and their problems.
+    """The readable content of an enclave's files, and their problems.
 
     ``permissions_bytes`` is the size of ``permissions.p7s``.
     """
@@ -635,25 +638,25 @@ class OpenedEnclave:
     permissions_bytes: int
     problems: tuple[Problem, ...]
     files: Mapping[str, bytes] = field(default_factory=dict, repr=False)
-    """The content of the readable files, by name: required files and ``crl.pem``."""
+    """The content of the readable files by name: the required files and ``crl.pem``."""
     permissions_document: bytes = field(default=b"", repr=False)
-    """The XML in ``permissions.p7s``, even if malformed; empty if its signature is not valid."""
+    """The XML in ``permissions.p7s``, even if malformed; empty without a valid signature."""
     key_on_robot: bool = False
     """Whether the key was generated on the robot and stays there."""
     token: TokenUri | None = None
-    """The place of the key on a PKCS#11 token, which ``key.p11`` names.
+    """The place of the key on a PKCS#11 token, by ``key.p11``.
 
-    The key is not compared with the certificate, because no token is opened to read an enclave.
+    The key is not compared with the certificate, because reading an enclave opens no token.
     """
     public_key: object = field(default=None, repr=False)
     """The public key of ``key.pem``; None if the file cannot be read."""
     read_once: FilesReadOnce = field(
         default_factory=lambda: FilesReadOnce(), repr=False, compare=False
     )
-    """Cache of the enclave's files, and of files that it shares with other enclaves."""
+    """A cache of the enclave's files, and of files that it shares with other enclaves."""
 
     def signed(self, file: str) -> smime.SignedDocument:
-        """Return a signed document of the enclave, whose signature may not be verified yet.
+        """Return a signed document of the enclave, whose signature need not be verified yet.
 
         Raises:
             PkiError: the file does not exist, or is not a signed message.
@@ -667,12 +670,12 @@ class OpenedEnclave:
 
     @cached_property
     def grant(self) -> Grant | None:
-        """The grant that DDS reads: the first for the subject of the certificate."""
+        """The grant that DDS reads: the first one for the certificate's subject."""
         return self.permissions.grant_of(self.subject) if self.permissions else None
 
     @property
     def problems_in_keystore(self) -> tuple[Problem, ...]:
-        """The problems, except the missing key of an enclave whose key is on the robot."""
+        """The problems, except a missing key that is on the robot."""
         return _problems_in_keystore(self.problems, self.key_on_robot)
 
     def domains(self) -> DomainSet | None:
@@ -680,10 +683,10 @@ class OpenedEnclave:
         return self.governance.domains().closed() if self.governance else None
 
     def joined_domains(self) -> DomainSet | None:
-        """Return the ROS domains that governance and permissions name, or None without governance.
+        """Return the ROS domains in both governance and permissions; None without governance.
 
-        If they have no domain in common, return the domains of the governance; `problems` has the
-        fault.
+        If they have no domain in common, the result is the domains of the governance; `problems`
+        has the fault.
         """
         governed = self.domains()
         if governed is None or self.grant is None:
@@ -693,9 +696,9 @@ class OpenedEnclave:
         return common if common.ranges else governed
 
     def valid_until(self) -> datetime | None:
-        """Return the first expiry among its certificates and its grant, in UTC.
+        """Return the first expiry among the enclave's certificates and its grant, in UTC.
 
-        Return None if the certificate or the permissions, or their dates, cannot be read.
+        The result is None if the certificate or the permissions, or their dates, cannot be read.
         """
         if not (self.certificate and self.permissions):
             return None
@@ -707,7 +710,7 @@ class OpenedEnclave:
             moments += [self.grant.validity.not_after] if self.grant else []
         except DocumentError:
             return None
-        except SrosError:  # a grant that expires before it begins
+        except SrosError:  # the grant expires before it begins
             pass
         return min(moments)
 
@@ -715,7 +718,7 @@ class OpenedEnclave:
 class EnclaveIdentity(NamedTuple):
     """The certificate of an enclave, and the problems of certificate, key and identity CA.
 
-    The key may be missing in a keystore if it was generated on the robot and stays there.
+    In a keystore, a key that was generated on the robot and stays there is not here.
     """
 
     certificate: x509.Certificate | None
@@ -723,13 +726,13 @@ class EnclaveIdentity(NamedTuple):
 
 
 def _problems_in_keystore(problems: tuple[Problem, ...], key_on_robot: bool) -> tuple[Problem, ...]:
-    """Return the problems, except a missing key that is on the robot."""
+    """Return the problems without a missing key that is on the robot."""
     on_robot = (KEY_FILE, Fault.FILE_MISSING) if key_on_robot else None
     return tuple(problem for problem in problems if (problem.file, problem.fault) != on_robot)
 
 
 def weaknesses(state: OpenedEnclave) -> Iterator[tuple[str, str]]:
-    """Yield weak cryptography in an enclave's files: the name of the file, and a clause."""
+    """Yield (file name, clause) for each weak cryptography in an enclave's files."""
     for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE, CERTIFICATE_FILE):
         with suppress(SrosError):
             for certificate in load_certificates(state.files.get(file, b""), file):
@@ -751,7 +754,7 @@ def open_enclave(
     """Return the content of an enclave's files, and their problems at the time ``now``.
 
     With ``domain``, also check whether the enclave may join that ROS domain.  ``files`` is a cache
-    of files that were read before, such as the cache of the keystore (`Keystore.enclave`).
+    of files that were already read, such as `OpenedKeystore.files`.
     """
     return _EnclaveFiles(folder, now, files or FilesReadOnce()).check(domain)
 
@@ -772,7 +775,7 @@ _parse_governance = lru_cache(maxsize=8)(parse_governance)
 def _load_crl(
     data: bytes, authority: x509.Certificate | None, authorities: bytes
 ) -> tuple[x509.CertificateRevocationList, x509.Certificate | None]:
-    """Return a revocation list, and the CA in the file ``authorities`` that signed it, or None."""
+    """Return a revocation list, and the CA in ``authorities`` (PEM) that signed it, or None."""
     crl = read_list(data, CRL_FILE)
     trusted: tuple[x509.Certificate, ...] = (authority,) if authority else ()
     with suppress(SrosError):
@@ -781,7 +784,7 @@ def _load_crl(
 
 
 class _EnclaveFiles:
-    """Checker of the files of an enclave, which collects the problems."""
+    """Checks the files of an enclave, and collects the problems."""
 
     def __init__(self, folder: Path, now: datetime, files: FilesReadOnce) -> None:
         self._folder = folder
@@ -790,7 +793,7 @@ class _EnclaveFiles:
         self._problems: list[Problem] = []
 
     def identity(self) -> EnclaveIdentity:
-        """Return the identity alone."""
+        """Return the enclave's identity, without reading its documents."""
         files, _ = self._read_all(_IDENTITY_FILES)
         certificate, *_ = self._checked_identity(files)
         return EnclaveIdentity(
@@ -895,7 +898,7 @@ class _EnclaveFiles:
         if key is not None:
             text = f"{KEY_FILE} is there, too"
             self._add(KEY_URI_FILE, text, Fault.KEY_TWICE)
-        if not data:  # it was reported already
+        if not data:  # already reported
             return None
         from sros_tool.pki.token import read_token_file
 
@@ -932,7 +935,7 @@ class _EnclaveFiles:
         ca: x509.Certificate | None,
         files: Mapping[str, bytes | None],
     ) -> object:
-        """Check certificate and key; return the public key of ``key.pem``, or None."""
+        """Check certificate and key, and return the public key of ``key.pem``, or None."""
         key, authorities = files[KEY_FILE], files[IDENTITY_CA_FILE]
         if certificate and ca and not issued_by(certificate, ca):
             text = (
@@ -963,9 +966,9 @@ class _EnclaveFiles:
         return public_key
 
     def _fault_with_all(self, certificate: x509.Certificate, authorities: bytes) -> str:
-        """Return a clause on why no chain to the CAs in a file is valid; "" if a chain is valid.
+        """Return why no chain to the CAs in a file is valid, as a clause; "" if a chain is valid.
 
-        Also return "" if the issuer of ``certificate`` is not in the file.
+        The result is also "" if the issuer of ``certificate`` is not in the file.
         """
         with suppress(SrosError):
             chain = load_certificates(authorities, "")
@@ -976,7 +979,7 @@ class _EnclaveFiles:
     def _check_chain(self, certificate: x509.Certificate, authorities: bytes) -> None:
         try:
             chain = load_certificates(authorities, "")
-        except SrosError as error:  # in a certificate after the first one
+        except SrosError as error:  # a certificate after the first one is faulty
             self._add(IDENTITY_CA_FILE, error.clause, Fault.CERTIFICATE_MALFORMED)
             return
         if refusal := chain_fault(certificate, chain, moment=self._now):
@@ -988,7 +991,7 @@ class _EnclaveFiles:
         ca: x509.Certificate | None,
         authorities: bytes | None,
     ) -> bytes | None:
-        """Check and return the revocation list; None without a list that can be read."""
+        """Check and return the revocation list; None if there is no readable list."""
         path = self._folder / CRL_FILE
         if not path.exists():
             return None
@@ -1069,7 +1072,7 @@ class _EnclaveFiles:
             return
         try:
             self._check_validity(name, grant.validity, _EXPIRY_OF_PERMISSIONS)
-        except SrosError as error:  # it expires before it begins
+        except SrosError as error:  # the validity ends before it begins
             self._add(name, error.what, Fault.PERMISSIONS_MALFORMED)
         rules = [rule for rule in grant.rules if rule.allow]
         if domain is not None and not any(domain in rule.domains.closed() for rule in rules):
@@ -1090,9 +1093,9 @@ Opened = TypeVar("Opened", Path, OpenedKeystore)
 def read_consistently(
     read: Callable[Concatenate[Opened, Arguments], Result],
 ) -> Callable[Concatenate[Opened, Arguments], Result]:
-    """Decorate a function so that it is called again if the keystore changes meanwhile.
+    """Decorate a function so that it is called again if the keystore changes in the meantime.
 
-    It is called at most five times; then its last result or exception counts.
+    After five calls, the last result or exception counts.
     """
 
     @wraps(read)
@@ -1116,9 +1119,9 @@ def read_consistently(
 
 
 def _state(root: Path) -> object:
-    """Return a value that is different after each change of a keystore.
+    """Return a value that differs after each change of a keystore.
 
-    It identifies the file of the ledger.
+    The value identifies the file of the ledger.
     """
     file_states: list[tuple[int, int, int] | None] = []
     for name in (LEDGER, SETTINGS):

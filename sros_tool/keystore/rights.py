@@ -1,8 +1,8 @@
 """The rights that a policy, permissions, an enclave, a keystore or a Zenoh configuration gives.
 
 The rights of enclaves and keystores are read from ``permissions.p7s``, the file that DDS loads.
-Its signature is verified with the permissions CA next to it.  A Zenoh configuration gives the
-rights that its access control gives other enclaves.
+Its signature is verified with the permissions CA next to it.  A Zenoh configuration gives rights to
+other enclaves by its access control.
 """
 
 from __future__ import annotations
@@ -84,15 +84,16 @@ class RightsSource:
     """The rights that a file or folder gives.
 
     ``kind`` is "policy", "permissions", "enclave", "keystore" or "zenoh".  ``scope`` are the
-    enclaves that it can give rights to, such as those of an export; None for all.  ``sound`` is
-    False if DDS would refuse a part of it: a signature that does not verify, or permissions that
-    are missing or malformed.  ``fleet`` is the fleet that it is for, or None.  ``protections`` are
-    a policy's statements about the protection of names; None for anything else.  ``documents`` are
-    the permissions of enclaves, ``enforcers`` the access control of each Zenoh process that checks
-    others; ``routers`` are the enclaves of a keystore's routers, and ``links`` is what passes
-    between several.  ``configurations`` are the Zenoh configurations that were read, also those of
-    clients, and ``key_domains`` maps their rights to the ROS domains in their keys, None for a
-    wildcard.  ``policy`` is the policy in a policy file.
+    enclaves to which the source can give rights, such as those of an export; None for all.
+    ``sound`` is False if DDS would refuse a part of the source, because a signature does not
+    verify, or because permissions are missing or malformed.  ``fleet`` is the fleet for which the
+    source is, or None.  ``protections`` are a policy's statements about the protection of names;
+    None for anything else.  ``documents`` are the permissions of enclaves.  ``enforcers`` are the
+    access control of each Zenoh process that checks others.  ``routers`` are the enclaves of a
+    keystore's routers, and ``links`` is what passes between several routers.  ``configurations``
+    are the Zenoh configurations that were read, including those of clients.  ``key_domains`` maps
+    their rights to the ROS domains in the keys; None stands for a wildcard.  ``policy`` is the
+    policy in a policy file.
     """
 
     path: Path
@@ -102,7 +103,7 @@ class RightsSource:
     rights: frozenset[Right]
     scope: frozenset[str] | None
     sound: bool
-    """Whether DDS would accept all of its files."""
+    """Whether DDS would accept all files of the source."""
     notes: tuple[Note, ...]
     """Notes on the file or folder."""
     fleet: Fleet | None = None
@@ -120,13 +121,13 @@ class RightsSource:
         return self.stated_enclaves() - {right.enclave for right in self.rights}
 
     def stated_enclaves(self) -> set[str]:
-        """Return the enclaves of a policy or of permissions, also those without rights."""
+        """Return the enclaves of a policy or of permissions, including those without rights."""
         policy = self.policy.enclaves if self.policy else ()
         return {*self.documents, *(enclave.path for enclave in policy)}
 
     @property
     def enclaves(self) -> list[str] | None:
-        """Enclaves that the file or folder can give rights to; null for all."""
+        """Enclaves to which the file or folder can give rights; null for all."""
         return None if self.scope is None else sorted(self.scope)
 
 
@@ -145,7 +146,7 @@ def load_rights(
     ``only_enclaves`` are the enclaves of a keystore that are read; None for all.
 
     Raises:
-        DocumentError: ``path`` is anything else, or malformed.
+        DocumentError: ``path`` is something else, or is malformed.
     """
     if isinstance(path, OpenedKeystore):
         return _keystore_rights(path, hidden=hidden, only_enclaves=only_enclaves)
@@ -167,7 +168,7 @@ def load_rights(
 
         return _zenoh_rights(path, parse_configuration(data, str(path), lines=False))
     signed = b"multipart/signed" in data[:1000].lower()
-    # read_policy says how a policy of an earlier format, with <profiles> at the top, is converted.
+    # An earlier format has <profiles> at the top; read_policy says how to convert it.
     if not signed and parse(data, f"'{path}'").tag in ("policy", "profiles"):
         return _policy_rights(path, fleet)
     return _document_rights(path, "permissions", path)
@@ -184,7 +185,7 @@ def _policy_rights(path: Path, fleet: Fleet | None) -> RightsSource:
 
 
 def rights_by_domains(source: RightsSource) -> dict[DomainSet | None, set[Right]]:
-    """Map sets of ROS domains to the rights that a source gives there; None: in every domain.
+    """Map sets of ROS domains to the rights that a source gives in them; None means every domain.
 
     A policy is for every domain, except for enclaves of robots whose domain the fleet states.
     """
@@ -199,9 +200,9 @@ def rights_grouped_by_domains(
     key_domains: Mapping[Right, frozenset[int | None]],
     fleet: Fleet | None = None,
 ) -> dict[DomainSet | None, set[Right]]:
-    """Map sets of ROS domains to the rights that apply there; None: in every domain.
+    """Map sets of ROS domains to the rights that apply in them; None means every domain.
 
-    ``documents`` are the permissions of enclaves, whose rules name domains; ``key_domains`` are as
+    ``documents`` are the permissions of enclaves, whose rules name domains.  ``key_domains`` is as
     in `RightsSource`.  An enclave without permissions is for the domain that ``fleet`` states for
     its robot.
     """
@@ -255,15 +256,15 @@ def _divide_by_rules(rights: Collection[Right], enclave: str, permissions: Permi
 
 
 def load_zenoh_rights(keystore: OpenedKeystore, *, hidden: bool = False) -> RightsSource:
-    """Return the rights that the Zenoh configurations of a keystore together give its enclaves.
+    """Return the rights that all Zenoh configurations of a keystore together give its enclaves.
 
-    These are the configurations of routers, and of peers, which also connect without the router.
-    ``hidden`` is as in `load_rights`.
+    These are the configurations of routers, and those of peers, which also connect without the
+    router.  ``hidden`` is as in `load_rights`.
 
     Raises:
-        KeystoreError: there is no configuration of a router, or there are several routers that are
-            not connected.
-        DocumentError: Zenoh would not accept a configuration.
+        KeystoreError: no router has a configuration, or there are several routers that are not
+            connected.
+        DocumentError: Zenoh would refuse a configuration.
     """
     from sros_tool.zenoh.configuration import Mode
     from sros_tool.zenoh.document import parse_configuration
@@ -286,7 +287,7 @@ def load_zenoh_rights(keystore: OpenedKeystore, *, hidden: bool = False) -> Righ
             data = keystore.read(file, "Zenoh configuration")
             document = parse_configuration(data, str(file), lines=False)
             configurations[file] = document
-            # Clients are filtered by the router.
+            # the router filters the messages of clients
             if file.name == ROUTER_FILE or (
                 name not in routers and document.mode is not Mode.CLIENT
             ):
@@ -295,7 +296,8 @@ def load_zenoh_rights(keystore: OpenedKeystore, *, hidden: bool = False) -> Righ
         keystore,
         {router: configurations[files[router] / ROUTER_FILE].access.names() for router in routers},
     )
-    # Peers state the rights that both ends of a link have: parts of those that the router states.
+    # Peers state the rights that both ends of a link have, which are parts of those that the router
+    # states.
     of_router = frozenset(
         right for source in sources if source.path.name == ROUTER_FILE for right in source.rights
     )
@@ -327,9 +329,9 @@ def load_zenoh_rights(keystore: OpenedKeystore, *, hidden: bool = False) -> Righ
 def _links(
     sources: Mapping[Path, RightsSource], files: Mapping[str, Path], routers: Sequence[str]
 ) -> RouterLinks | None:
-    """Return which messages pass between routers, and for each enclave the router with its rules.
+    """Return what passes between routers, and for each enclave the router with its rules.
 
-    ``files`` are the folders of the enclaves, and ``sources`` the rights in the configurations
+    ``files`` maps enclaves to their folders, and ``sources`` has the rights in the configurations
     there.
     """
     from sros_tool.translate_zenoh.rights import RouterLinks
@@ -349,8 +351,8 @@ def _links(
 def check_routers(keystore: OpenedKeystore, known: Mapping[str, Collection[str]]) -> None:
     """Raise `KeystoreError` if a router has no rules for another router of the keystore.
 
-    ``known`` maps the enclave of each router to the names for which its configuration has rules. A
-    router without rules for any enclave forwards nothing.
+    ``known`` maps the enclave of each router to the names for which the router's configuration has
+    rules.  A router without rules for any enclave forwards nothing.
     """
     routing = [name for name, names in known.items() if not known.keys() >= {*names}]
     for name in routing:
@@ -463,7 +465,7 @@ def _keystore_rights(
 
 @dataclass(slots=True)
 class _Reader:
-    """Reader of permissions documents, which collects notes about them.
+    """A reader of permissions documents, which collects notes about them.
 
     ``unverified`` are notes on documents whose signature is missing or was not verified.
     """
@@ -475,7 +477,7 @@ class _Reader:
     documents: dict[str, Permissions] = field(default_factory=dict)
 
     def permissions(self, file: Path, label: str) -> tuple[frozenset[Right], tuple[str, ...]]:
-        """Return the rights in a permissions document and the enclaves that it is for."""
+        """Return the rights in a permissions document, and the enclaves for which it is."""
         data = self.files.read(file, "permissions document")
         if b"multipart/signed" in data[:1000].lower():
             try:
@@ -526,13 +528,13 @@ def _first_of_each(permissions: Permissions) -> dict[str, Grant]:
 
 
 def _enclave_of(grant: Grant) -> str:
-    """Return the enclave of a grant: the common name of its subject, or the grant's name."""
+    """Return the enclave of a grant: the common name in its subject, or the grant's name."""
     match = _COMMON_NAME.search(grant.subject)
     return match[1] if match else grant.name or grant.subject
 
 
 def _left_out_notes(grants: Iterable[Grant]) -> Iterator[Note]:
-    """Yield notes on parts of grants that cannot be stated as rights in ROS terms."""
+    """Yield notes on the parts of grants that cannot be expressed as rights in ROS terms."""
     seen: set[str] = set()
     for grant in grants:
         name = _enclave_of(grant)
@@ -568,7 +570,7 @@ class DifferentRight(NamedTuple):
     """The side that has the right."""
     right: Right
     covered_by: Sequence[Right]
-    """Rights of the other side that include this right, such as wildcards."""
+    """Rights of the other side that include this right, such as rights with wildcards."""
 
 
 @shows(spread=("protection",))
@@ -595,9 +597,9 @@ class DifferentDomains(NamedTuple):
     enclave: str
     """Name of the enclave."""
     a: str
-    """The domains of its rights in A, such as ``10`` or ``10,20``."""
+    """The domains of the enclave's rights in A, such as ``10`` or ``10,20``."""
     b: str
-    """The domains of its rights in B."""
+    """The domains of the enclave's rights in B."""
 
 
 class PolicyDifference(NamedTuple):
@@ -615,30 +617,35 @@ class PolicyDifference(NamedTuple):
     protections: Sequence[DifferentProtection]
     """Protection that only one of two policies demands."""
     unanswered: Sequence[Right]
-    """Rights of B whose counterpart, such as the subscriber, an enclave of A has, and no enclave of
-    B."""
+    """Rights of B whose counterpart, such as the right of the subscriber, was in A, but is not in
+    B.
+    """
     domains: Sequence[DifferentDomains]
-    """Enclaves of both sides whose ROS domains differ; only where both sides state them."""
+    """Enclaves of both sides with different ROS domains; only enclaves for which both sides state
+    domains.
+    """
     enclaves: Sequence[DifferentEnclave]
     """Enclaves without rights that only one side has."""
     governance_differs: bool
-    """Whether the governance of the enclaves of A and B differs, or cannot be read."""
+    """Whether the governance of the enclaves differs between A and B, or cannot be read."""
 
 
 class SourcesDifference(NamedTuple):
-    """The difference between two sources of rights; false if there is none."""
+    """The difference between two sources of rights; false if they do not differ."""
 
     scope: frozenset[str] | None
     """The enclaves that were compared; None for all."""
     rights: RightsDifference
     protections: Sequence[tuple[str, StatedProtection]]
-    """Protections that only one of two policies states, with "-" for the first or "+"."""
+    """Protection that only one of two policies states, with "-" for the first, "+" for the second.
+    """
     unanswered: Sequence[Right]
     """As in `PolicyDifference`; empty if a source is only for some enclaves."""
     domains: Sequence[DifferentDomains] = ()
     """As in `PolicyDifference`."""
     enclaves: Sequence[tuple[str, str]] = ()
-    """Enclaves without rights that only one side has, with "-" for the first or "+"."""
+    """Enclaves without rights that only one side has, with "-" for the first, "+" for the second.
+    """
     governance_differs: bool = False
     """As in `PolicyDifference`."""
 
@@ -650,10 +657,10 @@ class SourcesDifference(NamedTuple):
 def compared_enclaves(
     *sides: tuple[SourceKind, frozenset[str] | None],
 ) -> frozenset[str] | None:
-    """Return the enclaves in which two sources are compared; None for all.
+    """Return the enclaves for which two sources are compared; None for all.
 
-    If one source is only for some enclaves, these are compared.  Two exports are compared in all
-    their enclaves, as are two enclaves; an enclave and an export only in that enclave.
+    If one source is only for some enclaves, these are compared.  Two exports, or two enclaves, are
+    compared in all their enclaves.  An enclave and an export are compared only in this enclave.
 
     Args:
         sides: the kind and the ``scope`` of each source, as in `RightsSource`.
@@ -695,7 +702,7 @@ def compare_sources(
 
 
 def _governance_differs(first_source: RightsSource, second_source: RightsSource) -> bool:
-    """Return whether the governance of two keystores or enclaves differs, or cannot be read."""
+    """Return whether the governance of two keystores or enclaves differs or cannot be read."""
     if not {first_source.kind, second_source.kind} <= {"keystore", "enclave"}:
         return False
     try:
@@ -705,7 +712,7 @@ def _governance_differs(first_source: RightsSource, second_source: RightsSource)
 
 
 def _governances(source: RightsSource) -> set[Governance]:
-    """Return the distinct governance documents that enclaves load, without verifying them."""
+    """Return the distinct governance documents that enclaves load; signatures are not verified."""
     keystore = OpenedKeystore(source.path)
     if source.kind == "enclave":
         places = {source.path / GOVERNANCE_FILE}
@@ -722,7 +729,7 @@ def _governances(source: RightsSource) -> set[Governance]:
 def without_added(source: RightsSource, other: RightsSource) -> RightsSource:
     """Return a source without the enclaves that sros adds to a policy, unless ``other`` has them.
 
-    These are the observer of a closed robot, and, compared with a policy, the `_plain_routers`,
+    These are the observer of a closed robot and, if ``other`` is a policy, the `_plain_routers`,
     which a note names.
     """
     observer = {CLOSED_OBSERVER} if folder_of_closed_robot(source.path) else set()
@@ -748,7 +755,7 @@ def without_added(source: RightsSource, other: RightsSource) -> RightsSource:
 
 
 def _plain_routers(source: RightsSource) -> set[str]:
-    """Return the routers of a keystore that have no rights but those that every node needs."""
+    """Return the routers of a keystore that only have the rights that every node needs."""
     settings = OpenedKeystore(source.path).settings if source.kind == "keystore" else None
     rights = defaultdict(set)
     for right in source.rights:
@@ -765,7 +772,7 @@ def is_plain_router(settings: Template | None, name: str, rights: Iterable[Right
 def _domain_differences(
     first_source: RightsSource, second_source: RightsSource, scope: Collection[str] | None
 ) -> list[DifferentDomains]:
-    """Return the enclaves of both sources that have rights in different ROS domains."""
+    """Return the enclaves whose rights in the two sources are for different ROS domains."""
     before, after = _stated_domains(first_source), _stated_domains(second_source)
     return [
         DifferentDomains(enclave, before[enclave], after[enclave])
@@ -775,7 +782,7 @@ def _domain_differences(
 
 
 def _stated_domains(source: RightsSource) -> dict[str, str]:
-    """Map the enclaves of a source to the ROS domains that it states for their rights."""
+    """Map the enclaves of a source to the ROS domains that the source states for their rights."""
     if source.kind == "zenoh":
         return {}
     ranges: dict[str, list[tuple[int, int]]] = defaultdict(list)
@@ -792,7 +799,7 @@ def _stated_domains(source: RightsSource) -> dict[str, str]:
 def _protection_differences(
     first_source: RightsSource, second_source: RightsSource
 ) -> list[tuple[str, StatedProtection]]:
-    """Return the protections that only one of two policies states, with "-" or "+"."""
+    """Return the protection that only one of two policies states, with "-" or "+"."""
     if first_source.protections is None or second_source.protections is None:
         return []
     protections, other = set(first_source.protections), set(second_source.protections)
@@ -833,8 +840,8 @@ def policy_difference(
 class SignedRights(NamedTuple):
     """The rights in signed permissions.
 
-    ``policy`` is the SHA-256 of the policy that they were made from; "" if the ledger lacks it.
-    ``nodes`` are the nodes of the policy that the permissions do not show, as in the ledger.
+    ``policy`` is the SHA-256 of the policy from which they were made; "" if the ledger lacks it.
+    ``nodes`` are nodes of the policy that the permissions do not show, as in the ledger.
     """
 
     grant: Grant
@@ -843,8 +850,9 @@ class SignedRights(NamedTuple):
 
 
 _MOST_LOOKUPS = 200
-"""Number of enclaves up to which the ledger is searched for each one; for more, the whole ledger is
-read.
+"""Number of enclaves up to which the ledger is searched for each enclave.
+
+For more enclaves, the whole ledger is read.
 """
 
 
@@ -852,7 +860,7 @@ class _LedgerPermissions:
     """The permissions in the ledger, or in the part of the ledger about some enclaves.
 
     ``last`` maps enclaves to their last permissions.  ``chained`` are enclaves with permissions
-    after the lines without a hash chain, ``certain`` those with permissions after the last gap.
+    after the lines without a hash chain, and ``certain`` those with permissions after the last gap.
     """
 
     def __init__(self, ledger: Ledger, keystore: OpenedKeystore) -> None:
@@ -860,7 +868,7 @@ class _LedgerPermissions:
         self.unchained = ledger.unchained
         chained = ledger.entries[ledger.unchained :]
         self.chained = {entry.enclave for entry in chained if entry.what == "permissions"}
-        # What ros2/sros2 made is recorded by the first write of sros.
+        # The first write of sros records the files of ros2/sros2.
         self.complete = not keystore.is_of_ros2
         self.last = {
             entry.enclave: entry for entry in ledger.entries if entry.what == "permissions"
@@ -869,10 +877,10 @@ class _LedgerPermissions:
 
 
 class RecordedRights:
-    """The rights that were last signed for each enclave, according to the ledger.
+    """The rights that were last signed for each enclave, by the ledger.
 
-    The signature of older permissions stays valid, so whoever puts them back could otherwise have
-    their rights signed again, with a new date.
+    Signatures of older permissions stay valid.  Without this check, whoever puts older permissions
+    back could have their rights signed again, with a new date.
     """
 
     def __init__(self, keystore: OpenedKeystore, ledger: Ledger | None = None) -> None:
@@ -888,7 +896,7 @@ class RecordedRights:
         )
 
     def _ledger_part(self, name: str) -> _LedgerPermissions:
-        """Return the part of the ledger about an enclave, and perhaps about others."""
+        """Return a part of the ledger with all lines about an enclave, and perhaps others."""
         file, are_few = self._keystore.ledger_file, len(self._looked_up) < _MOST_LOOKUPS
         if self._whole or "_whole_ledger" in self.__dict__ or not file.is_indexed:
             return self._whole_ledger
@@ -902,14 +910,14 @@ class RecordedRights:
         return self._looked_up[name]
 
     def rights_to_sign(self, name: str, digest: str, grant: Grant) -> SignedRights:
-        """Return the rights in an enclave's permissions, to sign them again.
+        """Return the rights in an enclave's permissions, for signing them again.
 
         ``grant`` has the rights; ``name``, ``digest`` and errors are as for `policy`.
         """
         return SignedRights(grant, self.policy(name, digest), self.nodes(name))
 
     def nodes(self, name: str) -> str:
-        """Return the nodes of an enclave's last permissions, as text from the ledger."""
+        """Return the nodes of an enclave's last permissions, as the text in the ledger."""
         last = self.last(name)
         return last.nodes if last else ""
 
@@ -918,7 +926,7 @@ class RecordedRights:
         return self._ledger_part(name).last.get(name)
 
     def latest(self, name: str, digest: str) -> Entry | None:
-        """Return the last ledger entry of an enclave; None unless it records these permissions.
+        """Return the last ledger entry of an enclave if it records these permissions, else None.
 
         ``name`` and ``digest`` are as for `policy`.
         """
@@ -928,7 +936,7 @@ class RecordedRights:
         return None
 
     def unproven_entries(self) -> dict[str, Entry]:
-        """Map enclaves to their last entries, if these are from before the hash chain."""
+        """Map enclaves to their last entries if these are from before the hash chain."""
         of_all = self._whole_ledger
         if not of_all.unchained:
             return {}
@@ -939,7 +947,7 @@ class RecordedRights:
 
         Args:
             name: the enclave.
-            digest: the SHA-256 of its current permissions document, in hexadecimal.
+            digest: the SHA-256 of the enclave's present permissions document, in hexadecimal.
 
         Raises:
             KeystoreError: the document is not the last one that the ledger records for the enclave.

@@ -1,6 +1,6 @@
-"""Selection of the enclaves that a verb works on: by name, by pattern, or by robot.
+"""Selection of the enclaves on which a verb works: by name, by pattern, or by robot.
 
-The error for a missing enclave says whether it was revoked, or its name may be a typo.
+The error for a missing enclave says whether it was revoked, or what its name may be a typo of.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ class EnclaveList(NamedTuple):
     hidden: Sequence[str]
     """Names of enclaves in hidden folders, sorted; DDS loads them, but sros leaves them out."""
     robots: Mapping[str, str] | None
-    """Robot of each enclave that belongs to a robot; null for a keystore without a fleet."""
+    """Maps each enclave of a robot to the robot; null for a keystore without a fleet."""
 
 
 def robots_of(keystore: OpenedKeystore, names: Sequence[str]) -> dict[str, str] | None:
-    """Map each enclave in ``names`` that belongs to a robot to the robot; None without a fleet."""
+    """Map each enclave in ``names`` that belongs to a robot to this robot; None without a fleet."""
     fleet = load_fleet(keystore)
     if fleet is None:
         return None
@@ -71,8 +71,8 @@ def select_enclaves(
 ) -> tuple[str, ...]:
     """Return ``names``, then the enclaves that match ``patterns``, then those of ``robots``.
 
-    Each enclave is returned once.  In a pattern ``*`` stands for any part of a name, "/" included,
-    as in policies.  With ``checked``, ``robots`` are only accepted if nobody edited the fleet file.
+    Each enclave is returned once.  In a pattern, ``*`` stands for any text, including "/", as in
+    policies.  With ``checked``, ``robots`` are only accepted if nobody edited the fleet file.
 
     Raises:
         KeystoreError: a pattern matches no enclave, or a robot has none.
@@ -101,14 +101,15 @@ def select_to_revoke(
 ) -> tuple[tuple[str, ...], tuple[Note, ...]]:
     """Return the enclaves to revoke, and notes on enclaves of ``robots`` that the fleet lacks.
 
-    As `select_enclaves`, but a robot also has all enclaves in its folder, such as ``/r3/spare``.
+    This works like `select_enclaves`, except that a robot also has all enclaves in its folder, such
+    as ``/r3/spare``.
 
     Raises:
         KeystoreError: as `select_enclaves`.
         DocumentError: as `select_enclaves`.
     """
     if not (patterns or robots):
-        return tuple(names), ()  # the verb says what is wrong with a name
+        return tuple(names), ()  # the verb reports what is wrong with a name
     chosen = dict.fromkeys(select_enclaves(keystore, names, patterns))
     unrecorded: dict[str, Unrecorded] = {}
     by_name = partial(_revocation_by_name, keystore, robots)
@@ -124,8 +125,9 @@ def select_to_revoke(
 def _revocation_by_name(keystore: OpenedKeystore, robots: Sequence[str]) -> str:
     """Return sentences on how to revoke the enclaves of robots although the fleet was edited.
 
-    They name the enclaves that the edited file gives to the robots, and those with their names in
-    the paths: both only propose, because whoever edited the file may be the thief.
+    They name the enclaves that the edited file gives to the robots, and those with the robots'
+    names in their paths.  Both are only proposals, because whoever edited the file may be the
+    thief.
     """
     root, fleet = quote(str(keystore.root)), None
     with suppress(SrosError):
@@ -149,8 +151,8 @@ def _possible_enclaves(
 ) -> Sequence[str]:
     """Return all enclaves that may belong to ``robots``, and perhaps others.
 
-    In a keystore with an index, these are the enclaves in the folders of the robots, and those that
-    the ledger has with the name of a robot or such a folder in their paths.
+    If the ledger has an index, these are the enclaves in the folders of the robots, and enclaves in
+    the ledger with the name of a robot or of such a folder in their paths.
     """
     folders = folders_of_robots(fleet, robots)
     recorded = keystore.ledger_file.recorded_with(*robots, *folders)
@@ -233,16 +235,16 @@ def _robots_enclaves(
 
 
 def _enclaves_named_after(keystore: OpenedKeystore, robot: str) -> list[str]:
-    """Return the enclaves with the name of a robot as a part of their paths."""
+    """Return the enclaves that have the name of a robot as a part of their paths."""
     return [name for name in keystore.names if robot in name.split("/")[1:]]
 
 
 _SHOWN = 5
-"""Largest number of enclaves that an error names."""
+"""Maximum number of enclaves that an error names."""
 _ALIKE = 0.75
 """Lowest similarity (`difflib`) that counts as a typo: one of four letters differs."""
 _WHOLE_ALIKE = 0.9
-"""Lowest similarity for a typo in a full name: names in a namespace have the same beginning."""
+"""Lowest similarity for a typo in a full name, because names in a namespace begin alike."""
 
 
 def missing_enclave_error(
@@ -254,7 +256,7 @@ def missing_enclave_error(
 ) -> SrosError:
     """Return the error for the missing enclave ``name``, with similar ``existing_enclaves``.
 
-    Without ``may_create`` it does not advise to create the enclave.
+    Without ``may_create``, the error does not suggest creating the enclave.
     """
     root = keystore.root
     if revocation := revocation_of(keystore, name):
@@ -313,20 +315,20 @@ _DDS_TOPICS = {
     "service": ">rq{}Request<",
     "action": ">rq{}/_action/send_goalRequest<",
 }
-"""For each kind of ROS name, the DDS topic in the permissions of enclaves that use the name."""
+"""Maps a kind of ROS name to the DDS topic in the permissions of enclaves that use the name."""
 
 
 def _uses(keystore: OpenedKeystore, name: str, names: Sequence[str]) -> dict[str, list[str]]:
-    """Map each kind that ``name`` has in permissions to the enclaves that have it; always "node".
+    """Map each kind that ``name`` has in permissions to the enclaves that use it; always "node".
 
-    A node is of the enclaves that may serve its parameters.
+    A node belongs to the enclaves that may serve its parameters.
     """
     uses: dict[str, list[str]] = {"node": []}
     for enclave in names:
         with suppress(SrosError, OSError):
             document = keystore.read(keystore.folder(enclave) / PERMISSIONS_FILE, "permissions")
             for kind, topic in _DDS_TOPICS.items():
-                if os.fsencode(topic.format(name)) in document:  # a name that is not UTF-8, too
+                if os.fsencode(topic.format(name)) in document:  # the name may not be UTF-8
                     uses.setdefault(kind, []).append(enclave)
     return uses
 
@@ -336,13 +338,13 @@ def revocation_of(keystore: OpenedKeystore, name: str) -> Entry | None:
     try:
         entries = keystore.ledger_with("enclave", name).entries
     except SrosError:
-        return None  # the missing enclave is the error to report here
+        return None  # only the missing enclave is to be reported here
     of_enclave = [
         e for e in entries if e.enclave == name and e.what in ("certificate", "revocation")
     ]
     if not of_enclave or of_enclave[-1].what != "revocation":
         return None
-    # One revocation has an entry for each certificate; only one of them has files.
+    # A revocation has an entry for each certificate, but only one of these has files.
     kept = (e for e in reversed(of_enclave) if e.serial and keystore.has(f"{REVOKED}/{e.serial}"))
     return next(kept, of_enclave[-1])
 
@@ -363,9 +365,9 @@ def _revoked_enclave_error(keystore: OpenedKeystore, entry: Entry) -> SrosError:
 def likely_names(name: str, existing_enclaves: Collection[str]) -> tuple[str, ...]:
     """Return at most three enclaves that a mistyped ``name`` may mean.
 
-    These are the enclaves whose names end with ``name``, because people leave out the namespace; if
-    there are none, enclaves whose last part is similar; if there are none, enclaves whose full name
-    is similar.  Capital letters do not count.
+    These are the enclaves whose names end with ``name``, because people leave out the namespace.
+    If there are none, they are the enclaves whose last part is similar, or else those whose full
+    name is similar.  Upper and lower case count as equal.
     """
     end = "/" + name.strip("/").lower()
     if end == "/":

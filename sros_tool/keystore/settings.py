@@ -1,7 +1,7 @@
-"""The settings of a keystore: writing ``sros.toml``, reading it, and finding edits by hand.
+"""The settings of a keystore: writing ``sros.toml``, reading it, and finding manual edits.
 
-The ledger has the text of the settings as sros wrote them last, so that an edit is noticed, and can
-be applied (`sros_tool.keystore.lifecycle.update`) or undone.
+The ledger has the text of the settings that sros wrote last.  So an edit is noticed, and can be
+applied (`sros_tool.keystore.lifecycle.update`) or undone.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _COMMENT = """\
 
 
 def write_settings(transaction: Transaction, template: Template, now: datetime) -> Entry:
-    """Stage ``template`` as the settings of the keystore; return the entry for the ledger."""
+    """Stage ``template`` as the settings of the keystore, and return the entry for the ledger."""
     text = render_template(template)
     document = (_COMMENT + text).encode()
     transaction.write(SETTINGS, document)
@@ -46,9 +46,9 @@ def write_settings(transaction: Transaction, template: Template, now: datetime) 
 
 
 def _recorded_settings(ledger: Ledger) -> Template | None:
-    """Return the settings that sros wrote last, or None if the ledger has none.
+    """Return the settings that sros wrote last; None if the ledger has none.
 
-    Only lines after the last gap count: others may be forged, or older than the settings.
+    Only lines after the last gap count, because others may be forged, or older than the settings.
     """
     for entry in reversed(ledger.certain):
         if entry.what == "settings":
@@ -61,7 +61,7 @@ class HandEdits(NamedTuple):
     """Manual edits of settings and governance files that sros has not applied yet.
 
     ``settings`` are clauses on keys of ``sros.toml``; ``governance`` is a clause on
-    ``governance.xml``, or "".  ``unsigned`` are clauses on protection that ``sros.toml`` states and
+    ``governance.xml``, or "".  ``unsigned`` are clauses on protection that ``sros.toml`` states but
     the signed governance lacks.
     """
 
@@ -79,12 +79,12 @@ class HandEdits(NamedTuple):
 
 
 class PresentSettings(NamedTuple):
-    """The settings in force in a keystore, and edits by hand.
+    """The settings in force in a keystore, and manual edits.
 
-    ``settings`` are the settings as sros wrote them last, with the protection of the signed
-    ``governance``.  ``written`` are the settings in ``sros.toml`` now; None if it is missing or
-    cannot be read, and for a keystore ``without_settings``, as ros2/sros2 makes them.  ``recorded``
-    are the settings in the ledger.
+    ``settings`` are the settings that sros wrote last, with the protection of the signed
+    ``governance``.  ``written`` are the settings that are now in ``sros.toml``; None if the file is
+    missing or cannot be read.  ``recorded`` are the settings in the ledger.  ``without_settings``
+    says that the keystore has no settings, as made by ros2/sros2.
     """
 
     settings: Template
@@ -111,7 +111,8 @@ class PresentSettings(NamedTuple):
         """Return the settings to which a single change is applied.
 
         Raises:
-            KeystoreError: no settings can state the governance, so a change would replace it.
+            KeystoreError: settings cannot express the governance, so a change would replace the
+                governance.
         """
         if self.without_settings and protection_for(self.governance) is None:
             raise KeystoreError(
@@ -165,7 +166,7 @@ _SHOWN = 3
 
 
 def edit_notes(keystore: OpenedKeystore, governance: Governance) -> tuple[Note, ...]:
-    """Return a note on files that were edited by hand, for a verb that does not apply the edits.
+    """Return a note on manually edited files, for a verb that does not apply the edits.
 
     ``governance`` is the signed governance of the keystore.
     """
@@ -179,7 +180,7 @@ def edit_notes(keystore: OpenedKeystore, governance: Governance) -> tuple[Note, 
 
 
 def found_edits(keystore: OpenedKeystore, governance: Governance | None) -> HandEdits:
-    """Return the edits by hand; ``governance`` is the signed governance, None if unreadable."""
+    """Return the manual edits; ``governance`` is the signed governance, None if unreadable."""
     ledger = keystore.ledger_with("what", "settings")
     return hand_edits(keystore, ledger, keystore.settings, governance)
 
@@ -199,11 +200,11 @@ def hand_edits(
     present: Template | None,
     governance: Governance | None,
 ) -> HandEdits:
-    """Return the edits by hand, found by comparing ``sros.toml`` with ledger and governance.
+    """Return the manual edits, found by comparing ``sros.toml`` with ledger and governance.
 
-    ``present`` are the settings in ``sros.toml``, ``governance`` is the signed governance; None if
-    unreadable.  A keystore of ros2/sros2 has no settings, so only its ``governance.xml`` is
-    compared.
+    ``present`` are the settings in ``sros.toml``, and ``governance`` is the signed governance; None
+    if they cannot be read.  A keystore of ros2/sros2 has no settings, so only its
+    ``governance.xml`` is compared.
     """
     recorded = _recorded_settings(ledger)
     settings: tuple[str, ...] = ()
@@ -220,13 +221,13 @@ def hand_edits(
 def _unsigned_clauses(
     present: Template, recorded: Template | None, settings: Sequence[str]
 ) -> Iterator[str]:
-    """Yield a clause if the signed governance is not what sros.toml states."""
+    """Yield a clause if the signed governance does not have what sros.toml states."""
     if not settings or (recorded and recorded.protection == present.protection):
         yield f"the signed governance differs from [protection] in {SETTINGS}"
 
 
 def _difference_clauses(old: Template, new: Template) -> Iterator[str]:
-    """Yield a clause for each key with different values; name and description do not count."""
+    """Yield a clause for each key with different values, except name and description."""
     if old == new:
         return
     before, after = settings_values(old), settings_values(new)
@@ -237,7 +238,7 @@ def _difference_clauses(old: Template, new: Template) -> Iterator[str]:
 
 
 def _governance_edit(keystore: OpenedKeystore) -> str:
-    """Return a clause if ``governance.xml`` differs from the signed governance; else ""."""
+    """Return a clause if ``governance.xml`` differs from the signed governance, or ""."""
     if not all((keystore.root / file).is_file() for file in (GOVERNANCE_XML, GOVERNANCE_P7S)):
         return ""
     try:
@@ -255,9 +256,9 @@ def _governance_edit(keystore: OpenedKeystore) -> str:
 
 
 def with_places(template: Template, places: Template) -> Template:
-    """Return ``template`` with the places of the CA keys in ``places``, another template.
+    """Return ``template`` with the places of the CA keys from the template ``places``.
 
-    Unless it has its own Zenoh network, it also gets the Zenoh network of ``places``.
+    If ``template`` has no Zenoh network, it also gets that of ``places``.
     """
     return replace(
         template,

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 DEFAULT_TEMPLATE = "development"
 EVERYTHING, NODE_BASICS = "everything", "node_basics"
 CA_SERVICE_SCHEME = "issuer:"
-"""Begins the place of an identity CA's key that stands for a CA service, such as issuer:NAME."""
-_LONGEST_AUTHORITY_NAME = 40  # characters; a common name also has the role and a number
+"""The prefix of a key's place that stands for a CA service, such as issuer:NAME."""
+_LONGEST_AUTHORITY_NAME = 40  # in characters; a common name also has the role and a number
 _DATA_LEVELS = (Level.NONE, Level.SIGN, Level.ENCRYPT)
 _KINDS: dict[str, str] = {"topic": "topics", "service": "services", "action": "actions"}
 _TYPES: dict[type, str] = {str: "a string", bool: "a boolean", list: "a list"}
@@ -61,13 +61,13 @@ class ShortLived(NamedTuple):
 class Template:
     """The settings of a keystore.
 
-    ``authority_name`` begins the common names of its CAs.  Durations count from the creation of a
-    certificate or document.  ``default_permissions`` is `EVERYTHING` or `NODE_BASICS`.
+    ``authority_name`` is the beginning of the CAs' common names.  Durations count from the creation
+    of a certificate or document.  ``default_permissions`` is `EVERYTHING` or `NODE_BASICS`.
     ``identity_key`` and ``permissions_key`` are the URIs of CA keys outside of the keystore.  With
     ``unique_subject``, the subject of every certificate has a unique part.  ``short_lived`` are
     enclaves whose certificates and permissions expire earlier than the others.  ``zenoh`` is the
-    network for which enclaves get Zenoh configurations, or None.  ``distributions`` are the
-    ROS 2 distributions that the keystore has to fit; () if the template states none.
+    network for which enclaves get Zenoh configurations, or None.  ``distributions`` are the ROS 2
+    distributions for which the keystore must work; () if the template states none.
     """
 
     name: str
@@ -88,11 +88,11 @@ class Template:
     distributions: tuple[str, ...] = ()
 
     def key_place(self, role: str) -> str:
-        """Return the URI of the key of the identity or permissions CA; "" in the keystore."""
+        """Return the URI of the identity or permissions CA's key; "" for a key in the keystore."""
         return self.identity_key if role == IDENTITY else self.permissions_key
 
     def longest_validity(self, enclave: str) -> timedelta | None:
-        """Return the longest validity of a short-lived enclave; None for all others."""
+        """Return the longest validity of a short-lived enclave; None for other enclaves."""
         validities = (
             short_lived.validity
             for short_lived in self.short_lived
@@ -139,7 +139,7 @@ def read_template(path: Path) -> Template:
 
 
 def decode_template(data: bytes, path: Path, kind: str, remedy: str) -> Template:
-    """Return the template in ``data``; ``path``, ``kind`` and ``remedy`` are for errors."""
+    """Return the template in ``data``; the other arguments are for errors."""
     try:
         return parse_template(data.decode(), path.stem)
     except _TemplateError as error:
@@ -149,14 +149,14 @@ def decode_template(data: bytes, path: Path, kind: str, remedy: str) -> Template
 
 
 class _TemplateError(ValueError):
-    """A key of a template that is missing, unknown, or has a value that is not valid."""
+    """A key of a template is missing, unknown, or has an invalid value."""
 
 
 @lru_cache(maxsize=16)
 def parse_template(text: str, name: str) -> Template:
     """Return the template in TOML text; ``name`` is its name if the text states none.
 
-    The last texts are not parsed again: most verbs read the settings several times.
+    Results are cached, because most verbs read the settings several times.
 
     Raises:
         tomllib.TOMLDecodeError: the text is not TOML.
@@ -195,7 +195,7 @@ def _template(values: object, name: str) -> Template:
 
 
 def render_template(template: Template) -> str:
-    """Return the template as TOML text, from which `parse_template` returns an equal template."""
+    """Return the template as TOML, from which `parse_template` returns an equal template."""
     protection = template.protection
     lines = [
         f"name = {_toml(template.name)}",
@@ -263,7 +263,7 @@ def _read_short_lived(table: _Table) -> Iterator[ShortLived]:
 
 
 def _read_zenoh(table: _Table) -> ZenohNetwork:
-    from sros_tool.zenoh.configuration import (  # most keystores have none
+    from sros_tool.zenoh.configuration import (  # most keystores have no Zenoh network
         Mode,
         ZenohNetwork,
         is_endpoint,
@@ -352,7 +352,7 @@ def _zenoh_lines(network: ZenohNetwork) -> Iterator[str]:
 def settings_values(template: Template) -> dict[str, str]:
     """Map the keys of a template, such as ``protection.rtps``, to their values as text.
 
-    The protection of single names has keys such as ``protection.topic /camera/*.data``.
+    The protection of names has keys such as ``protection.topic /camera/*.data``.
     """
     values: dict[str, str] = {}
 
@@ -385,12 +385,12 @@ def with_values(
     Args:
         template: the template.
         values: keys, such as ``protection.rtps``, with their new values as text.
-        rules: protections of names, which replace the current protection of these names.
-        dropped: kinds and names (``topic``, ``/camera/*``) whose own protection is removed.  Names
-            without a leading / count from the root, as in a template.
+        rules: protection of names, which replaces the present protection of these names.
+        dropped: kinds and names (``topic``, ``/camera/*``) whose own protection is removed.  As in
+            a template, names without a leading / begin at the root.
 
     Raises:
-        UsageError: a template has no such key or value, or a dropped name has no protection.
+        UsageError: templates do not have the key or value, or a dropped name has no own protection.
     """
     table = parse_toml(render_template(template))
     protection = table["protection"]
@@ -488,7 +488,8 @@ def _topic_lines(protection: TopicProtection) -> list[str]:
 def _toml(value: str | bool) -> str:
     if isinstance(value, bool):
         return json.dumps(value)
-    # A JSON string is a TOML basic string, except for one character that TOML requires escaped.
+    # A JSON string is a TOML basic string, except that TOML also requires an escape for one
+    # character.
     return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
@@ -497,7 +498,7 @@ _OF_DOMAIN: dict[str, Any] = {
     for field in fields(DomainProtection)
     if field.name not in ("default", "named")
 }
-"""The keys of [protection] for the whole domain, with their defaults."""
+"""Maps the keys of [protection] for the whole domain to their defaults."""
 
 
 def _read_protection(table: _Table) -> DomainProtection:
@@ -542,7 +543,7 @@ def _read_topic_protection(table: _Table, default: TopicProtection) -> TopicProt
 
 
 class _Table:
-    """Reader of a TOML table: each method removes a key, and `finish` refuses remaining keys."""
+    """A reader of a TOML table: each method removes a key, and `finish` refuses the others."""
 
     def __init__(self, values: object, path: str) -> None:
         if not isinstance(values, dict):
@@ -582,14 +583,14 @@ class _Table:
         return str(self._take(key, str, default))
 
     def texts(self, key: str, default: list[str] | None = None) -> list[str]:
-        """Return a list of texts, which must not be empty; ``default`` if the key is missing."""
+        """Return a list of texts, which must not be empty; ``default`` if there is no such key."""
         values = self._take(key, list, default)
         if not (values or default == []) or not all(isinstance(value, str) for value in values):
             raise _TemplateError(f"{self._at(key)} is not a list of names")
         return list(values)
 
     def numbers(self, key: str, maximum: int) -> list[int]:
-        """Return a list of numbers from 0 to ``maximum``; empty if the key is missing."""
+        """Return a list of numbers from 0 to ``maximum``; empty if there is no such key."""
         values = self._take(key, list, [])
         if not all(type(value) is int and 0 <= value <= maximum for value in values):
             raise _TemplateError(f"{self._at(key)} is not a list of numbers from 0 to {maximum}")

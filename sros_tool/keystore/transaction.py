@@ -1,13 +1,13 @@
-"""Transactions: atomic changes of many files in a keystore, even if the machine stops.
+"""Transactions: changes of many files in a keystore that stay atomic even if the machine stops.
 
-New files are written to a stage, ``.sros-transaction`` in the keystore.  The commit
-(`Transaction.commit`) changes existing files in three steps.  Each path becomes a link to
-``.sros-transaction/live/<name>``; ``live`` is a link to ``before``, so the content is still the
-old one.  Then ``live`` is pointed at ``after``, which changes all files at once.  Finally plain
-files replace the links, and new folders move to their places (`_recover`).  If the machine stops at
-any moment, DDS finds either all old files or all new files, and the next transaction recovers: it
-completes a committed transaction and undoes any other.  Each step of a recovery can be repeated and
-skips finished work, so an interrupted recovery can be repeated, too.
+New files are written to the stage, the folder ``.sros-transaction`` in the keystore.  The commit
+(`Transaction.commit`) changes existing files in three steps.  First, each path becomes a link to
+``.sros-transaction/live/<name>``, where ``live`` is a link to ``before``, so that the content is
+still the old one.  Then ``live`` becomes a link to ``after``, which changes all files at once.
+Finally plain files replace the links, and new folders move to their places (`_recover`).  If the
+machine stops at any moment, DDS finds either all old files or all new files, and the next
+transaction recovers: it completes a committed transaction, and undoes an uncommitted one.  Each
+step of a recovery skips finished work, so an interrupted recovery can be repeated, too.
 
 A new keystore is created in a sibling folder and renamed to its path.
 
@@ -69,15 +69,15 @@ from sros_tool.xml import read_bytes
 _BEFORE, _AFTER, _LIVE, _ADDED, MANIFEST = "before", "after", "live", "added", "manifest.json"
 _VERSION = 3
 _EARLIER = 2
-"""The version without moves of folders."""
+"""The earlier version of the manifest, without moves of folders."""
 
 
 class Move(NamedTuple):
     """The change of a path in an existing folder of the keystore.
 
-    ``before`` and ``after`` are the content of the path: None for nothing, "" for a file, and the
-    target of a symbolic link.  If the path is the certificate of an enclave whose whole folder
-    moves, ``to`` is the new path of that folder.
+    ``before`` and ``after`` say what is at the path: None for nothing, "" for a file, or the target
+    of a symbolic link.  If the path is the certificate of an enclave whose whole folder moves,
+    ``to`` is the new path of that folder.
     """
 
     path: str
@@ -92,11 +92,11 @@ _ADOPT = "adopt"
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A file or link that a transaction changes.
+    """A change of a file or link by a transaction.
 
-    ``action`` is "create", "replace" or "remove", or `_CLOSE` for a private key or a folder of keys
-    that other users could open before, or `_ADOPT` for a keystore of ros2/sros2 that gets its
-    settings and ledger; ``path`` is relative to the keystore.
+    ``action`` is "create", "replace" or "remove".  It is `_CLOSE` for a private key or a folder of
+    keys that other users could open before, and `_ADOPT` for a keystore of ros2/sros2 that gets
+    settings and a ledger.  ``path`` is relative to the keystore.
     """
 
     action: str
@@ -106,7 +106,7 @@ class Change:
 class ChangeRun(NamedTuple):
     """The same action on several files of a folder; ``folder`` is "" or ends with "/".
 
-    With ``file``, it is the action on this file of each enclave in ``names``.
+    With ``file``, ``names`` are enclaves, and the action is on this file of each enclave.
     """
 
     action: str
@@ -122,14 +122,14 @@ class ChangeRun(NamedTuple):
 class Changes(Sequence[Change]):
     """The changes of a transaction, in order.
 
-    Consecutive changes of the same kind are stored together: most folders of a large keystore get
-    the same files, whose names are in memory only once.
+    Consecutive changes of the same kind are stored together.  Most folders of a large keystore get
+    the same files, whose names are kept in memory only once.
     """
 
     def __init__(self) -> None:
         """Create an empty list of changes."""
         self._runs: list[ChangeRun] = []
-        self._ends: list[int] = []  # how many changes there are up to the end of each run
+        self._ends: list[int] = []  # the number of changes up to the end of each run
         self._names: dict[tuple[str, ...], tuple[str, ...]] = {}
         self._last_is_open = False
 
@@ -190,7 +190,8 @@ class Changes(Sequence[Change]):
 class Staged:
     """The changes that a forked worker staged, sent to the process that commits.
 
-    ``kept`` has the new files and link targets of a dry run; None for files beyond its limit.
+    ``kept`` has the new files and link targets of a dry run; None stands for files beyond the
+    limit.
     """
 
     changes: tuple[ChangeRun, ...]
@@ -199,7 +200,7 @@ class Staged:
 
 
 def staged_name(path: str) -> str:
-    """Return the name of a path's file in the stage; short, so that a link fits in an inode."""
+    """Return a path's file name in the stage, which is so short that a link fits in an inode."""
     return hashlib.blake2b(os.fsencode(path), digest_size=8).hexdigest()
 
 
@@ -214,7 +215,7 @@ def _relocated_target(path: str, text: str) -> str:
 
 
 def _point_live(folder: Folder, to: str) -> None:
-    """Atomically point the ``live`` symlink of the stage at ``to``: ``before`` or ``after``."""
+    """Atomically make the link ``live`` of the stage lead to ``to``, ``before`` or ``after``."""
     folder.symlink(to, f"{STAGE}/{_LIVE}.next")
     folder.replace(f"{STAGE}/{_LIVE}.next", f"{STAGE}/{_LIVE}")
 
@@ -272,11 +273,11 @@ _STAGED_NAME = re.compile(r"[0-9a-f]{16}")
 
 
 def _check_stage(folder: Folder) -> str | None:
-    """Return the target of the link ``live``: _BEFORE, _AFTER, or None if nothing was changed yet.
+    """Return the target of the link ``live`` (_BEFORE or _AFTER); None if nothing was changed yet.
 
-    Whoever can write to the keystore, or packed it into an archive, could forge a stage, to have
-    the next verb of another user move files.  A stage is only accepted if sros, run by this user or
-    by the owner of the keystore, can have made all of it.
+    Whoever can write to the keystore, or packed it into an archive, could forge a stage, so that
+    the next verb of another user moves files.  So a stage is only accepted if sros can have made
+    all of it, run by this user or by the owner of the keystore.
 
     Raises:
         KeystoreError: another user made the stage, or it has the format of another version.
@@ -314,7 +315,7 @@ def _check_stage(folder: Folder) -> str | None:
 
 
 def check_interrupted(folder: Folder) -> tuple[str | None, tuple[Move, ...]]:
-    """Return the target of ``live`` in a stage, and the moves to complete or to undo.
+    """Return the target of ``live`` in a stage, and the moves to complete or undo.
 
     Raises:
         KeystoreError: as `_check_stage` and `_read_manifest`.
@@ -324,7 +325,7 @@ def check_interrupted(folder: Folder) -> tuple[str | None, tuple[Move, ...]]:
 
 
 def _check_added(folder: Folder, path: str) -> None:
-    """Raise `KeystoreError` unless all files below an added folder can belong to a keystore."""
+    """Raise `KeystoreError` unless all files in an added folder can belong to a keystore."""
     added_path = f"{STAGE}/{_ADDED}/{path}".rstrip("/")
     if stat.S_ISDIR(folder.mode(added_path)):
         _check_owner(folder, added_path)
@@ -374,16 +375,16 @@ _LOG = logging.getLogger(__name__)
 _KEY_FOLDERS = (PRIVATE, ENCLAVES, REVOKED, RETIRED)
 _MOST_LINKS = 8
 _MOST_KEPT = 32 << 20
-"""Bytes of new files that a dry run keeps in memory, for `Transaction.content_after`."""
+"""Number of bytes of new files that a dry run keeps in memory, for `Transaction.content_after`."""
 
 
 class Transaction:
     """An atomic change of many files of a keystore, which is locked during the change.
 
-    Use it as a context manager; without `commit` nothing changes.  Unless ``new_keystore`` is set,
-    the keystore must exist.  With ``dry_run`` nothing is written, and ``changes`` lists the changes
-    that would be made.  With ``partial``, the caller may leave out enclaves: some may be
-    unreadable.
+    A transaction is a context manager, and changes nothing without `commit`.  Unless
+    ``new_keystore`` is set, the keystore must exist.  With ``dry_run``, nothing is written, and
+    ``changes`` lists the changes that would be made.  With ``partial``, some enclaves may be
+    unreadable, because the caller may leave them out.
     """
 
     def __init__(
@@ -404,29 +405,29 @@ class Transaction:
         self._folder: Folder | None = None
         self._lock: KeystoreLock | None = None
         self._sibling = ""
-        self._staged: dict[str, tuple[str, ...]] = {}  # the names in each folder
+        self._staged: dict[str, tuple[str, ...]] = {}  # the names of staged files in each folder
         self._names: dict[tuple[str, ...], tuple[str, ...]] = {}
         self._folders: dict[str, bool] = {}  # whether the folder exists in the keystore
-        self._parents: set[str] = set()  # of folders that are staged
+        self._parents: set[str] = set()  # parents of staged folders
         self._moves: list[Move] = []
         self._linked: frozenset[str] = frozenset()
         self._undo: list[Callable[[], None]] = []
         self._after: list[Callable[[], None]] = []
         self._adopts = False
-        # New files, None for those beyond the limit, and targets of links, of a dry run.
+        # In a dry run, maps paths to new files (None beyond the limit) and to targets of links.
         self._path_of_old_content: dict[str, bytes | str | None] = {}
         self._kept_bytes = 0
 
     @property
     def _in(self) -> Folder:
-        """The folder to write in: the keystore's, or for a new keystore a sibling folder."""
+        """The folder in which to write: the keystore, or a sibling folder for a new keystore."""
         if self._folder is None:
             self._folder = Folder(self.root, for_owner=True)
         return self._folder
 
     @property
     def _added(self) -> str:
-        """The folder in `_in` for the files of new folders; ends with "/"."""
+        """The path in `_in` for files in new folders; ends with "/"."""
         return "" if self._new_root else f"{STAGE}/{_ADDED}/"
 
     def on_failure(self, undo: Callable[[], None]) -> None:
@@ -476,7 +477,7 @@ class Transaction:
 
     @cached_property
     def enclaves(self) -> tuple[str, ...]:
-        """The sorted names of the enclaves before the change, for verbs that change all of them.
+        """The sorted names of the enclaves before the change, for verbs that change all enclaves.
 
         Raises:
             KeystoreError: this user cannot read all files of all enclaves.
@@ -486,7 +487,7 @@ class Transaction:
         return search_enclaves(self.root)[0] if self._partial else readable_enclaves(self.root)
 
     def _refuse_folder_of_stranger(self) -> None:
-        """Refuse, as root, to write keys into a folder that another user may have prepared."""
+        """Refuse to write keys, as root, into a folder that another user may have prepared."""
         above = Path(os.path.realpath(self.root)).parent.stat()
         owner = self._in.owner[0]
         if os.geteuid() == 0 and above.st_mode & stat.S_IWOTH and owner not in (0, above.st_uid):
@@ -522,7 +523,7 @@ class Transaction:
         while not self._folder:
             self._sibling = f"{self._sibling_prefix}{secrets.token_hex(4)}"
             parent.mkdir(self._sibling, 0o700)
-            # Until the folder is locked, another process may take it for a stale one and remove it.
+            # Until the folder is locked, another process may consider it stale and remove it.
             with contextlib.suppress(FileNotFoundError):
                 folder = Folder(parent.path / self._sibling)
                 if lock_new(folder) and parent.state(self._sibling):
@@ -531,7 +532,7 @@ class Transaction:
                     folder.close()
 
     def _remove_stale_siblings(self, parent: Folder) -> None:
-        """Remove what killed processes of this user left while they created this keystore."""
+        """Remove what this user's killed processes left when they created this keystore."""
         for name in parent.names():
             if not name.startswith(self._sibling_prefix):
                 continue
@@ -571,26 +572,28 @@ class Transaction:
         """Return the content of a file, to move or copy it within the keystore.
 
         Raises:
-            KeystoreError: a link leads out of the keystore: the copy would belong to its owner.
+            KeystoreError: a link leads out of the keystore, so that the keystore's owner would get
+                a copy of a foreign file.
         """
         return self._in.read_inside(path)
 
     def place_after(self, path: str) -> str:
-        """Return the path that ``path`` will lead to through links, for `content_after`."""
+        """Return the path to which links at ``path`` will lead, for `content_after`."""
         for _ in range(_MOST_LINKS):
             target = self.target_after(path)
             if target is None:
                 break
             path = os.path.normpath(f"{path.rpartition('/')[0]}/{target}")
-            if target.startswith("/") or path.startswith(".."):  # out of the keystore
+            # The link leads out of the keystore.
+            if target.startswith("/") or path.startswith(".."):
                 return str(self.root / path) if path.startswith("..") else target
         return path
 
     def content_after(self, place: str) -> bytes | None:
         """Return the content that a file (not a link) will have after the transaction.
 
-        Return None if the file will not exist or cannot be read, or if this dry run makes too many
-        files to keep it in memory.
+        The result is None if the file will not exist or cannot be read, or if this is a dry run
+        that makes more files than it keeps in memory.
         """
         if not self.is_staged(place):
             return _content(self.root / place)
@@ -600,14 +603,14 @@ class Transaction:
         return _content(Path(self._stage_place(place)))
 
     def files_not_kept(self) -> list[str]:
-        """Return the new files that `content_after` does not know, because of a dry run's limit.
+        """Return the new files that `content_after` does not know because of a dry run's limit.
 
-        Private files are not among them.
+        Private files are not included.
         """
         return sorted(path for path, kept in self._path_of_old_content.items() if kept is None)
 
     def target_after(self, path: str) -> str | None:
-        """Return the target of the link at ``path`` after the transaction; None: no link."""
+        """Return the target of the link at ``path`` after the transaction, or None."""
         if not self.is_staged(path):
             return _link_target(f"{self.root}/{path}")
         if self._links_to_list(path):
@@ -647,7 +650,7 @@ class Transaction:
     def link_to_first_list(self, names: Sequence[str]) -> None:
         """Stage the link ``crl.pem`` for enclaves without one; this transaction writes the list.
 
-        The commit makes the links first: until the list is there, they lead nowhere.
+        The commit makes the links first; until the list is there, they lead nowhere.
         """
         self._linked = frozenset(names)
         self.changes.extend((ChangeRun("create", "", tuple(names), CRL_FILE),))
@@ -664,8 +667,8 @@ class Transaction:
     def move_folder(self, folder: str, to: str, files: Sequence[str], links: Sequence[str]) -> None:
         """Stage the move of an enclave's folder, with its ``files`` and without its ``links``.
 
-        The commit takes the certificate away, without which no node starts in the enclave; the rest
-        of the folder is moved once it is committed.
+        The commit removes the certificate, without which no node starts in the enclave.  The rest
+        of the folder is moved after the commit.
         """
         for name in files:
             self._begin_change(f"{to}/{name}", "create")
@@ -676,7 +679,7 @@ class Transaction:
     def _prepare(self, path: str, after: str) -> str | None:
         """Record a change of ``path``, and return the path of its staged file in `_in`.
 
-        ``after`` is as in `Move`.  Return None in a dry run.
+        ``after`` is as in `Move`.  The result is None in a dry run.
         """
         exists = self._prepare_folder(path.rpartition("/")[0])
         before = self._present_content(path) if exists else None
@@ -708,7 +711,7 @@ class Transaction:
         return name == CRL_FILE and (folder.removeprefix(ENCLAVES) or "/") in self._linked
 
     def _present_content(self, path: str) -> str | None:
-        """Return the current content of a path, in the form of `Move.before`."""
+        """Return what is now at a path, in the form of `Move.before`."""
         state = self._in.state(path)
         if state is None:
             return None
@@ -782,7 +785,7 @@ class Transaction:
         return [(part, result) for part, (result, _) in slices]
 
     def note_adoption(self) -> None:
-        """Add a change that says that the keystore gets its first settings and ledger."""
+        """Add a change which says that the keystore gets its first settings and ledger."""
         self._adopts = True
         self.changes.add(_ADOPT, "")
 
@@ -792,11 +795,12 @@ class Transaction:
         """Put all staged changes in place atomically, and flush them to disk.
 
         Private keys and folders of keys that other users could open are closed to them, because
-        ros2/sros2 leaves their mode to the umask: those of the CAs and of the enclaves that change,
-        and of all enclaves when a keystore of ros2/sros2 is taken over or all enclaves are read.
+        ros2/sros2 leaves their mode to the umask.  This applies to the keys of the CAs and of the
+        changed enclaves; when a keystore of ros2/sros2 is taken over, or all enclaves are read, it
+        applies to all enclaves.
 
         Raises:
-            KeystoreError: another process has created the keystore meanwhile.
+            KeystoreError: another process has created the keystore in the meantime.
         """
         if not self.changes:
             return
@@ -820,7 +824,7 @@ class Transaction:
             complete(folder, self._moves)
         self._finish()
         for path in self._open_keys():
-            with contextlib.suppress(OSError):  # `check` finds what stays open
+            with contextlib.suppress(OSError):  # `check` reports what stays open
                 folder.close_to_others(path)
                 if not folder.mode(path) & 0o077:
                     self.changes.add(_CLOSE, path)
@@ -829,7 +833,8 @@ class Transaction:
         """Return the keys that other users can open, except files that this transaction writes."""
         if self._new_root:
             return []
-        # What costs as much as the keystore has enclaves is left to who looks at all of them.
+        # This takes time for each enclave, so only verbs that read all enclaves look at all of
+        # them.
         looks_at_all = self._adopts or "enclaves" in self.__dict__
         changed = None if looks_at_all else self.changed_folders()
         return [path for path in _open_keys(self.root, changed) if not self.is_staged(path)]
@@ -859,7 +864,7 @@ class Transaction:
         self._made_parents.clear()
         self._undo.clear()
         with contextlib.suppress(OSError), Folder(self.root.parent) as parent:
-            parent.flush()  # already in place; otherwise the system flushes it soon
+            parent.flush()  # the files are already in place; otherwise the system flushes them soon
 
 
 def _link_target(path: str) -> str | None:
@@ -879,7 +884,7 @@ def _content(path: Path) -> bytes | None:
 def _open_keys(root: Path, changed: Collection[str] | None = None) -> Iterator[str]:
     """Yield the paths of private keys, and top folders of keys, that other users can open.
 
-    Of the folders of enclaves, only those in ``changed`` are looked at; None looks at all.
+    Of the folders of enclaves, only those in ``changed`` are examined; None means all folders.
     """
     for top in _KEY_FOLDERS:
         if _is_open(f"{root}/{top}", stat.S_IFDIR):
@@ -888,7 +893,8 @@ def _open_keys(root: Path, changed: Collection[str] | None = None) -> Iterator[s
         below = changed is None or top not in (ENCLAVES, REVOKED)
         if changed is not None and not below:
             folders = [f"{root}/{path}" for path in sorted(changed) if path.split("/")[0] == top]
-        for folder in folders:  # which grows; os.walk would follow each link to see what it is
+        # This list grows; os.walk would follow each link to see where it leads.
+        for folder in folders:
             with contextlib.suppress(OSError), os.scandir(folder) as entries:
                 for entry in sorted(entries, key=lambda entry: entry.name):
                     if entry.is_dir(follow_symlinks=False) and not entry.name.startswith("."):
@@ -919,25 +925,25 @@ def _bridge(folder: Folder, moves: Sequence[Move]) -> None:
     if _can_exchange(folder):
         map_slices(moves, work.exchange_with_links)
         return
-    # A file system that cannot exchange two names: make hard links or copies first.
+    # A file system that cannot exchange two names: first make hard links or copies.
     if any(copied for _, copied in map_slices(moves, work.keep)):
         folder.flush_file_system(f"{STAGE}/{_BEFORE}")
     map_slices(moves, work.replace_with_links)
 
 
 def _can_exchange(folder: Folder) -> bool:
-    """Return whether the file system can exchange two names, by trying it."""
+    """Return whether the file system can exchange two names, found by trying it."""
     spare = f"{STAGE}/spare"
-    folder.symlink(_BEFORE, spare)  # the same as `live`, so that exchanging them changes nothing
+    folder.symlink(_BEFORE, spare)  # equal to `live`, so that exchanging the two changes nothing
     can = folder.exchange(spare, f"{STAGE}/{_LIVE}")
     folder.unlink(spare)
     return can
 
 
 class _Bridge:
-    """Replace the paths of a slice of the moves with links, in one of two ways.
+    """Replaces the paths of some moves with links, in one of two ways.
 
-    One is `exchange_with_links`; the other is `keep`, followed by `replace_with_links`.
+    One way is `exchange_with_links`; the other is `keep`, followed by `replace_with_links`.
     """
 
     def __init__(self, folder: Folder) -> None:
@@ -965,7 +971,7 @@ class _Bridge:
                 continue
             try:
                 self._folder.link(move.path, _path_of_old_content(move))
-            except OSError:  # a file system, or an owner, that allows no hard links
+            except OSError:  # the file system, or the owner of the file, allows no hard links
                 self._folder.copy(move.path, _path_of_old_content(move))
                 copied = True
         return copied
@@ -1002,12 +1008,12 @@ _PAUSE = 0.02
 class KeystoreLock:
     """The lock on a keystore: a locked file in the keystore, which exists only while it is locked.
 
-    Only the owner of the keystore (and root) can open the file, so no other user can hold the lock:
-    anybody who may read the folder could lock the folder itself.
+    Only the owner of the keystore (and root) can open the file, so no other user can hold the lock.
+    The folder itself is not locked, because anybody who may read it could lock it.
     """
 
     def __init__(self, folder: Folder, label: str = "keystore") -> None:
-        """Prepare to lock ``folder``, which is ``label`` in errors."""
+        """Prepare to lock ``folder``; ``label`` is the name of the folder in errors."""
         self._folder = folder
         self._what = label
         self._handle = -1
@@ -1020,8 +1026,8 @@ class KeystoreLock:
     def acquire(self, wait: float | None = None) -> Self:
         """Lock the keystore, waiting up to ``wait`` seconds (default: 60) for another process.
 
-        The caller has to call `release` even if this raises: a signal may arrive just after the
-        file was made.
+        The caller must call `release` even if an exception is raised, because a signal may arrive
+        just after the file was made.
 
         Raises:
             KeystoreError: another process held the lock for ``wait`` seconds.
@@ -1039,7 +1045,7 @@ class KeystoreLock:
         return self
 
     def _try(self) -> bool:
-        """Try to take the lock; return whether this succeeded."""
+        """Try to take the lock, and return whether this succeeded."""
         try:
             with _signals_held_back():
                 handle = self._folder.open_private(LOCK)
@@ -1050,13 +1056,13 @@ class KeystoreLock:
                     os.close(handle)
                     return False
         except FileNotFoundError:
-            return False  # another process removed it between two looks at it
+            return False  # another process has just removed it
         except PermissionError:
             if self._folder.state(LOCK) is None:
                 raise  # this user cannot write to the folder
-            return False  # root made the file just now, and hands it over to the owner
+            return False  # root has just made the file, and will hand it over to the owner
         except OSError as error:
-            if error.errno not in (errno.ELOOP, errno.ENXIO):  # a link, a socket
+            if error.errno not in (errno.ELOOP, errno.ENXIO):  # a link or a socket
                 raise
             raise self._blocked_lock_error() from error
         regular = stat.S_ISREG(os.fstat(handle).st_mode)
@@ -1073,23 +1079,23 @@ class KeystoreLock:
         )
 
     def _is_there(self, handle: int) -> bool:
-        """Return whether the locked file is still in the folder; unlocking removes it."""
+        """Return whether the locked file is still in the folder, because unlocking removes it."""
         state = self._folder.state(LOCK)
         return state is not None and os.path.samestat(state, os.fstat(handle))
 
     def release(self) -> None:
         """Unlock the keystore."""
         if self._handle >= 0:
-            for _ in range(2):  # a disk that is full may refuse it once
+            for _ in range(2):  # on a full disk, the first attempt may fail
                 with contextlib.suppress(OSError):
                     self._folder.unlink(LOCK, missing_ok=True)
-                    break  # what is there now is the lock of another process
+                    break  # a file there now would be the lock of another process
             os.close(self._handle)
             self._handle = -1
 
 
 def lock_new(folder: Folder) -> bool:
-    """Lock a folder that only this user can open; return False if another process has locked it.
+    """Lock a folder that only this user can open; False if another process has locked it.
 
     The lock lasts until the folder is closed.
     """
@@ -1106,7 +1112,7 @@ def _locked(handle: int) -> bool:
 
 @contextlib.contextmanager
 def _signals_held_back() -> Iterator[None]:
-    """Delay signals, so that none interrupts between making and recording a file."""
+    """Delay signals, so that none arrives between making a file and recording it."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield
@@ -1117,7 +1123,7 @@ def _signals_held_back() -> Iterator[None]:
 def recover_keystore(root: Path) -> None:
     """Remove the transaction and the lock that an interrupted process left in the keystore.
 
-    The transaction is completed if it was committed, and otherwise undone.
+    The transaction is completed if it was committed; otherwise it is undone.
 
     Raises:
         KeystoreError: the keystore is busy, or the stage was not made by sros for this keystore.
@@ -1158,8 +1164,8 @@ def complete(folder: Folder, moves: Sequence[Move]) -> None:
 
 
 def _remove_stage(folder: Folder) -> None:
-    """Remove the stage of a transaction that changed nothing, or is complete or undone."""
-    # First ``live``: without it, the rest of the stage only needs to be removed.
+    """Remove the stage of a transaction that is complete, was undone, or changed nothing."""
+    # ``live`` comes first: without it, a recovery only has to remove the rest of the stage.
     folder.unlink(f"{STAGE}/{_LIVE}", missing_ok=True)
     folder.remove_tree(STAGE)
 
@@ -1181,7 +1187,7 @@ def _replace_links(folder: Folder, moves: Sequence[Move]) -> None:
                 if _leads_into_stage(folder, path):
                     _replace_by_link(folder, after, spare, path)
             else:
-                with contextlib.suppress(FileNotFoundError):  # an earlier recovery moved it
+                with contextlib.suppress(FileNotFoundError):  # an earlier recovery has moved it
                     folder.replace(f"{STAGE}/{_AFTER}/{name}", path)
             if before is not None:
                 folder.unlink(f"{STAGE}/{_BEFORE}/{name}", missing_ok=True)
@@ -1194,9 +1200,9 @@ def _replace_links(folder: Folder, moves: Sequence[Move]) -> None:
 
 def _move_revoked_folder(folder: Folder, certificate: str, to: str) -> None:
     """Move the folder of a removed ``certificate`` to ``to``, without the links in it."""
-    with contextlib.suppress(FileNotFoundError):  # an earlier recovery moved it
+    with contextlib.suppress(FileNotFoundError):  # an earlier recovery has moved it
         folder.rename(certificate.rpartition("/")[0], to)
-    with contextlib.suppress(FileNotFoundError):  # an earlier recovery put it back
+    with contextlib.suppress(FileNotFoundError):  # an earlier recovery has put it back
         kept = f"{STAGE}/{_BEFORE}/{staged_name(certificate)}"
         folder.replace(kept, f"{to}/{CERTIFICATE_FILE}")
     for link in folder.links(to):
@@ -1219,13 +1225,13 @@ def _undo(folder: Folder, moves: Sequence[Move]) -> None:
 
 
 def _link_to_first_list(folder: Folder, names: Sequence[str]) -> None:
-    """Make the link ``crl.pem`` for enclaves; it leads nowhere until there is a list."""
+    """Make the link ``crl.pem`` of enclaves; until there is a list, it leads nowhere."""
     for name in names:
         folder.symlink(link_to_list(name), f"{enclave_folder(name)}/{CRL_FILE}")
 
 
 def _unlink_from_list(folder: Folder) -> None:
-    """Remove the links ``crl.pem`` to the list, which is not there."""
+    """Remove the links ``crl.pem`` to a list that does not exist."""
     for name in search_enclaves(folder.path)[0]:
         path = f"{enclave_folder(name)}/{CRL_FILE}"
         if folder.link_target(path) == link_to_list(name):
@@ -1265,8 +1271,8 @@ def _make_folders(folder: Folder, paths: Iterable[str]) -> None:
 def _move_into_place(folder: Folder, source: str, target: str) -> None:
     """Move everything in the folder ``source`` to the same paths below the folder ``target``.
 
-    CA keys move after their certificates, and enclaves last: a folder without enclaves does not
-    count as a keystore yet.
+    CA keys are moved after their certificates, and enclaves last, because a folder without enclaves
+    does not yet count as a keystore.
     """
     for name in sorted(folder.names(source), key=lambda name: (name == ENCLAVES, name == PRIVATE)):
         old, new = f"{source}/{name}", f"{target}/{name}".lstrip("/")
@@ -1282,8 +1288,8 @@ def _move_into_place(folder: Folder, source: str, target: str) -> None:
 def _remove_empty_folders(folder: Folder, paths: Iterable[str]) -> None:
     """Remove the empty parent folders of ``paths``, except the folders directly in ``folder``."""
     for parent in dict.fromkeys(path.rpartition("/")[0] for path in paths):
-        with contextlib.suppress(OSError):  # it is not empty
+        with contextlib.suppress(OSError):  # the folder is not empty
             while "/" in parent:
-                with contextlib.suppress(FileNotFoundError):  # an earlier recovery removed it
+                with contextlib.suppress(FileNotFoundError):  # an earlier recovery has removed it
                     folder.rmdir(parent)
                 parent = parent.rpartition("/")[0]

@@ -1,13 +1,14 @@
 """The Zenoh configurations of a keystore: existing files, their faults, and files that it needs.
 
-Zenoh itself verifies nothing, so each configuration must be identical to the document in the
-signed message next to it, and state the rights of the enclave's signed permissions.
-`sros_tool.keystore.lifecycle.change` writes them.
+Zenoh itself verifies nothing, so each configuration must be identical to the document in the signed
+message next to it, and state the rights of the enclave's signed permissions.
+`sros_tool.keystore.lifecycle.change` writes the configurations.
 
-Anybody may have written the permissions.  Zenoh has no partitions, and its rules have no order.  A
-ROS node opens its topics in the default partition.  What an earlier rule decides is subtracted from
-later rules, and the result is compared with the decisions of each vendor: if two vendors differ, or
-if the order of the rules cannot be expressed, the permissions are refused.
+The permissions need not be written by sros.  Zenoh has no partitions, so only the default partition
+counts, in which ROS nodes open their topics.  In Zenoh, the rules have no order, so what an earlier
+rule decides is subtracted from later rules.  The result is compared with the decisions of each
+vendor.  If two vendors differ, or if the order of the rules cannot be expressed, the permissions
+are refused.
 
 One difference between vendors is left out: on Cyclone DDS 0.10, a denial of one direction also
 keeps an enclave from the other direction of the topic (``portable.deny-blocks-topic``).
@@ -123,7 +124,7 @@ class ZenohFault(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ZenohProblem:
-    """A fault of a Zenoh configuration, with the file that has it and the reason as a clause."""
+    """A fault of a Zenoh configuration: the file with the fault, and the reason as a clause."""
 
     file: str
     text: str
@@ -137,7 +138,7 @@ class ZenohProblem:
 class OpenedZenoh:
     """The Zenoh configurations of an enclave by file name, and their problems.
 
-    ``files`` are the existing files; ``configurations`` has the files that were read and verified.
+    ``files`` are the existing files; ``configurations`` are those that were read and verified.
     """
 
     files: tuple[str, ...]
@@ -145,7 +146,7 @@ class OpenedZenoh:
     problems: tuple[ZenohProblem, ...]
 
     def domains(self) -> tuple[int, ...]:
-        """Return the ROS domains that the configurations are for, sorted."""
+        """Return the ROS domains for which the configurations are, sorted."""
         controls = (configuration.access_control for configuration in self.configurations.values())
         return tuple(sorted(set().union(*map(domains_of, controls))))
 
@@ -153,8 +154,8 @@ class OpenedZenoh:
 def open_zenoh(folder: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
     """Return the Zenoh configurations of the enclave ``name`` in ``folder``, and their problems.
 
-    They are compared with the enclave's own files in ``state`` alone, so it works on a robot, too.
-    An enclave without any configuration has the problem `ZenohFault.MISSING`.
+    The configurations are only compared with the enclave's own files in ``state``, so this works on
+    a robot, too.  An enclave without any configuration has the problem `ZenohFault.MISSING`.
     """
     present = tuple(
         file
@@ -190,7 +191,7 @@ def is_signed(
     authority: x509.Certificate,
     files: FilesReadOnce | None = None,
 ) -> bool:
-    """Return whether the permissions CA signed ``document``, in the file next to ``path``."""
+    """Return whether the permissions CA signed ``document``, by the file next to ``path``."""
     files = files or FilesReadOnce()
     try:
         message = files.read(path.with_name(ZENOH_SIGNED[path.name]), "signed document")
@@ -206,7 +207,7 @@ def _exists(path: Path) -> bool:
 
 
 def _read(folder: Path, file: str, state: OpenedEnclave) -> Configuration | ZenohProblem:
-    """Return a configuration that the permissions CA signed, or what is wrong with it."""
+    """Return a configuration that the permissions CA signed, or the problem with it."""
     signed_file = ZENOH_SIGNED[file]
     for needed, fault in ((file, ZenohFault.MISSING), (signed_file, ZenohFault.UNSIGNED)):
         if not _exists(folder / needed):
@@ -236,14 +237,14 @@ def _read(folder: Path, file: str, state: OpenedEnclave) -> Configuration | Zeno
 
 
 def _before_revocation_clause(configuration: Configuration, state: OpenedEnclave) -> str:
-    """Return a clause if rights of others in a configuration predate a revocation, or ""."""
+    """Return a clause if a configuration's rights of others predate a revocation, or ""."""
     data = state.files.get(CRL_FILE)
     if configuration.mode is Mode.CLIENT or data is None:
         return ""
     try:
         crl = load_crl(data, CRL_FILE)
     except SrosError:
-        return ""  # a problem of the enclave that is reported elsewhere
+        return ""  # another check reports this problem of the enclave
     if configuration.revoked >= _last_revocation(lists=(crl,)):
         return ""
     return (
@@ -252,7 +253,7 @@ def _before_revocation_clause(configuration: Configuration, state: OpenedEnclave
 
 
 def _out_of_date(configuration: Configuration, file: str, name: str, state: OpenedEnclave) -> str:
-    """Return a clause on how a configuration differs from its enclave's permissions, or ""."""
+    """Return how a configuration differs from its enclave's permissions, as a clause, or ""."""
     is_session = file == SESSION_FILE
     if is_session is (configuration.mode is Mode.ROUTER):
         return f"it is the configuration of a {'router' if is_session else 'session'}"
@@ -260,14 +261,15 @@ def _out_of_date(configuration: Configuration, file: str, name: str, state: Open
         return ""
     control = configuration.access_control
     domains = _joined_domains(state.grant, domains_of(control))
-    # Only the keystore knows which nodes a policy names: here it is what the permissions CA signed.
+    # The nodes of a policy are only known in the keystore; here, the nodes that the permissions CA
+    # signed count.
     nodes = nodes_in_rules((rule for remote in control.remotes for rule in remote.rules), name)
     try:
         stated = {domain: rights_in_domain(name, state.grant, domain) for domain in domains}
         own_rights = remote_of(name, stated, nodes)
     except SrosError as error:
         return f"Zenoh cannot state the permissions of the enclave: {error.what}"
-    # The router may do what the enclave lets it, and other processes nothing else.
+    # The router may do what the enclave allows to it, and other processes nothing beyond this.
     mirrored = joined(rule.mirrored() for rule in own_rights.rules)
     if not any(remote.rules == mirrored for remote in control.remotes) or not all(
         is_within(remote, own_rights) for remote in control.remotes
@@ -277,7 +279,7 @@ def _out_of_date(configuration: Configuration, file: str, name: str, state: Open
             stated_names(rule.mirrored() for rule in remote.rules) == names
             for remote in control.remotes
         ):
-            # Refused all the same: the earlier rules may let others do more.
+            # The file is refused anyway, because the earlier rules may allow more to others.
             return (
                 f"it has the topics and services of {PERMISSIONS_FILE}, but an earlier version of "
                 "sros wrote it, with other rules than this version"
@@ -290,30 +292,30 @@ _ANY_PORT_HERE = "tls/localhost:0"
 """Where sessions listen for direct connections: on their own host, as in rmw_zenoh."""
 _MOST_BYTES = 512 << 20
 _IN_A_ROW = 50
-"""Number of enclaves that are read together, one step at a time.
+"""Number of enclaves that are read together, step by step.
 
-The code of a step then stays in the caches of the processor.  This takes a third less time than
+The code of a step then stays in the caches of the processor, which takes a third less time than
 reading one enclave after the other, and little memory.
 """
 _MOST_DOMAINS = 16
-"""Maximum number of ROS domains in a network: every right is written once per domain."""
+"""Maximum number of ROS domains in a network, because every right is written once per domain."""
 
 
 Result = TypeVar("Result")
 OTHER_DOMAINS = "its permissions are for no domain of the network"
-"""Why an enclave gets no configuration if the settings state the ROS domains of the network."""
+"""Why an enclave gets no configuration if the network's domains are stated in the settings."""
 
 
 @dataclass(frozen=True, slots=True)
 class ZenohDocuments:
     """The configurations that a keystore should have.
 
-    ``files`` maps the paths of configurations to their content, ``enclaves`` maps the paths to the
-    enclaves. ``left_out`` maps enclaves without a configuration, and without rights in other
-    configurations, to the reason (a clause). ``nodes`` maps all other enclaves to the nodes that
-    they may announce in the graph. ``existing`` are the enclaves of the keystore, ``ledger`` is
-    its ledger. ``unread`` are enclaves whose rights were not read, so that the files have no rules
-    for them.
+    ``files`` maps the paths of configurations to their content, and ``enclaves`` maps the paths to
+    the enclaves.  ``left_out`` maps enclaves without a configuration, and without rights in other
+    configurations, to the reason (a clause).  ``nodes`` maps all other enclaves to the nodes that
+    they may announce in the graph.  ``existing`` are the enclaves of the keystore, and ``ledger``
+    is its ledger.  ``unread`` are enclaves whose rights were not read, so that the files have no
+    rules for them.
     """
 
     files: Mapping[str, bytes]
@@ -327,12 +329,12 @@ class ZenohDocuments:
 
 @dataclass(frozen=True, slots=True)
 class ZenohChange:
-    """The changes of a transaction that the Zenoh configurations of a keystore depend on.
+    """The changes of a transaction on which the Zenoh configurations of a keystore depend.
 
-    ``issued`` are the new permissions of enclaves.  ``gone`` are the revoked enclaves, ``replaced``
-    the enclaves whose earlier certificates are revoked.  ``recorded`` are the entries that the
-    transaction adds to the ledger.  ``stated`` are the policies of the enclaves, whose lines errors
-    name.
+    ``issued`` are the new permissions of enclaves.  ``gone`` are the revoked enclaves, and
+    ``replaced`` the enclaves whose earlier certificates are revoked.  ``recorded`` are the entries
+    that the transaction adds to the ledger.  ``stated`` are the policies of the enclaves, for the
+    lines that errors name.
     """
 
     issued: Mapping[str, SignedRights] = field(default_factory=dict)
@@ -351,14 +353,14 @@ class Drift(StrEnum):
     MISSING = "missing"
     DIFFERS = "differs"
     UNSIGNED = "unsigned"
-    """The permissions CA has not signed the document next to it."""
+    """The permissions CA has not signed the document next to the configuration."""
     STALE = "stale"
     """The enclave should not have the configuration."""
 
 
 @dataclass(frozen=True, slots=True)
 class Drifted:
-    """A configuration that is not as it should be; ``path`` is relative to the keystore."""
+    """A configuration that differs from what it should be; ``path`` is relative to the keystore."""
 
     enclave: str
     path: str
@@ -375,7 +377,7 @@ def drifted_configurations(
     """Return the configurations that differ from ``wanted_documents``, or lack a valid signature.
 
     Configurations of enclaves in ``gone_enclaves`` do not count, nor do rules for unread enclaves.
-    ``reader`` may have read the files already.
+    ``reader`` may already have read the files.
     """
     reader = reader or RenderedReader()
 
@@ -405,8 +407,8 @@ def _without_rules_for(
 ) -> bytes | None:
     """Return a configuration without the rules for the enclaves ``names``.
 
-    Returns None if ``names`` is not empty and this version of sros would write the file
-    differently.
+    The result is None if ``names`` is not empty and this version of sros would write the file in
+    another way.
     """
     if not names:
         return document
@@ -419,10 +421,10 @@ def _without_rules_for(
 
 
 class ZenohDrift(NamedTuple):
-    """The configurations of a keystore that are not as they should be.
+    """The configurations of a keystore that differ from what they should be.
 
-    ``left_out`` maps enclaves that get no configuration to the reason, a clause; ``nodes`` maps all
-    other enclaves to the nodes that they may announce in the graph.
+    ``left_out`` maps enclaves that get no configuration to the reason (a clause).  ``nodes`` maps
+    all other enclaves to the nodes that they may announce in the graph.
     """
 
     files: tuple[Drifted, ...]
@@ -441,11 +443,11 @@ def zenoh_drift(
     among: Collection[str] = (),
     reader: RenderedReader | None = None,
 ) -> ZenohDrift:
-    """Return the configurations that are not as they should be, and the enclaves without one.
+    """Return the configurations that differ from what they should be, and the enclaves without one.
 
-    Without ``now``, permissions that have expired count, too.  ``only_enclaves`` are the enclaves
-    whose files are examined, ``among`` the enclaves whose rights are compared in these files; empty
-    for all.  ``reader`` may have read the files already.
+    If ``now`` is None, permissions that have expired count, too.  ``only_enclaves`` are the
+    enclaves whose files are examined, ``among`` the enclaves whose rights are compared in these
+    files; empty means all.  ``reader`` may already have read the files.
 
     Raises:
         SrosError: the rights of an enclave cannot be stated to Zenoh, or the router has no enclave.
@@ -473,15 +475,15 @@ def zenoh_documents(
 
     Args:
         keystore: the keystore.
-        network: the Zenoh network of its settings.
-        domains: the ROS domains of its governance.
+        network: the Zenoh network in the keystore's settings.
+        domains: the ROS domains of the governance.
         authority: the permissions CA.
-        now: the current time; with None, permissions that have expired count, too.
+        now: the current time; if None, permissions that have expired count, too.
         change: what a transaction changes.
         existing: the enclaves of the keystore; None searches for them.
-        only_enclaves: the enclaves whose configurations are made, and that count as existing; ()
-            for all.
-        among: the enclaves whose rights are written into these configurations; () for all.
+        only_enclaves: the enclaves whose configurations are made, and which alone count as
+            existing; () for all.
+        among: the enclaves whose rights are written to these configurations; () for all.
     """
     root = keystore.root
     of_network = _domains(network, domains, keystore)
@@ -569,8 +571,7 @@ def zenoh_documents(
 def _last_revocation(entries: Iterable[Entry] = (), lists: Iterable[RevocationList] = ()) -> str:
     """Return when an enclave was last revoked, by the ledger and by revocation lists; "" if never.
 
-    Certificates that were replaced by others of the same enclave do not count: their reason is
-    `SUPERSEDED`.
+    Replaced certificates, with the reason `SUPERSEDED`, do not count.
     """
     moments = [
         entry.time for entry in entries if entry.what == "revocation" and entry.reason != SUPERSEDED
@@ -591,7 +592,7 @@ def _peers(name: str, router: RenderedRights, between: RightsBetween) -> list[Re
         PolicyError: the common rights of two enclaves take too many key expressions.
     """
     try:
-        # Zenoh takes no policy without rules.
+        # Zenoh accepts no policy without rules.
         rendered = [
             render_rights(rights) for rights in between.rights_for_others(name) if rights.rules
         ]
@@ -616,10 +617,10 @@ def _router_files(
     rules: Mapping[str, _RulesOfEnclave],
     revoked: str,
 ) -> dict[str, bytes]:
-    """Return the configurations of all routers, by their paths.
+    """Return the configurations of all routers, by path.
 
-    ``revoked`` is the time of the last revocation, which is written into the files.  A router gives
-    another router the rights that the enclaves at both ends have.
+    ``revoked`` is the time of the last revocation, which is written to the files.  A router gives
+    another router the rights that the enclaves at both ends have in common.
 
     Raises:
         TooManyExpressions: these rights take too many key expressions.
@@ -659,7 +660,7 @@ def _router_files(
 def _domains(
     network: ZenohNetwork, domains: DomainSet, keystore: OpenedKeystore
 ) -> tuple[int, ...]:
-    """Return the ROS domains of the network, all of which the governance has."""
+    """Return the ROS domains of the network, after checking that the governance has all of them."""
     root = keystore.root
     if unserved := [domain for domain in network.domains if domain not in domains]:
         raise UsageError(
@@ -683,15 +684,15 @@ def _domains(
 
 
 _UNCERTAIN = re.compile(rb"[\x00\x80-\xff*?\[&]|<!|ALLOW")
-"""Matches text in permissions that may give a right to a name that they do not contain.
+"""Matches text in permissions that may give a right to a name that is not in the text.
 
-It may be a wildcard, markup that splits or encodes a name, or a default that allows.
+This can be a wildcard, markup that splits or encodes a name, or a default that allows.
 """
 _XML_DECLARATION = b'<?xml version="1.0" encoding="UTF-8"?>'
 
 
 def enclaves_with_rights(keystore: OpenedKeystore, names: Collection[str]) -> set[str]:
-    """Return the enclaves whose permissions may have a right to one of ``names``, and maybe others.
+    """Return the enclaves that may have a right to one of ``names``, and perhaps others.
 
     No signature is verified and no XML parsed: the bytes of the permissions are searched for the
     names.
@@ -712,12 +713,12 @@ def enclaves_with_rights(keystore: OpenedKeystore, names: Collection[str]) -> se
 
 
 class _RulesOfEnclave(NamedTuple):
-    """The rights that other processes give an enclave, and that the enclave gives the router.
+    """The rights that other processes give to an enclave, and that the enclave gives to the router.
 
     ``remote`` are the rights that other processes give to the enclave; ``rights`` are the same
     rights as a value, if more than one file needs them.  ``router`` are the rights that the enclave
-    gives to the router; None if its own file is not needed.  ``nodes`` are the nodes that the
-    enclave may announce.
+    gives to the router; None if the enclave's own file is not needed.  ``nodes`` are the nodes that
+    the enclave may announce.
     """
 
     remote: RenderedRights
@@ -727,10 +728,10 @@ class _RulesOfEnclave(NamedTuple):
 
 
 class _RightsReader:
-    """A reader of enclaves' rights, as rules of other processes.
+    """A reader of enclaves' rights, in the form of other processes' rules.
 
-    Only the last permissions that the permissions CA signed count, until they expire: an enclave
-    whose files are older or other permissions gets no rules.
+    Only the last permissions that the permissions CA signed count, until they expire.  An enclave
+    whose files have older or other permissions gets no rules.
     """
 
     def __init__(
@@ -759,7 +760,7 @@ class _RightsReader:
         }
 
     def read(self, names: Sequence[str]) -> dict[str, _RulesOfEnclave | str]:
-        """Return the rules of enclaves, or why they get none, as a clause."""
+        """Map enclaves to their rules, or to the reason why they get none (a clause)."""
         rules: dict[str, _RulesOfEnclave | str] = {}
         for begin in range(0, len(names), _IN_A_ROW):
             rules |= self._read_some(names[begin : begin + _IN_A_ROW])
@@ -845,7 +846,8 @@ class _RightsReader:
         if grant is None:
             raise KeystoreError("its permissions are not for its certificate")
         now = self._now
-        # Without a valid certificate nobody gets a connection, so rules would change for nothing.
+        # Without a valid certificate, the enclave gets no connection, so changing its rules would
+        # be useless.
         if now and grant.validity.not_after < now <= validity_of(certificate).not_after:
             raise KeystoreError(f"its permissions expired at {grant.not_after}")
         return grant
@@ -868,7 +870,7 @@ class _RightsReader:
             return remote_of(name, stated_rights, nodes_from_text(self._nodes(name)))
         except PolicyError:
             if policy := self._change.stated.get(name):
-                remote_rights(policy, min(stated_rights))  # names the line of the policy
+                remote_rights(policy, min(stated_rights))  # the error names the line of the policy
             raise
 
 
@@ -878,18 +880,18 @@ _PROOF = {
     "request": (Flow.INGRESS, Message.QUERY),
     "reply": (Flow.EGRESS, Message.QUERY),
 }
-"""The message of each right, repeated here on purpose, so that errors of the translation show."""
+"""Maps each right to its message, stated again on purpose, to find errors of the translation."""
 _ANNOUNCED = {"NN": "", "MP": "publish", "MS": "subscribe", "SC": "request", "SS": "reply"}
-"""What each kind of graph token announces: a node, or the use of a right to a name."""
+"""Maps the kind of a graph token to the right that it announces; "" for a node."""
 _TOKEN = re.compile(r"@ros2_lv/([0-9]+)/\*/\*/\*/(..)/([^/]+)/[^/]+/[^/]+(?:/([^/]+)/\*\*)?")
 
 
 def _prove(
     enclave: str, remote: RemoteRights, stated_rights: Mapping[int, Sequence[StatedRight]]
 ) -> None:
-    """Raise `PkiError` if rules and rights decide differently on a name in the rights.
+    """Raise `PkiError` if rules and rights decide differently on a name.
 
-    For a name with wildcards, examples are tried.
+    For names with wildcards, examples are tried.
     """
     control = AccessControl((remote,))
     passing = {right: control.passing(enclave, *use) for right, use in _PROOF.items()}
@@ -909,7 +911,7 @@ def _prove(
     def is_announced(domain: int, right: str, name: str) -> bool:
         last = (name.replace("/", "%"), "type/hash/qos")
         ns, _, node_name = name.rpartition("/")[0].rpartition("/")
-        # A service of a node itself is announced by that node alone.
+        # Only the node itself may announce its own services.
         its_own = tuple(part.replace("/", "%") for part in (enclave, ns or "/", node_name))
         tokens = (
             "/".join((f"@ros2_lv/{domain}/z/0/1", kinds[right], *node, *last))
@@ -933,9 +935,9 @@ def _prove(
 def _are_exactly(
     passing: Mapping[str, KeyExpressions], stated_rights: Mapping[int, Sequence[StatedRight]]
 ) -> bool:
-    """Return whether the rights have no wildcards, and the rules have exactly their keys.
+    """Return whether the rights have no wildcards, and the rules have exactly the rights' keys.
 
-    A key below a topic with history is not the key of a name.
+    The keys for the history of a topic, below its key, are not compared.
     """
     keys: dict[str, set[str]] = {right: set() for right in _PROOF}
     for domain, rights in stated_rights.items():
@@ -981,7 +983,7 @@ def _to_announce(stated_rights: Mapping[int, Sequence[StatedRight]]) -> set[tupl
 
 
 def _example_nodes(enclave: str, control: AccessControl) -> set[tuple[str, ...]]:
-    """Return nodes, as tokens name them, that rules let an enclave announce: one for each wildcard.
+    """Return nodes that rules let an enclave announce, as in tokens: one for each wildcard.
 
     The result is empty if the rights of the enclave deny all its nodes.
     """
@@ -1022,7 +1024,7 @@ def _present_file(keystore: OpenedKeystore, path: str) -> bytes | None:
 def stale_files(
     root: Path, wanted_paths: Collection[str], names: Iterable[str]
 ) -> Iterable[Drifted]:
-    """Yield the configurations in enclaves ``names`` that should not be there.
+    """Yield the configurations of the enclaves ``names`` that should not exist.
 
     A file without a signed document is left out, because it may be the user's own file.
     """
@@ -1047,7 +1049,7 @@ def signed_path(path: str) -> str:
 
 
 _ROS_VENDORS = (*TESTED, Vendor.CONNEXT)
-"""The vendors of ROS 2, whose decisions have to be the same; Connext stands for the standard."""
+"""The vendors of ROS 2, whose decisions must be the same; Connext stands for the standard."""
 _VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 _STATE_RIGHTS = "State the rights of the enclave in a policy, with `sros create_permission`."
 _TOPICS = "rt"
@@ -1058,10 +1060,10 @@ _PREFIXES = (_TOPICS, "rq", "rr")
 def grant_for_all(document: bytes, name: str, subject: str) -> Grant | None:
     """Return the grant in signed permissions on which all vendors agree; None if there is none.
 
-    ``name`` is the name of the document in errors, ``subject`` the subject of the certificate.
+    ``name`` is the name of the document in errors, and ``subject`` the subject of the certificate.
 
     Raises:
-        DocumentError: a vendor refuses the document, or reads other rules in it.
+        DocumentError: a vendor refuses the document, or reads other rules from it.
     """
     permissions = parse_permissions(document, name)
     grant = permissions.grant_of(subject)
@@ -1096,7 +1098,7 @@ def _grant_for(
 
 
 def _joined_domains(grant: Grant, domains: Iterable[int]) -> tuple[int, ...]:
-    """Return the ROS domains, out of ``domains``, that an enclave may join by its permissions."""
+    """Return those of ``domains`` that an enclave may join by its permissions."""
     allowed = grant.domains()
     return tuple(domain for domain in domains if domain in allowed)
 
@@ -1104,15 +1106,15 @@ def _joined_domains(grant: Grant, domains: Iterable[int]) -> tuple[int, ...]:
 def rights_in_domain(enclave: str, grant: Grant, domain: int) -> tuple[StatedRight, ...]:
     """Return the ROS rights that signed permissions give an enclave in a ROS domain.
 
-    A topic ``*`` without a ROS name, as ros2/sros2 grants it, stands for all topics and services if
-    it may be published and subscribed.  Another topic without a ROS name is translated exactly if
-    its wildcard begins right after the prefix of ROS topics.  A topic that matches no ROS topic is
-    left out, because it is not on Zenoh.
+    If the DDS topic ``*`` may be published and subscribed, as ros2/sros2 grants it, it stands for
+    all topics and services.  Other topics that are not ROS names are translated exactly if their
+    wildcard begins directly after the prefix of ROS topics.  Topics that match no ROS topic are
+    left out, because they are not on Zenoh.
 
     Raises:
-        PolicyError: it is uncertain which ROS names a right or a denial is about, what no rule
-            names is allowed, DDS vendors do not decide alike, or the order of the rules counts
-            in a way that Zenoh does not have.
+        PolicyError: it is uncertain which ROS names a right or a denial is about; the default
+            allows; DDS vendors do not decide alike; or the order of the rules matters in a way that
+            Zenoh cannot express.
     """
     source = Source(f"the permissions of {enclave}", 0)
     if grant.default_allow:
@@ -1156,7 +1158,7 @@ def _meets_ros_names(topic: str) -> bool:
 
 
 def _is_plain(grant: Grant) -> bool:
-    """Return whether a grant has the form that sros writes: denials come first.
+    """Return whether a grant has the form that sros writes, with denials first.
 
     All vendors decide alike on such a grant.
     """
@@ -1187,17 +1189,17 @@ def _is_plain_topic(topic: str) -> bool:
 
 
 class _Ordered(NamedTuple):
-    """The topics that rules allow and deny, each with its position in the rules."""
+    """The topics that rules allow and deny, each with the position of its rule."""
 
     allowed: list[tuple[int, str]]
     denied: list[tuple[int, str]]
 
 
 def _joined_if_unordered(rules: Sequence[Rule]) -> list[Rule]:
-    """Return rules with the same meaning whose denials come first, for the default partition.
+    """Return equivalent rules with denials first, for the default partition.
 
-    A right that an earlier rule denies completely is left out, and so is a denial after all rights
-    that it is about.
+    A right that an earlier rule completely denies is left out.  So is a denial after all rights
+    that it concerns.
     """
     allowed: dict[AccessVerb, tuple[str, ...]] = {}
     denied: dict[AccessVerb, tuple[str, ...]] = {}
@@ -1241,7 +1243,7 @@ def _criteria(topics: tuple[str, ...]) -> tuple[Criteria, ...]:
 
 
 def _joined_rules(rules: Iterable[Rule]) -> tuple[Rule, ...]:
-    """Return one rule with all denials and one with all rights, if the order does not matter."""
+    """Return one rule with all denials and one with all rights, regardless of their order."""
     joined = []
     for allow in (False, True):
         of = [rule for rule in rules if rule.allow is allow]
@@ -1260,7 +1262,7 @@ def _topics(all_criteria: Iterable[Criteria]) -> Iterator[str]:
 
 
 def _check_vendors(source: Source, grant: Grant, domain: int, rules: Sequence[Rule]) -> None:
-    """Raise `PolicyError` unless every vendor decides as ``rules``, in which denials win."""
+    """Raise `PolicyError` unless every vendor decides like ``rules``, in which denials win."""
     decisions = {vendor: GrantedAccess(vendor.traits, grant, domain) for vendor in _ROS_VENDORS}
     for verb in _VERBS:
         denied, allowed = (
@@ -1283,7 +1285,7 @@ def _vendors_differ_error(
     topic: str,
     decisions: Mapping[Vendor, GrantedAccess],
 ) -> PolicyError:
-    """Return the error about a topic on which vendors, or vendors and Zenoh, decide differently."""
+    """Return the error for a topic on which vendors, or vendors and Zenoh, decide differently."""
     difference = f"{source}: {verb} {topic} cannot be expressed in Zenoh"
     reasons: dict[str, list[str]] = {}
     for vendor, decision in decisions.items():

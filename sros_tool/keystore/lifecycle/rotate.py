@@ -1019,11 +1019,11 @@ def _make_successor(
 def _existing_ca(
     change: KeystoreChange, roles: Sequence[str], data: bytes, key: PrivateKey, name: x509.Name
 ) -> x509.Certificate:
-    """Return the certificate of a CA that exists already, such as one that a backup lacks.
+    """Return the certificate of an existing CA, such as one that a backup lacks.
 
     Raises:
-        PkiError: it cannot be a CA, or is not that of ``key``.
-        KeystoreError: it has a chain, or is a permissions CA with another name than ``name``.
+        PkiError: the certificate cannot be that of a CA, or ``key`` does not belong to it.
+        KeystoreError: the CA has a chain, or is a permissions CA with another name than ``name``.
     """
     imported = [check_imported(role, data, key, change.now) for role in roles]
     certificate = imported[0].certificate
@@ -1041,7 +1041,7 @@ def _existing_ca(
 
 
 def _distributed_successors(change: KeystoreChange, rotation: Rotation) -> list[_Successor]:
-    """Return the new CAs of a rotation at the stage DISTRIBUTE, with their keys."""
+    """Return the new CAs of a rotation in the stage DISTRIBUTE, with their keys."""
     successors = []
     files = change.keystore.authority_files
     for replacement in rotation.replacements:

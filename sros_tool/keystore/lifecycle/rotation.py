@@ -1,4 +1,4 @@
-"""The state of a CA rotation: its stage, the replaced CAs, and the number of enclaves of each CA.
+"""The state of a CA rotation: its stage, the replaced CAs, and how many enclaves each CA has.
 
 This module only reads; `sros_tool.keystore.lifecycle.rotate` makes the changes.
 """
@@ -42,13 +42,13 @@ from sros_tool.values import Words, as_plain, parse_json, shows
 
 
 class RotationStage(StrEnum):
-    """The stages of a rotation, in order; a keystore without a rotation is at NONE."""
+    """The stages of a rotation, in order; NONE is the stage of a keystore without a rotation."""
 
     NONE = "none"
     DISTRIBUTE = "distribute"
     """Both CAs are trusted; the old CA issues."""
     REISSUE = "reissue"
-    """Both CAs are trusted; the new CA issues, and has issued everything again."""
+    """Both CAs are trusted; the new CA issues, and has already issued everything again."""
     RETIRE = "retire"
     """The old CA is no longer trusted; the rotation is complete."""
 
@@ -57,10 +57,10 @@ class RotationStage(StrEnum):
 class Replacement:
     """An old CA, and the new CA that replaces it.
 
-    ``file`` is the stem of the CA file ("identity_ca", "permissions_ca", or "ca" for both roles).
-    ``old`` and ``new`` are the SHA-256 fingerprints of the certificates.  ``key`` is the place of
-    the new key: a URI, or a path in the keystore.  ``old_key`` is the place of the old key, or ""
-    if it is in `RETIRED`.
+    ``file`` is the name of the CA file without suffixes ("identity_ca", "permissions_ca", or "ca"
+    for both roles).  ``old`` and ``new`` are the SHA-256 fingerprints of the certificates.  ``key``
+    is the place of the new key: a URI, or a path in the keystore.  ``old_key`` is the place of the
+    old key, or "" if it is in `RETIRED`.
     """
 
     file: str
@@ -70,7 +70,7 @@ class Replacement:
     old_key: str = ""
 
     def old_key_place(self, certificate: x509.Certificate) -> str:
-        """Return the place of the old CA's key from REISSUE on; ``certificate`` is that CA's."""
+        """Return the place of the old CA's key from REISSUE on; ``certificate`` is the old CA's."""
         return self.old_key or retired_key(certificate)
 
 
@@ -92,13 +92,15 @@ class Rotation:
 )
 @dataclass(frozen=True, slots=True)
 class AuthorityStatus:
-    """A trusted CA, and its state in a rotation."""
+    """A trusted CA, and its state in the rotation."""
 
     file: str
     roles: tuple[Annotated[str, Words(ROLES)], ...]
     """Roles of the CA."""
     state: Annotated[str, Words(("issuing", "next", "old"))]
-    """Whether the CA issues now (``issuing``), will issue next, or issued before (``old``)."""
+    """Whether the CA issues now (``issuing``), will issue in the next stage, or issued before
+    (``old``).
+    """
     subject: str
     """Subject of the CA."""
     serial: str
@@ -107,12 +109,12 @@ class AuthorityStatus:
     """SHA-256 of the CA's certificate (DER), in hexadecimal; two CAs can have the same subject."""
     validity: Window
     enclaves: int
-    """Number of enclaves with a certificate or permissions of this CA."""
+    """Number of enclaves whose certificate or permissions are by this CA."""
 
 
 @dataclass(frozen=True, slots=True)
 class RotationStatus:
-    """The rotation of a keystore, its CAs, the number of its enclaves, and next steps."""
+    """The rotation of a keystore, its CAs, the number of its enclaves, and the next steps."""
 
     root: Path
     rotation: Rotation
@@ -130,7 +132,7 @@ def read_rotation(keystore: OpenedKeystore) -> Rotation:
     """Return the rotation in progress; an empty `Rotation` if there is none.
 
     Raises:
-        KeystoreError: the rotation file is damaged, or does not fit the CA certificates.
+        KeystoreError: the rotation file is damaged, or contradicts the CA certificates.
     """
     path = keystore.root / ROTATION
     if not path.exists():
@@ -156,7 +158,7 @@ def read_rotation(keystore: OpenedKeystore) -> Rotation:
 
 
 def _replacement(values: dict[str, str]) -> Replacement:
-    """Return the replacement that the JSON object ``values`` describes.
+    """Return the replacement that a JSON object describes.
 
     Raises:
         ValueError, TypeError: ``values`` does not describe a replacement.
@@ -169,7 +171,7 @@ def _replacement(values: dict[str, str]) -> Replacement:
 
 
 def render_rotation(rotation: Rotation) -> bytes:
-    """Return the content of the rotation file: JSON, which `read_rotation` reads."""
+    """Return the content of the rotation file: JSON for `read_rotation`."""
     content = {
         "stage": rotation.stage.value,
         "replacements": as_plain(rotation.replacements),
@@ -218,8 +220,8 @@ def _count(
     """Count the enclaves of each CA, by its index in ``authorities``.
 
     An enclave belongs to the identity CA that issued its certificate, and to the permissions CA
-    that signed its permissions.  A folder without a certificate belongs to none: it waits for one,
-    or is the rest of a removal that was interrupted.
+    that signed its permissions.  A folder without a certificate belongs to no CA: it waits for a
+    certificate, or is left from an interrupted removal.
     """
     counts: Counter[int] = Counter()
     for name in keystore.names:
@@ -272,7 +274,7 @@ def _expiry_remarks(authority_states: Sequence[AuthorityStatus], now: datetime) 
 
 
 def _restart_remarks(keystore: OpenedKeystore, rotation: Rotation) -> list[str]:
-    """Return remarks, by vendor, on the processes to restart at the stage DISTRIBUTE or REISSUE."""
+    """Return remarks, by vendor, on which processes to restart at DISTRIBUTE or REISSUE."""
     files = [replacement.file for replacement in rotation.replacements]
     if rotation.stage is RotationStage.DISTRIBUTE:
         return [
@@ -287,7 +289,7 @@ def _restart_remarks(keystore: OpenedKeystore, rotation: Rotation) -> list[str]:
         "Cyclone DDS: it trusts one CA at a time, so restart all processes together; restarted "
         "and other processes do not communicate.",
     ]
-    with suppress(SrosError):  # `check` finds settings that cannot be read
+    with suppress(SrosError):  # `check` reports settings that cannot be read
         if keystore.template.zenoh:
             remarks.append(f"Zenoh: {ONE_BY_ONE} Continue when all have been restarted.")
     if any(file != "permissions_ca" for file in files):
@@ -299,10 +301,10 @@ def _restart_remarks(keystore: OpenedKeystore, rotation: Rotation) -> list[str]:
 
 
 def crls_confusable(old: x509.Certificate, new: x509.Certificate) -> bool:
-    """Return whether OpenSSL may take the revocation list of one CA for the list of the other.
+    """Return whether OpenSSL may mistake the revocation list of one CA for that of the other.
 
     OpenSSL finds a list by name and key identifier.  If both CAs have the same name and the old CA
-    has no identifier, Fast DDS 2.9.1 uses the wrong list and no process starts (tested).
+    has no key identifier, Fast DDS 2.9.1 uses the wrong list, and no process starts (tested).
     """
     return old.subject == new.subject and not _has_identifier(old)
 
@@ -316,7 +318,7 @@ def _has_identifier(certificate: x509.Certificate) -> bool:
 
 
 def _fast_dds_hindrance(keystore: OpenedKeystore, files: Sequence[str]) -> str:
-    """Return a sentence on why Fast DDS cannot trust the old and the new CA at once; "" if it can.
+    """Return why Fast DDS cannot trust both the old and the new CA, as a sentence; "" if it can.
 
     Fast DDS 2.9.1 (tested) distinguishes two CAs of the same name by their key identifiers, and
     refuses a peer whose permissions CA has another name or key algorithm.

@@ -1,6 +1,7 @@
 """The values that ``--json`` prints for changes of a keystore.
 
-`shown` makes them from the result of a change: creation, renewal, revocation, update, rotation.
+`shown` makes these values from the result of a change: creation, renewal, revocation, update,
+rotation.
 """
 
 from __future__ import annotations
@@ -55,10 +56,10 @@ Form = TypeVar("Form", bound=tuple[Any, ...])
 
 
 def shown(result: Changed, form: type[Form], **more: Any) -> Form:
-    """Return the value of class ``form`` that ``--json`` prints for the result of a change.
+    """Return the result of a change as an instance of ``form``, the class that ``--json`` prints.
 
-    Its fields are from ``more``, or else from the result.  ``notes`` in ``more`` are added to the
-    notes of the result.
+    The value of a field comes from ``more``, or else from the result.  ``notes`` in ``more`` are
+    added to the notes of the result.
     """
     root = result.root
     known: dict[str, Callable[[], Any]] = {
@@ -97,7 +98,7 @@ class _EnclaveCreation(NamedTuple, Generic[Outcome]):
     keystore: NamedKeystore
     dry_run: DryRun
     new_keystore: bool
-    """Whether the keystore was created, too."""
+    """Whether the keystore itself was also created."""
     enclaves: Sequence[EnclaveResult[Outcome]]
     """The enclaves of the command, with their outcomes."""
     rights: Rights
@@ -184,22 +185,22 @@ def shown_keystore(
 
 
 class NetworkSettings(NamedTuple):
-    """The network, as the keystore's settings have it afterwards."""
+    """The network in the keystore's settings after the change."""
 
     router: str
     """The enclave of the router."""
     endpoints: Sequence[str]
     """Endpoints at which sessions connect to the router, as HOST:PORT."""
     listen: Sequence[str]
-    """Endpoints on which the router listens, as HOST:PORT."""
+    """Endpoints at which the router listens, as HOST:PORT."""
     mode: Annotated[str, Words(("client", "peer"))]
     """Whether sessions also connect to each other (``peer``), or only to the router."""
     domains: Sequence[int]
     """The ROS domains of the network."""
     routers: Sequence[RouterFacts]
-    """Further routers, of robots or hosts."""
+    """Further routers, on robots or other hosts."""
     crossing: Sequence[str]
-    """The names that may pass between routers; empty for all that enclaves have rights to."""
+    """The names that may pass between routers; empty for all to which enclaves have rights."""
 
 
 class ZenohFileState(NamedTuple):
@@ -214,12 +215,12 @@ class ZenohFileState(NamedTuple):
 
 
 class EnclaveWithoutZenoh(NamedTuple):
-    """An enclave that has no Zenoh configuration, and no rights there."""
+    """An enclave without a Zenoh configuration, and so without rights on Zenoh."""
 
     enclave: str
     """The enclave."""
     why: str
-    """Why the enclave has no file, as a clause."""
+    """Why the enclave has no configuration, as a clause."""
 
 
 class KeystoreZenoh(NamedTuple):
@@ -228,17 +229,17 @@ class KeystoreZenoh(NamedTuple):
     keystore: NamedKeystore
     dry_run: DryRun
     network: NetworkSettings | None
-    """The network, as the keystore's settings have it afterwards; null after ``--off``."""
+    """The network in the keystore's settings after the change; null after ``--off``."""
     files: Sequence[ZenohFileState]
-    """The file of the router, and a file for every other enclave with rights."""
+    """The file of the router, and a file for each other enclave with rights."""
     left_out: Sequence[EnclaveWithoutZenoh]
-    """The enclaves that have no file; with ``--check`` they make the exit status 1."""
+    """The enclaves without a file; with ``--check``, the exit status is 1 if there are any."""
     created: Sequence[str]
-    """Enclaves that were created: the router's enclave, if it did not exist."""
+    """Enclaves that were created: the router's enclave, if it was missing."""
     restart: Sequence[str]
     """The enclaves whose processes have to be restarted, because their rules changed."""
     changes: FileChanges
-    """The files that were written or, with ``--dry-run`` or ``--check``, would be."""
+    """The files that were written; with ``--dry-run`` or ``--check``, those that would be."""
     notes: Notes
 
 
@@ -278,12 +279,13 @@ class RenewedEnclaves(NamedTuple):
     ]
     """The renewed enclaves."""
     replaced_work_until: datetime | None
-    """Until when the last earlier certificate of these enclaves that the ledger has works, in UTC:
-    until it expires, or the last permissions that fit it; null if they have expired or were
-    revoked."""
+    """Until when the last of these enclaves' earlier certificates in the ledger works, in UTC:
+    until it or the last permissions that fit it expire; null if all have expired or were revoked.
+    """
     may_work_longer: bool
-    """Whether the keystore is older than its robots, or was restored from a backup, so that
-    certificates that the ledger lacks may work longer."""
+    """Whether certificates that the ledger lacks may work longer, because the keystore is older
+    than its robots, or was restored from a backup.
+    """
     revoked: int
     """Number of certificates that were revoked (``--revoke-old``)."""
     restart: TrustRevoked
@@ -309,7 +311,7 @@ class RevokedEnclaves(NamedTuple):
     enclaves: Sequence[RevokedEnclave]
     """The revoked enclaves."""
     reason: str
-    """The reason, as RFC 5280 spells it."""
+    """The reason, as in RFC 5280."""
     next_update: datetime
     """Expiry of the revocation list, in UTC."""
     restart: TrustRevoked
@@ -337,14 +339,14 @@ class UpdatedKeystore(NamedTuple):
     template: TemplateChange
     """The name of the template."""
     done: Sequence[UpdateStage]
-    """Stages that were carried out; empty if nothing was left to do."""
+    """Stages that were carried out; empty if nothing had to be done."""
     left: Sequence[UpdateStage]
-    """Stages that are left to do."""
+    """Stages that remain."""
     settings: Sequence[SettingChange]
     """The settings that change."""
     rights: Rights
     looser: Sequence[str]
-    """Clauses on everything that the update allows and that was not allowed before."""
+    """Clauses on everything that the update allows but that was not allowed before."""
     enclaves: Sequence[
         EnclaveResult[
             Annotated[
@@ -356,8 +358,9 @@ class UpdatedKeystore(NamedTuple):
     ]
     """Enclaves that got a certificate or permissions."""
     replaced_work_until: datetime | None
-    """Last expiry of the replaced certificates with their permissions, in UTC; null if none was
-    replaced or all were revoked."""
+    """Until when the replaced certificates work with their permissions, in UTC; null if none was
+    replaced or all were revoked.
+    """
     revoked: int
     """The number of revoked certificates."""
     restart: Restart
@@ -375,11 +378,11 @@ class RevokedCertificate(NamedTuple):
     serial: str
     """Serial number, in hexadecimal."""
     enclave: str | None
-    """Enclave of the certificate; null if the ledger does not record it."""
+    """Enclave of the certificate; null if it is not in the ledger."""
     date: datetime
-    """When it was revoked, in UTC."""
+    """When the certificate was revoked, in UTC."""
     reason: str
-    """The reason, as RFC 5280 spells it."""
+    """The reason, as in RFC 5280."""
 
 
 class OtherList(NamedTuple):
@@ -398,7 +401,7 @@ class OtherList(NamedTuple):
 
 
 class KeystoreLists(NamedTuple):
-    """The revocation lists of a keystore, after ``--refresh`` if it is given."""
+    """The revocation lists of a keystore; with ``--refresh``, those after signing again."""
 
     keystore: NamedKeystore
     dry_run: DryRun
@@ -409,15 +412,17 @@ class KeystoreLists(NamedTuple):
     next_update: datetime | None
     """Expiry of the list, in UTC; null if there is no list."""
     expires_soon: bool
-    """Whether the list expires within 30 days, or within a third of its validity, if that is
-    shorter: the exit status is 1."""
+    """Whether the list expires within 30 days, or within a third of its validity if this is
+    shorter; then the exit status is 1.
+    """
     revoked: Sequence[RevokedCertificate]
     """The revoked certificates."""
     other_lists: Sequence[OtherList]
     """The list of the other identity CA during a rotation."""
     restart: Sequence[str]
-    """With ``--refresh``: enclaves whose processes have the earlier list until they are
-    restarted."""
+    """With ``--refresh``, the enclaves whose processes use the earlier list until they are
+    restarted.
+    """
     changes: FileChanges
     notes: Notes
 
@@ -476,8 +481,9 @@ class RotationState(NamedTuple):
     authorities: Sequence[AuthorityStatus]
     """The CAs that processes trust."""
     unconfirmed: Sequence[str] | None
-    """The robots of the fleet that have not confirmed the stage; empty without a rotation or a
-    fleet, null if the file of the fleet was edited."""
+    """The robots of the fleet that have not confirmed the stage; empty without a rotation or
+    without a fleet, null if the fleet file was edited.
+    """
     remarks: Sequence[str]
     """Next steps, as sentences."""
 
@@ -502,7 +508,7 @@ class RotationChange(NamedTuple):
     stage: RotationStage
     """The stage that was reached."""
     authorities: Sequence[Annotated[str, Words(("identity_ca", "permissions_ca", "ca"))]]
-    """The CAs that are replaced: stems of their file names in public/."""
+    """The replaced CAs, by the names of their files in public/ without suffixes."""
     enclaves: Sequence[
         EnclaveResult[
             Annotated[
@@ -517,8 +523,9 @@ class RotationChange(NamedTuple):
     old_keys_elsewhere: Sequence[str]
     """Places of old CA keys outside of the keystore, which sros never deletes."""
     cut_off: Sequence[str]
-    """The robots of the fleet that have not confirmed the previous stage, and so cannot communicate
-    with the others until they get its files (``--allow-unconfirmed``)."""
+    """The robots of the fleet that have not confirmed the previous stage, and therefore cannot
+    communicate with the others until they get its files (``--allow-unconfirmed``).
+    """
     remarks: Sequence[str]
     """Next steps, as sentences; empty in a dry run."""
     changes: FileChanges

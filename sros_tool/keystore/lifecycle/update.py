@@ -1,10 +1,11 @@
-"""Update of an existing keystore: settings, governance, and the files that follow from them.
+"""Update of an existing keystore: settings, governance, and the files that depend on them.
 
-There are two stages, so that a running robot passes the first without a pause.  credentials:
-enclaves get certificates and permissions as the new settings state them; processes with old and new
-files communicate.  governance: the signed governance and the domains change; with most differences,
-processes with the old governance cannot communicate with processes with the new one.  Each stage is
-a transaction, and no state is kept: the stages that would still change something are left.
+There are two stages, so that a running robot passes the first one without interruption.  In
+``credentials``, enclaves get certificates and permissions by the new settings; processes with old
+and new files communicate.  In ``governance``, the signed governance and the domains change; with
+most differences, processes with the old governance cannot communicate with processes with the new
+one.  Each stage is a transaction.  No progress is recorded: the stages that remain are those that
+would still change something.
 """
 
 from __future__ import annotations
@@ -113,7 +114,7 @@ class UpdateStage(StrEnum):
     """The stages of an update, in order."""
 
     CREDENTIALS = "credentials"
-    """Certificates and permissions of the enclaves, and the settings that they follow."""
+    """Certificates and permissions of the enclaves, and the settings on which they depend."""
     GOVERNANCE = "governance"
     """The signed governance, and the domains in governance and permissions."""
 
@@ -135,7 +136,7 @@ class KeystoreUpdate(Changed):
 
     @property
     def looser(self) -> tuple[str, ...]:
-        """Clauses on everything that the update allows and that was not allowed before."""
+        """Clauses on everything that the update allows but that was not allowed before."""
         gained = [
             f"{right.enclave} gains {rights_text(right.gained)}"
             for right in self.rights
@@ -156,8 +157,8 @@ def edited_settings(
     """Return the settings and domains that the edited files of a keystore state.
 
     Raises:
-        KeystoreError: nothing was edited, both files were edited to different protection, or
-            settings cannot state the governance.
+        KeystoreError: nothing was edited; both files were edited, but to different protection; or
+            settings cannot express the governance.
     """
     root = keystore.root
     edits = present_settings.edits
@@ -168,7 +169,8 @@ def edited_settings(
             "Edit one of them first, or name what to change with --set or --template.",
         )
     if present_settings.written is None and not present_settings.without_settings:
-        _ = OpenedKeystore(root).template  # raises what is wrong with them
+        # Raises the error that says what is wrong with the settings.
+        _ = OpenedKeystore(root).template
         raise KeystoreError(
             f"there is no {SETTINGS} in keystore '{root}', so there is no change to apply",
             "",
@@ -209,7 +211,7 @@ def edited_settings(
 def _checked_target(
     keystore: OpenedKeystore, present_settings: PresentSettings, target: Template
 ) -> Template:
-    """Return ``target`` with the places of the current CA keys.
+    """Return ``target`` with the present places of the CA keys.
 
     Raises:
         UsageError: the keystore cannot be changed to ``target``.
@@ -263,24 +265,24 @@ def update_keystore(
 
     Args:
         root: the keystore.
-        target: its new settings; the places of its CA keys stay.
-        domains: its new domains.
-        next_stage: do only the first stage that is left.
+        target: the new settings; the places of the CA keys do not change.
+        domains: the new domains.
+        next_stage: carry out only the first stage that remains.
         allow_looser: accept settings that allow more than before.
         revoke_old: issue all certificates again, with subjects that no earlier permissions fit, and
             revoke all earlier certificates.
-        replace_edits: accept that ``target`` replaces edits by hand in the settings or the
-            governance, because it contains or undoes them.
-        seen_settings: the settings that ``target`` was made from.
+        replace_edits: accept that ``target`` replaces manual edits in the settings or the
+            governance, because ``target`` contains or undoes them.
+        seen_settings: the settings from which ``target`` was made.
         progress: called with the name of each enclave that is done.
-        options: those of every change of a keystore.
+        options: the options of every change of a keystore.
 
     Raises:
-        UsageError: more would be allowed without ``allow_looser``, or the keystore cannot be
-            changed to ``target``.
+        UsageError: more would be allowed, and ``allow_looser`` is not set; or the keystore cannot
+            be changed to ``target``.
         KeystoreError: an enclave cannot be issued again, files were edited by hand, the settings
-            are no longer ``seen_settings``, or vendors would refuse enclaves that they
-            accept today.
+            are no longer ``seen_settings``, or vendors would refuse enclaves that they accept
+            today.
     """
     change = KeystoreChange(root, **options)
     with change:
@@ -330,7 +332,7 @@ def update_keystore(
 
 @dataclass(frozen=True, slots=True)
 class _Goal:
-    """The settings and the domains that an update leads to."""
+    """The settings and the domains to which an update leads."""
 
     settings: Template
     domains: DomainSet
@@ -343,7 +345,7 @@ class _Goal:
 def _first_step(present_settings: PresentSettings, goal: _Goal) -> _Goal:
     """Return the goal of the first stage, CREDENTIALS: ``goal`` with the present protection.
 
-    The name, the description, the distributions and the domains also stay as they are.
+    The present name, description, distributions and domains also stay.
     """
     settings = replace(
         goal.settings,
@@ -379,7 +381,7 @@ def _signed_payloads(before: DomainProtection, after: DomainProtection) -> list[
 
 
 _ONLY_STATED = ("name", "description", "distributions")
-"""Settings that no file depends on."""
+"""Settings on which no file depends."""
 
 
 def _pending_stages(present_settings: PresentSettings, goal: _Goal) -> tuple[UpdateStage, ...]:
@@ -398,7 +400,7 @@ def _pending_stages(present_settings: PresentSettings, goal: _Goal) -> tuple[Upd
 
 @dataclass(frozen=True, slots=True)
 class _Reissued:
-    """An enclave after its update; ``old`` records its replaced certificate, if there is one."""
+    """An enclave after its update; ``old`` is the record of its replaced certificate, or None."""
 
     name: str
     rights: ReplacedRights
@@ -407,7 +409,7 @@ class _Reissued:
 
 @dataclass(frozen=True, slots=True)
 class _KeptOpen:
-    """An enclave that keeps the right to everything, though enclaves without a policy lose it.
+    """An enclave that keeps the right to everything, although the new default rights are narrower.
 
     ``reissued`` has its new files, or None.
     """
@@ -417,7 +419,7 @@ class _KeptOpen:
 
 
 class _Updater:
-    """Writer of one update, within a transaction."""
+    """Carries out one update, within a transaction."""
 
     def __init__(
         self,
@@ -441,7 +443,7 @@ class _Updater:
             self._certificates
             or before.permissions_validity != after.permissions_validity
             or present_settings.domains != goal.domains
-            # Rights that no ledger records would not be signed again once there are settings.
+            # Once there are settings, rights that no ledger records would not be signed again.
             or present_settings.without_settings
         )
         self._kept_open: tuple[str, ...] = ()
@@ -595,7 +597,7 @@ class _Updater:
         return NewIdentity(enclave_subject(name, unique=unique), public)
 
     def _has_default_rights(self, state: Credentials, earlier_rights: SignedRights) -> bool:
-        """Return whether an enclave has the default rights, and the update changes these."""
+        """Return whether an enclave has the default rights, and the update changes these rights."""
         before, after = self._present.settings, self._goal.settings
         if before.default_permissions == after.default_permissions:
             return False
@@ -607,7 +609,7 @@ class _Updater:
             default, subject=state.grant.subject, validity=validity, domains=domains
         ).grants
         granted_rights = grant_rights(state.name, state.grant)
-        if before.default_permissions == EVERYTHING:  # ros2/sros2 adds the DDS topic *
+        if before.default_permissions == EVERYTHING:  # ros2/sros2 adds the DDS topic ``*``
             granted_rights = frozenset(right for right in granted_rights if right.kind != "dds")
         difference = compare(grant_rights(state.name, grant), granted_rights)
         return all(right in difference.covered for _, right in difference.lines())
@@ -634,7 +636,7 @@ class _Updater:
     # ── authorities ────────────────────────────────────────────────────────────────────────
 
     def _part_authorities(self) -> None:
-        """Stage a separate file for each CA if one file has both CAs; DDS loads the same bytes."""
+        """Stage a separate file for each CA if one file has both; DDS loads the same content."""
         settings, files = self._goal.settings, self._change.keystore.authority_files
         if not settings.separate_authorities or len(files) > 1:
             return
@@ -650,7 +652,7 @@ class _Updater:
             (f"{PRIVATE}/{file}.key.pem", True, ca_key),
         ):
             if not (self._root / path).is_file():
-                continue  # a key that is kept elsewhere
+                continue  # the key is kept in another place
             data = self._change.transaction.read(path)
             for role in ROLES:
                 self._change.transaction.write(path_of(role), data, private=private)
@@ -692,7 +694,7 @@ class _Updater:
         return []
 
     def _rotation(self, role: str) -> str:
-        """Return the command, as a clause, that begins or continues the replacement of CAs.
+        """Return the command that begins or continues a rotation of CAs, as a clause.
 
         ``role`` is the option that selects a CA, or "".
         """
@@ -708,12 +710,12 @@ class _Updater:
 def trust_records(root: Path, **options: Unpack[ChangeOptions]) -> KeystoreUpdate:
     """Record permissions again that sros 0.1 recorded without a chain of ledger lines.
 
-    Permissions are recorded only if the permissions CA signed them, and they are the last ones of
+    Permissions are recorded only if the permissions CA signed them and they are the last ones of
     their enclave in the ledger.  If any enclave has other permissions, nothing is written.
 
     Raises:
-        KeystoreError: the ledger is damaged, no enclave needs this, or an enclave has permissions
-            other than the last ones in the ledger.
+        KeystoreError: the ledger is damaged, no enclave needs this, or an enclave has other
+            permissions than the last ones in the ledger.
     """
     with KeystoreChange(root, **options) as change:
         ledger = change.ledger
@@ -766,13 +768,13 @@ def set_zenoh(
     network: ZenohNetwork | None,
     **options: Unpack[ChangeOptions],
 ) -> Creation:
-    """Set or remove (None) the Zenoh network of a keystore: its settings, and all enclaves' files.
+    """Set the Zenoh network of a keystore, or remove it (None), with the files of all enclaves.
 
-    The enclave of the router is created if it does not exist.  Files that already have the right
-    content and a valid signature stay as they are.
+    The router's enclave is created if it is missing.  Files that already have the right content and
+    a valid signature are not changed.
 
     Raises:
-        KeystoreError: files of the keystore were edited by hand, or it has no settings.
+        KeystoreError: files of the keystore were edited by hand, or the keystore has no settings.
         PolicyError: an enclave has rights that Zenoh cannot enforce.
         UsageError: the network cannot work, is not for the domains of the keystore, or the router's
             enclave has rights of its own.
@@ -804,10 +806,10 @@ def set_zenoh(
 
 
 def _with_routers_of_robots(change: KeystoreChange, network: ZenohNetwork) -> ZenohNetwork:
-    """Return a network with the routers of the fleet's robots.
+    """Return a network with the routers of the fleet's robots added.
 
     Raises:
-        UsageError: ``network`` has another endpoint, or none, for the router of a robot.
+        UsageError: ``network`` has other endpoints for a robot's router, or lacks the router.
     """
     complete = change.with_routers_of_robots(network)
     asked, before = (
