@@ -6,6 +6,7 @@ import ctypes
 import os
 import subprocess
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, tzinfo
 from pathlib import Path
@@ -31,7 +32,7 @@ from sros_tool.keystore.confirmation import (
     Seen,
     is_enclave_name,
 )
-from sros_tool.keystore.layout import KEY_FILE
+from sros_tool.keystore.layout import KEY_FILE, enclave_path
 from sros_tool.runtime.processes import (
     Process,
     ProcessEnclave,
@@ -102,10 +103,7 @@ def look_at_processes(
     """
     running = (look or ProcessTable().look)(now)
     own_processes = [process for process in running.processes if _is_of(process, folder)]
-    readers, owner = list[Process](), folder.stat().st_uid
-    for process in own_processes:
-        if process.user in (0, owner) or (process.enclave and _is_key_readable(process.enclave)):
-            readers.append(process)
+    readers = [process for process in own_processes if _can_read_key(process, folder)]
 
     def is_outdated(process: Process, enclave: ProcessEnclave) -> bool:
         return _is_older(process, replaced) or any(newer_files(process, enclave))
@@ -192,8 +190,22 @@ def _is_older(process: Process, moments: Mapping[str, datetime]) -> bool:
     return moment is not None and process.started < moment
 
 
-def _is_key_readable(enclave: ProcessEnclave) -> bool:
-    return bool(enclave.file(KEY_FILE).mode & 0o077)
+def _can_read_key(process: Process, folder: Path) -> bool:
+    """Return whether a process is of a user who can read the key of its enclave in ``folder``.
+
+    The files that the process sees do not show it: any user can mount others over them, for its own
+    processes.
+    """
+    if process.user in (0, folder.stat().st_uid):
+        return True
+    name, enclave = _enclave_of(process), process.enclave
+    if enclave and is_enclave_name(name):
+        with suppress(OSError):
+            place = enclave_path(folder, name)
+            state, key = place.stat(), (place / KEY_FILE).stat()
+            is_same_folder = (state.st_dev, state.st_ino) in enclave.folders[1:]
+            return is_same_folder and bool(key.st_mode & 0o077)
+    return False
 
 
 def _states(

@@ -34,7 +34,7 @@ from sros_tool.keystore.confirmation import (
 )
 from sros_tool.keystore.delivery.release import Release
 from sros_tool.keystore.issuing.keyring import no_secrets
-from sros_tool.keystore.layout import CRL_FILE, REQUIRED_FILES
+from sros_tool.keystore.layout import CRL_FILE, KEY_FILE, REQUIRED_FILES
 from sros_tool.keystore.reader import read_certificate
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificates, load_request, validity_of
@@ -70,6 +70,10 @@ class Robot:
     boot: str = "first"
     user: int = 0
     """The user of the processes."""
+    mode: int = 0o600
+    """The mode of the key that the processes see, perhaps in a file system of their own."""
+    enclaves: Path | None = None
+    """The folder with the enclaves that the processes see; None for that of the robot."""
     restarted: bool = False
     settings: AgentSettings = field(init=False)
     patience: float = 0.0
@@ -134,7 +138,11 @@ class Robot:
     def process(self, name: str) -> Process:
         place = self.folder / f"enclaves{name}"
         files = tuple(
-            LoadedFile(file, datetime.fromtimestamp((place / file).stat().st_ctime, UTC))
+            LoadedFile(
+                file,
+                datetime.fromtimestamp((place / file).stat().st_ctime, UTC),
+                mode=self.mode if file == KEY_FILE else 0o644,
+            )
             for file in (*REQUIRED_FILES, CRL_FILE)
             if (place / file).exists()
         )
@@ -144,7 +152,12 @@ class Robot:
             "ROS_SECURITY_STRATEGY": "Enforce",
         }
         here, is_there = self.folder, place.is_dir()
-        enclave = ProcessEnclave(str(here), name, files, is_there=is_there, here=here)
+        seen = (self.enclaves / name[1:]) if self.enclaves else place
+        states = [path.stat() for path in (here, seen) if path.exists()]
+        folders = tuple((state.st_dev, state.st_ino) for state in states)
+        enclave = ProcessEnclave(
+            str(here), name, files, is_there=is_there, here=here, folders=folders
+        )
         started, user = self.started[name], self.user
         return Process(1, ("node",), environment, started, user=user, enclave=enclave)
 
@@ -817,6 +830,19 @@ def test_a_process_that_cannot_read_the_key_restarts_nothing_and_ends_no_restart
     r1.systemctl, r1.user = [], r1.folder.stat().st_uid + 1
     r1.started = {"/r1/a": moment() - timedelta(hours=1)}
     assert r1.round().restart == ("/r1/a",) and not r1.systemctl
+    r1.mode = 0o644  # of a key that the process itself has mounted over the robot's
+    assert r1.round().restart == ("/r1/a",) and not r1.systemctl
+    key = r1.folder / "enclaves/r1/a" / KEY_FILE
+    key.chmod(0o644)
+    r1.enclaves = r1.inbox.parent / "own"
+    (r1.enclaves / "r1/a").mkdir(parents=True)
+    r1.round()
+    assert not r1.systemctl
+    r1.enclaves = None
+    r1.round()
+    assert r1.systemctl, "whoever can read the key may run there"
+    key.chmod(0o600)
+    r1.systemctl = []
     r1.unseen, r1.release = True, home.revoked
     r1.started = {"/r1/a": moment() + timedelta(hours=1)}
     r1.settings = replace(r1.settings, restart=False)
