@@ -44,7 +44,7 @@ from sros_tool.policy.rights import (
     compare,
     group_rights,
     join_actions,
-    lost_counterpart_text,
+    lost_counterparts_text,
     order,
     policy_rights,
     profile_rights,
@@ -247,8 +247,7 @@ def counterpart_notes(policies: Iterable[Policy], merged: Collection[Right]) -> 
     for rights in map(policy_rights, policies):
         lost.update(rights_without_counterpart(rights, merged, compare(rights, merged)))
     if lost:
-        text = first_few(list(map(lost_counterpart_text, sorted(lost))), _SHOWN, "; ", ", and ")
-        yield Note("merge.no-counterpart", f"{text}.")
+        yield Note("merge.no-counterpart", lost_counterparts_text(lost))
 
 
 _MARKUP = re.compile(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from itertools import chain
 from typing import Annotated, NamedTuple
 
 from sros_tool.names import (
@@ -37,6 +38,7 @@ from sros_tool.policy.model import (
 )
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers, matches, overlap
 from sros_tool.values import Words, shows
+from sros_tool.wording import first_few
 
 KIND_OF = {right: kind for kind, pair in RIGHTS.items() for right in pair}
 """Maps a right to the kind of its names, such as publish to topics."""
@@ -571,15 +573,26 @@ def _is_offered_by_every_node(name: str) -> bool:
 
 
 def _allowed_pairs(
-    rights: Iterable[Right], names: Iterable[tuple[str, str]]
+    rights: Collection[Right], names: Iterable[tuple[str, str]]
 ) -> set[tuple[str, str]]:
     """Return the pairs (right, name) that the rights allow to at least one enclave."""
-    rules, enclaves = Rules(rights), {right.enclave for right in rights}
+    rules, enclaves = Rules(rights), defaultdict[str, set[str]](set)
+    for right in rights:
+        if right.qualifier is not DENY:
+            enclaves[_name_or_wildcard(right.name)].add(right.enclave)
     return {
         (word, name)
         for word, name in names
-        if any(rules.allow(enclave, word, name) for enclave in enclaves)
+        if any(
+            rules.allow(enclave, word, name)
+            for enclave in chain(enclaves[_name_or_wildcard(name)], enclaves["*"])
+        )
     }
+
+
+def _name_or_wildcard(name: str) -> str:
+    """Return a name, of a part of an action the action's name, and "*" for any wildcard."""
+    return "*" if is_expression(name) else name.partition(ACTION_SEPARATOR)[0]
 
 
 def lost_counterpart_text(right: Right) -> str:
@@ -587,3 +600,12 @@ def lost_counterpart_text(right: Right) -> str:
     other = PEER_RIGHT[right.right]
     other = {"reply": "serve", "subscribe": "subscribe to"}.get(other, other)
     return f"{right.enclave} may {right.right} {right.name}, but no enclave may {other} it any more"
+
+
+def lost_counterparts_text(rights: Iterable[Right]) -> str:
+    """Return a sentence on some of the `rights_without_counterpart`."""
+    clauses = list(map(lost_counterpart_text, sorted(rights)))
+    return f"{first_few(clauses, _SHOWN, '; ', ', and ')}."
+
+
+_SHOWN = 3

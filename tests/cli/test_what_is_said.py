@@ -20,6 +20,7 @@ from tests.support.harness import (
     publish,
     snapshot,
     sros,
+    subscribe,
     topics_of,
 )
 
@@ -257,3 +258,30 @@ def test_a_policy_that_cannot_be_read_says_how_to_mend_it(
     text = policy_text({"/a": '<services reply="ALLOW"><service>x</service></services>'})
     (tmp_path / "p.xml").write_text(text.replace(*wrong))
     assert fix in sros("check", tmp_path / "p.xml").out
+
+
+def test_signing_says_which_counterpart_is_gone(tmp_path: Path) -> None:
+    """Twins: the name moves to a new enclave, or a wildcard gives it."""
+    ears = {"/ear": subscribe("/image"), "/all": publish("/map/*"), "/cam": publish("/map/a")}
+    policies = {
+        "whole": {**ears, "/cam": publish("/image", "/map/a")},
+        "moved": {**ears, "/new": publish("/image")},
+        "less": ears,
+        "deny": {**ears, "/cam": publish("/image").replace("ALLOW", "DENY")},
+        "wide": {**ears, "/all": publish("/*")},
+    }
+    for name, enclaves in policies.items():
+        (tmp_path / f"{name}.xml").write_text(policy_text(enclaves))
+    sign = ("generate_artifacts", "-k", "ks", "-p")
+    sros(*sign, "whole.xml", cwd=tmp_path).ok()
+    lost = (
+        "note [permissions.no-counterpart]: /ear may subscribe /image, but no enclave may publish"
+    )
+    for words, said in (
+        ((*sign, "less.xml", "--dry-run"), True),
+        ((*sign, "deny.xml", "--dry-run"), True),
+        ((*sign, "moved.xml", "--dry-run"), False),
+        ((*sign, "wide.xml", "--dry-run"), False),
+        (("create_permission", "ks", "/cam", "less.xml"), True),
+    ):
+        assert (lost in sros(*words, cwd=tmp_path).ok().err) == said, words

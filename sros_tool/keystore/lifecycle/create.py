@@ -79,6 +79,7 @@ from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, Keystore
 from sros_tool.keystore.lifecycle.replaced import (
     ReplacedRights,
     Superseded,
+    counterpart_notes,
     earlier_permissions,
     replaced_rights,
     with_ledger,
@@ -794,6 +795,8 @@ def write_enclaves(
     )
     change.record()
     replaced = [made.replaced for made in done.values() if made.replaced]
+    new = (wanted_enclaves[name] or _default_rights(change.template, name) for name in created)
+    change.notes += counterpart_notes(change.keystore, replaced, new)
     if not revoke_old:
         replaced = [*with_ledger(change.keystore, replaced, change.now)]
     change.finish(command="replace the permissions" if superseded else "")

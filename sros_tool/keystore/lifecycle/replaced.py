@@ -6,7 +6,8 @@ the same subject can use them until they expire (ros2/sros2 issue 275).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import re
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -17,16 +18,25 @@ from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
-from sros_tool.errors import SrosError
+from sros_tool.errors import Note, SrosError
 from sros_tool.fleet.robots import Fleet, folded
 from sros_tool.keystore.delivery.published import may_have_later_releases
 from sros_tool.keystore.known_keys import IssuedEarlier, restored_at
+from sros_tool.keystore.layout import PERMISSIONS_FILE
 from sros_tool.keystore.ledger import Entry, certificate_entry
 from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.template import Template
+from sros_tool.names import is_expression
 from sros_tool.pki.certificates import key_digest, subject_text, validity_of
-from sros_tool.policy.model import ALLOW
-from sros_tool.policy.rights import Right, compare
+from sros_tool.policy.model import ALLOW, DENY, Enclave, Policy
+from sros_tool.policy.rights import (
+    Right,
+    compare,
+    lost_counterparts_text,
+    policy_rights,
+    rights_without_counterpart,
+)
 from sros_tool.translate import grant_rights
 from sros_tool.validity import iso
 from sros_tool.wording import first_few
@@ -137,6 +147,56 @@ def replaced_rights(
     return ReplacedRights(
         name, tuple(lost), tuple(gained), works_until, lost_domains, gained_domains
     )
+
+
+def counterpart_notes(
+    keystore: OpenedKeystore, replaced_rights: Iterable[ReplacedRights], created: Iterable[Enclave]
+) -> Iterator[Note]:
+    """Yield a note on rights whose counterpart the replaced permissions took away.
+
+    ``keystore`` is the keystore before the change, and ``created`` are the new enclaves.  There is
+    no note if permissions of the keystore cannot be read.
+    """
+    removed: set[Right] = set()
+    added: set[Right] = set()
+    for replaced in replaced_rights:
+        for rights, of_allow, of_deny in (
+            (replaced.lost, removed, added),
+            (replaced.gained, added, removed),
+        ):
+            for right in rights:
+                (of_allow if right.qualifier is ALLOW else of_deny).add(right)
+    names = {right.name for right in removed if right.qualifier is ALLOW}
+    names |= {right.name for right in added if right.qualifier is DENY}
+    if not names:
+        return
+    with suppress(SrosError):  # a hint, without which the change is right, too
+        source = load_rights(keystore, only_enclaves=_enclaves_naming(keystore, names))
+        before = source.rights
+        after = before.difference(removed).union(added, policy_rights(Policy(tuple(created))))
+        lost = rights_without_counterpart(before, after, compare(removed, added))
+        if lost and source.sound:
+            yield Note("permissions.no-counterpart", lost_counterparts_text(lost))
+
+
+def _enclaves_naming(keystore: OpenedKeystore, names: Collection[str]) -> list[str]:
+    """Return the enclaves whose permissions may have one of some ROS names, perhaps by a wildcard.
+
+    Most permissions need not be parsed for that.
+    """
+    if len(names) > _FEW_NAMES or any(map(is_expression, names)):
+        return list(keystore.names)
+    texts = re.compile(b"|".join([_WILDCARD, *(re.escape(name.encode()) for name in names)]))
+    return [
+        enclave
+        for enclave in keystore.names
+        if texts.search(keystore.read(keystore.folder(enclave) / PERMISSIONS_FILE, "permissions"))
+    ]
+
+
+_FEW_NAMES = 20
+_WILDCARD = rb"[*\[&]|\?(?!xml |>)"
+"""A character in permissions that may belong to a wildcard, or to an escape."""
 
 
 def with_ledger(
