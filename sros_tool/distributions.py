@@ -117,7 +117,7 @@ class Distribution(NamedTuple):
         return next((shipped for shipped in self.shipped if shipped.product == product), None)
 
     def shipped_vendor_product(self, vendor: Vendor) -> Shipped:
-        """Return the release that it ships of a vendor's product, such as of ``cyclonedds``.
+        """Return the release of a vendor's product (``cyclonedds``) that the distribution ships.
 
         Raises:
             UsageError: the distribution ships another release than ``vendor`` names, or none that

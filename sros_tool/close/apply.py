@@ -213,7 +213,7 @@ class _RemainingProcesses:
             remedy = f"restart process {guest.pid} open: {process_text(guest)}"
             if not self._running.may_use_files(guest):
                 remedy = f"it is {guest.label} of user {guest.user}, who cannot read its files"
-            yield f"{enclave} runs in an enclave, too; {remedy}"
+            yield f"a process runs in the enclave {enclave}, too; {remedy}"
 
     def unknown_processes(self) -> Iterator[str]:
         """Yield processes that may run secured, although this folder did not start them."""

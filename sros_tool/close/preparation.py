@@ -148,7 +148,7 @@ def _remember_later_processes(robot: LocalRobot) -> None:
     for old, new in zip(before.processes, now.processes, strict=False):
         if new != old:
             robot.shell.say(
-                f"{new.enclave} runs by another command than before, which sros remembers: "
+                f"{new.enclave} runs by another command than before; sros remembers the new one: "
                 f"{new.open_command(robot.domain)}; before: {old.open_command(robot.domain)}"
             )
     if now != robot.observed:

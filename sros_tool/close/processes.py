@@ -107,7 +107,7 @@ class ClosedProcess(NamedTuple):
 
     @property
     def lacks_enclave_argument(self) -> bool:
-        """Whether its command has to name the enclave, because other Zenoh nodes look for it."""
+        """Whether the command has to name the enclave, because Zenoh nodes look for the name."""
         is_node = self.rmw == RMW_ZENOH and not self.is_router
         return is_node and named_enclave(self.command) != self.enclave
 

@@ -259,7 +259,7 @@ def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
 
 
 def _process_findings(running: RunningRobot) -> list[Finding]:
-    """Return what `check runtime` finds in the robot's domain, as from the observer's enclave."""
+    """Return what `check runtime` finds in the robot's domain, run in the observer's enclave."""
     robot = running.robot
     robot.shell.say(
         f'$ eval "$(sros env {shlex.quote(str(robot.export))} {OBSERVER})"; sros check runtime'

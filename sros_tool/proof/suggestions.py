@@ -104,7 +104,7 @@ def _not_proposed(requirement: Requirement) -> str:
     assert isinstance(requirement, Only)
     (right, (name,)), users = requirement.rights[0], counted(len(requirement.enclaves), "enclave")
     return (
-        f"# not proposed: who alone may {right} {name} (stated for {users}; others may by a "
+        f"# not proposed: only some may {right} {name} (stated for {users}, but others may by a "
         "wildcard, or a DENY is there)"
     )
 

@@ -185,7 +185,9 @@ def test_a_robot_that_was_away_for_a_month_goes_on(world: World) -> None:
     ],
 )
 def test_wrong_options_set_up_nothing(words: tuple[str, ...], why: str, world: World) -> None:
-    refused = world.run(*INIT, *words)
+    option, value = words
+    given = dict(zip(INIT[3::2], INIT[4::2], strict=True)) | {option: value}
+    refused = world.run(*INIT[:3], *(word for pair in given.items() for word in pair))
     assert refused.status == 2 and why in refused.err, refused
     assert len(refused.err.splitlines()) == 1
     assert not (world.folder / "robot/.agent/agent.toml").exists()

@@ -421,7 +421,7 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     proved = robot.close("--proof", status=1).out
     assert "no: everything that talked can still talk: denied: /listener subscribe /ch" in proved
     differs = "differs from the signed permissions of /listener, which the processes use: bring"
-    assert f"finds no error: robot/export; 'robot/policy.xml' {differs} the policy" in proved
+    assert f"finds no error: robot/export; 'robot/policy.xml' {differs} the signed" in proved
     policy.write_text(signed)
     assert "yes: everything that talked can still talk: 2 nodes" in robot.close("--proof").out
     refused = robot.close("--apply", status=2).err
@@ -513,8 +513,8 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     ended = robot.close()
     assert "  /talker: process 4711: closed\n" in ended.out
     now = "/opt/run talker --ros-args -r __node:=talker"
-    remembered = "/talker runs by another command than before, which sros remembers: cd /opt && "
-    assert f"{remembered}{now}; before: cd /opt && /opt/run talker\n" in ended.err
+    remembered = "/talker runs by another command than before; sros remembers the new one: "
+    assert f"{remembered}cd /opt && {now}; before: cd /opt && /opt/run talker\n" in ended.err
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert f" /talker -- {now}\n" in commands and " /opt/run talker\n" not in commands
     assert re.fullmatch(
