@@ -23,9 +23,9 @@ from benchmarks.floor import make_enclaves, sizes_of
 from benchmarks.inputs import fleet_file, fleet_policy
 from sros_tool.keystore.confirmation import (
     Confirmation,
-    Received,
-    keep_confirmation,
+    ReceivedConfirmation,
     make_confirmation,
+    store_confirmation,
 )
 from sros_tool.keystore.reader import OpenedKeystore
 
@@ -113,7 +113,7 @@ def _confirm(root: Path, robots: int) -> None:
             path: whole.certificates[path] for path in own if path in whole.certificates
         }
         confirmation = Confirmation(f"r{number}", now, own, certificates)
-        keep_confirmation(keystore, Received(confirmation, now))
+        store_confirmation(keystore, ReceivedConfirmation(confirmation, now))
 
 
 def _words(sizes: Sequence[tuple[str, int | str]]) -> list[str]:

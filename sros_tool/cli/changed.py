@@ -19,7 +19,7 @@ from sros_tool.wording import counted, first_few
 if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.change import Changed
     from sros_tool.keystore.lifecycle.replaced import ReplacedRights
-    from sros_tool.keystore.outcomes import KeptZenoh
+    from sros_tool.keystore.outcomes import StagedZenoh
     from sros_tool.keystore.transaction import Change
 
 _NAMES_SHOWN = 5
@@ -218,7 +218,7 @@ def shown_names(names: Sequence[str]) -> str:
 
 
 def _print_restart(
-    root: Path, names: Sequence[str], zenoh: KeptZenoh | None = None, *, exported: bool = True
+    root: Path, names: Sequence[str], zenoh: StagedZenoh | None = None, *, exported: bool = True
 ) -> None:
     """Print on stderr that the processes of the enclaves ``names`` have to be restarted.
 

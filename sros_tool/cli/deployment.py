@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from sros_tool.errors import Note
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.delivery.robot import ImportedEnclave
-    from sros_tool.keystore.delivery.signing import Signed
+    from sros_tool.keystore.delivery.signing import SignedRequests
     from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.policy.model import Policy
 
@@ -404,7 +404,7 @@ def sign_request(
     from sros_tool.runtime.variables import domain_from
 
     root, request = root_and_file(arguments, "sign_request takes a keystore and one request")
-    work: Callable[..., Signed] = certify_requests
+    work: Callable[..., SignedRequests] = certify_requests
     if no_answer:
         if output is not None or force:
             raise UsageError("--no-answer makes no file: leave out -o and --force")
@@ -431,7 +431,9 @@ def sign_request(
     _show_signed(signed, output, existed=existed, as_json=as_json)
 
 
-def _show_signed(signed: Signed, answer: Path | None, *, existed: bool, as_json: bool) -> None:
+def _show_signed(
+    signed: SignedRequests, answer: Path | None, *, existed: bool, as_json: bool
+) -> None:
     """Print what was done with signed requests; ``answer`` is the file for the robot."""
     from sros_tool.pki.certificates import digest
 

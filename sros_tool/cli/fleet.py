@@ -215,10 +215,10 @@ def _confirm(arguments: tuple[str, ...], robot: str, dry_run: bool, as_json: boo
     from sros_tool.keystore.confirmation import (
         MAX_BYTES,
         KeptConfirmation,
-        keep_confirmation,
         locked_confirmations,
         receive,
         refuse_older,
+        store_confirmation,
     )
     from sros_tool.keystore.fleet import recorded_fleet
     from sros_tool.keystore.layout import confirmation_file
@@ -235,7 +235,7 @@ def _confirm(arguments: tuple[str, ...], robot: str, dry_run: bool, as_json: boo
     with nullcontext() if dry_run else locked_confirmations(root):
         refuse_older(keystore, received)
         if not dry_run:
-            keep_confirmation(keystore, received)
+            store_confirmation(keystore, received)
     confirmation = received.confirmation
     enclaves = confirmation.enclaves()
     notes = [Note("fleet.clock", f"{robot}: {text}")] if (text := received.clock_note()) else []

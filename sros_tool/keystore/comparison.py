@@ -274,7 +274,7 @@ class Mismatch:
         return self.everything or bool(self.names)
 
 
-_DISTURBING = {
+_MUST_AGREE = {
     "discovery_protection_kind",
     "liveliness_protection_kind",
     "rtps_protection_kind",
@@ -287,7 +287,7 @@ def mismatch(old: Governance, new: Governance) -> Mismatch:
     names: dict[str, None] = {}
     pairs = dict.fromkeys((_rule_of(old, d), _rule_of(new, d)) for d in domains)
     for old_rule, new_rule in pairs:
-        if any(getattr(old_rule, kind) != getattr(new_rule, kind) for kind in _DISTURBING):
+        if any(getattr(old_rule, kind) != getattr(new_rule, kind) for kind in _MUST_AGREE):
             return Mismatch(everything=True)
         for expression, _, _ in _topic_pairs(old_rule, new_rule):
             if expression == "*":

@@ -240,7 +240,7 @@ def concerns_key(problem: str) -> bool:
     return is_of_key or KEY_NOT_HERE in problem or OF_ANOTHER_KEY in problem
 
 
-def is_of_copy(problem: str) -> bool:
+def shows_old_copy(problem: str) -> bool:
     """Return whether an agent's problem shows that it may fetch from an old copy."""
     phrases = (OLDER_THAN_SEEN, OLDER_THAN_INSTALLED, OF_OTHER_CA)
     return any(phrase in problem for phrase in phrases)
@@ -427,7 +427,7 @@ class LastMessage(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Received:
+class ReceivedConfirmation:
     """A confirmation with the time of its receipt, by the clock of the keystore's machine.
 
     ``message`` is the last message of the robot's agent, even if a later confirmation came in
@@ -479,7 +479,7 @@ class KeptConfirmation(NamedTuple):
     notes: Notes
 
 
-def receive(data: bytes, robot: str, label: str, *, now: datetime) -> Received:
+def receive(data: bytes, robot: str, label: str, *, now: datetime) -> ReceivedConfirmation:
     """Return the confirmation in ``data``, as received from ``robot`` at ``now``.
 
     Args:
@@ -498,10 +498,10 @@ def receive(data: bytes, robot: str, label: str, *, now: datetime) -> Received:
             "A robot can confirm only its own files.",
             f"If the report comes from {confirmation.robot}, add --robot {confirmation.robot}.",
         )
-    return Received(confirmation, now.replace(microsecond=0))
+    return ReceivedConfirmation(confirmation, now.replace(microsecond=0))
 
 
-def refuse_older(keystore: OpenedKeystore, received: Received) -> None:
+def refuse_older(keystore: OpenedKeystore, received: ReceivedConfirmation) -> None:
     """Raise `DocumentError` if a confirmation was made before the last one of its robot.
 
     If the robot's clock was ahead, the last confirmation counts as made when it was received.
@@ -539,7 +539,7 @@ def locked_confirmations(root: Path) -> Iterator[None]:
             lock.release()
 
 
-def keep_confirmation(keystore: OpenedKeystore, received: Received) -> str:
+def store_confirmation(keystore: OpenedKeystore, received: ReceivedConfirmation) -> str:
     """Write a robot's confirmation to the keystore in place of the previous one.
 
     Returns the path of the confirmation, relative to the keystore.  The last message of the robot's
@@ -567,7 +567,7 @@ class RefusedMessage(NamedTuple):
     why: str
 
 
-def keep_refusals(
+def store_refusals(
     keystore: OpenedKeystore,
     previous: Mapping[str, RefusedMessage],
     refused: Mapping[str, str],
@@ -617,7 +617,7 @@ def refusals(keystore: OpenedKeystore) -> dict[str, RefusedMessage]:
         ) from error
 
 
-def last_confirmation(keystore: OpenedKeystore, robot: str) -> Received | None:
+def last_confirmation(keystore: OpenedKeystore, robot: str) -> ReceivedConfirmation | None:
     """Return the last confirmation of ``robot``; None if the keystore has none.
 
     Raises:
@@ -638,7 +638,7 @@ def last_confirmation(keystore: OpenedKeystore, robot: str) -> Received | None:
         if confirmation.robot != robot:
             raise _FormError(f"it is the confirmation of {confirmation.robot}")
         message = _message_from(value["message"]) if "message" in value else None
-        return Received(confirmation, _moment(value["received"]), message)
+        return ReceivedConfirmation(confirmation, _moment(value["received"]), message)
 
 
 # The readers of the parts of a confirmation; each raises `_FormError` for another form.

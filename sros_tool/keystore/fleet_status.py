@@ -34,17 +34,17 @@ from sros_tool.keystore.confirmation import (
     EXPIRED_METADATA,
     OF_OTHER_CA,
     Confirmation,
-    Received,
+    ReceivedConfirmation,
     RobotClock,
     RobotDds,
     RunningFiles,
     certificate_digests,
     concerns_key,
     enclave_of,
-    is_of_copy,
     is_unusable,
     last_confirmation,
     refusals,
+    shows_old_copy,
 )
 from sros_tool.keystore.delivery.published import read_published
 from sros_tool.keystore.fleet import edited_fleet, enclaves_of_robot, recorded_fleet
@@ -653,7 +653,7 @@ class _ComparedRobot(NamedTuple):
 
     robot: Robot
     enclaves: tuple[str, ...]
-    received: Received | None
+    received: ReceivedConfirmation | None
     current: Mapping[str, int]
     different: tuple[_Difference, ...]
     authorities: Mapping[str, frozenset[tuple[str, ...]]]
@@ -779,7 +779,7 @@ def _compare(
     )
 
 
-def _notes_on_clock(received: Received) -> Iterator[str]:
+def _notes_on_clock(received: ReceivedConfirmation) -> Iterator[str]:
     if note := received.clock_note():
         yield note
     if received.confirmation.clock == RobotClock.BEHIND:
@@ -1070,7 +1070,7 @@ class _KeystoreRecords:
         A robot that reports another problem says itself why it did not get the release.
         """
         confirmed = compared_robot.confirmed
-        if confirmed and any(map(is_of_copy, confirmed.problems or ())):
+        if confirmed and any(map(shows_old_copy, confirmed.problems or ())):
             return True
         published = self.published.get(compared_robot.robot.name)
         if not (confirmed and last_heard and published and compared_robot.different):

@@ -1102,7 +1102,7 @@ def append(
     index = None
     if not transaction.dry_run:
         index = file.index_with(len(gaps) + len(entries), present)
-    links = _Links(chain(gaps, entries), present.previous, index)
+    links = _NewLines(chain(gaps, entries), present.previous, index)
     number, size = file.last_part()
     seals = index is not None and size + _LINE_BYTES * len(entries) >= _SEALED_FROM
     named = transaction.target_after(LEDGER) or ""
@@ -1137,7 +1137,7 @@ def append(
     transaction.write(LEDGER_HEAD, sign(head.encode(), "the head of the ledger"))
 
 
-class _Links:
+class _NewLines:
     """An iterator over the lines of new entries; each line gets the digest of the previous one.
 
     ``previous`` is the digest of the last line so far, ``count`` the number of lines so far.  The

@@ -33,7 +33,7 @@ RestartZenoh = Annotated[
 
 
 @dataclass(frozen=True, slots=True)
-class KeptZenoh:
+class StagedZenoh:
     """The Zenoh configurations after a change of a keystore.
 
     ``files`` maps enclaves to their files in the keystore.  ``written`` maps the paths of staged
@@ -49,7 +49,7 @@ class KeptZenoh:
     restart: tuple[str, ...] = ()
     notes: tuple[Note, ...] = ()
 
-    def without(self, names: Collection[str]) -> KeptZenoh:
+    def without(self, names: Collection[str]) -> StagedZenoh:
         """Return a copy in which the enclaves ``names`` need no restart."""
         return replace(self, restart=tuple(name for name in self.restart if name not in names))
 

@@ -57,7 +57,7 @@ from sros_tool.policy.model import Enclave
 
 # ── what DDS loads ─────────────────────────────────────────────────────────────────────────
 
-_LEFT_TO_THE_VENDOR = frozenset(
+_VENDOR_DECIDES = frozenset(
     {
         Fault.GOVERNANCE_DOMAIN,
         Fault.GOVERNANCE_MALFORMED,
@@ -135,7 +135,7 @@ class LoadedEnclave(NamedTuple):
         return tuple(
             problem
             for problem in vendor_problems(traits, self.state, self.at)
-            if problem.fault not in _LEFT_TO_THE_VENDOR
+            if problem.fault not in _VENDOR_DECIDES
             and not (self.key_elsewhere and (problem.fault, problem.file) == _NO_KEY)
         )
 
@@ -481,7 +481,7 @@ def accepted_state(
         problem
         for problem in state.problems
         if (problem.file == KEY_FILE and problem.fault is Fault.FILE_MISSING)
-        or (problem.fault in _LEFT_TO_THE_VENDOR and not sound)
+        or (problem.fault in _VENDOR_DECIDES and not sound)
         or all(problem in participant.problems for participant in participants)
         or (problem.fault is Fault.SIGNATURE and not _signed_by_ca(state, problem.file))
     )

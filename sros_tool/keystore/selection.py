@@ -241,9 +241,9 @@ def _enclaves_named_after(keystore: OpenedKeystore, robot: str) -> list[str]:
 
 _SHOWN = 5
 """Maximum number of enclaves that an error names."""
-_ALIKE = 0.75
+_SIMILARITY = 0.75
 """Lowest similarity (`difflib`) that counts as a typo: one of four letters differs."""
-_WHOLE_ALIKE = 0.9
+_FULL_NAME_SIMILARITY = 0.9
 """Lowest similarity for a typo in a full name, because names in a namespace begin alike."""
 
 
@@ -376,8 +376,8 @@ def likely_names(name: str, existing_enclaves: Collection[str]) -> tuple[str, ..
     similar_names = [enclave for enclave in existing_enclaves if lower[enclave].endswith(end)]
     if not similar_names:
         last = {enclave: text.rpartition("/")[2] for enclave, text in lower.items()}
-        similar_names = _similar_enclaves(end.rpartition("/")[2], last, _ALIKE)
-    return tuple(sorted(similar_names or _similar_enclaves(end, lower, _WHOLE_ALIKE))[:3])
+        similar_names = _similar_enclaves(end.rpartition("/")[2], last, _SIMILARITY)
+    return tuple(sorted(similar_names or _similar_enclaves(end, lower, _FULL_NAME_SIMILARITY))[:3])
 
 
 def _similar_enclaves(text: str, texts: Mapping[str, str], least: float) -> list[str]:

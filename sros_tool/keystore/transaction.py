@@ -415,7 +415,7 @@ class Transaction:
         self._after: list[Callable[[], None]] = []
         self._adopts = False
         # In a dry run, maps paths to new files (None beyond the limit) and to targets of links.
-        self._path_of_old_content: dict[str, bytes | str | None] = {}
+        self._kept_content: dict[str, bytes | str | None] = {}
         self._kept_bytes = 0
 
     @property
@@ -554,7 +554,7 @@ class Transaction:
         self.write_parts(path, (data,), private=private)
         if self.dry_run and not private:
             fits = self._kept_bytes + len(data) <= _MOST_KEPT
-            self._path_of_old_content[path] = data if fits else None
+            self._kept_content[path] = data if fits else None
             self._kept_bytes += len(data) if fits else 0
 
     def write_parts(self, path: str, parts: Iterable[bytes], *, private: bool = False) -> None:
@@ -598,7 +598,7 @@ class Transaction:
         if not self.is_staged(place):
             return _content(self.root / place)
         if self.dry_run:
-            kept = self._path_of_old_content.get(place)
+            kept = self._kept_content.get(place)
             return kept if isinstance(kept, bytes) else None
         return _content(Path(self._stage_place(place)))
 
@@ -607,7 +607,7 @@ class Transaction:
 
         Private files are not included.
         """
-        return sorted(path for path, kept in self._path_of_old_content.items() if kept is None)
+        return sorted(path for path, kept in self._kept_content.items() if kept is None)
 
     def target_after(self, path: str) -> str | None:
         """Return the target of the link at ``path`` after the transaction, or None."""
@@ -616,7 +616,7 @@ class Transaction:
         if self._links_to_list(path):
             return link_to_list(path.rpartition("/")[0].removeprefix(ENCLAVES) or "/")
         if self.dry_run:
-            kept = self._path_of_old_content.get(path)
+            kept = self._kept_content.get(path)
             return kept if isinstance(kept, str) else None
         target = _link_target(self._stage_place(path))
         return target and target.removeprefix(_relocated_target(path, ""))
@@ -645,7 +645,7 @@ class Transaction:
             flat = self._folders[path.rpartition("/")[0]]
             self._in.symlink(_relocated_target(path, target) if flat else target, staged)
         else:
-            self._path_of_old_content[path] = target
+            self._kept_content[path] = target
 
     def link_to_first_list(self, names: Sequence[str]) -> None:
         """Stage the link ``crl.pem`` for enclaves without one; this transaction writes the list.
@@ -763,14 +763,14 @@ class Transaction:
         With ``alone``, there are no forked workers: the session of a token does not survive a fork.
         """
         own_process, first_change, first_move = os.getpid(), self.changes.mark(), len(self._moves)
-        first_kept = len(self._path_of_old_content)
+        first_kept = len(self._kept_content)
 
         def work_on(part: Sequence[Item]) -> tuple[Result, Staged | None]:
             result = work(part)
             if os.getpid() == own_process:
                 return result, None
             changes, moves = self.changes.since(first_change), self._moves[first_move:]
-            kept = dict(islice(self._path_of_old_content.items(), first_kept, None))
+            kept = dict(islice(self._kept_content.items(), first_kept, None))
             return result, Staged(changes, tuple(moves), kept)
 
         slices = [(items, work_on(items))] if alone else map_slices(items, work_on)
@@ -781,7 +781,7 @@ class Transaction:
                     self._note_staged(place, (*self._staged.get(place, ()), *names))
                 self.changes.extend(staged.changes)
                 self._moves += staged.moves
-                self._path_of_old_content |= staged.kept
+                self._kept_content |= staged.kept
         return [(part, result) for part, (result, _) in slices]
 
     def note_adoption(self) -> None:

@@ -291,7 +291,7 @@ def _out_of_date(configuration: Configuration, file: str, name: str, state: Open
 _ANY_PORT_HERE = "tls/localhost:0"
 """Where sessions listen for direct connections: on their own host, as in rmw_zenoh."""
 _MOST_BYTES = 512 << 20
-_IN_A_ROW = 50
+_BATCH_SIZE = 50
 """Number of enclaves that are read together, step by step.
 
 The code of a step then stays in the caches of the processor, which takes a third less time than
@@ -359,7 +359,7 @@ class Drift(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Drifted:
+class DriftedConfiguration:
     """A configuration that differs from what it should be; ``path`` is relative to the keystore."""
 
     enclave: str
@@ -373,7 +373,7 @@ def drifted_configurations(
     authority: x509.Certificate,
     gone_enclaves: Collection[str] = (),
     reader: RenderedReader | None = None,
-) -> tuple[Drifted, ...]:
+) -> tuple[DriftedConfiguration, ...]:
     """Return the configurations that differ from ``wanted_documents``, or lack a valid signature.
 
     Configurations of enclaves in ``gone_enclaves`` do not count, nor do rules for unread enclaves.
@@ -381,7 +381,7 @@ def drifted_configurations(
     """
     reader = reader or RenderedReader()
 
-    def compare(paths: Sequence[str]) -> list[Drifted]:
+    def compare(paths: Sequence[str]) -> list[DriftedConfiguration]:
         differing = []
         for path in paths:
             document, present = wanted_documents.files[path], _present_file(keystore, path)
@@ -393,7 +393,7 @@ def drifted_configurations(
             elif not is_signed(keystore.root / path, present, authority, keystore.files):
                 kind = Drift.UNSIGNED
             if kind:
-                differing.append(Drifted(wanted_documents.enclaves[path], path, kind))
+                differing.append(DriftedConfiguration(wanted_documents.enclaves[path], path, kind))
         return differing
 
     files = [file for _, part in map_slices(list(wanted_documents.files), compare) for file in part]
@@ -427,7 +427,7 @@ class ZenohDrift(NamedTuple):
     all other enclaves to the nodes that they may announce in the graph.
     """
 
-    files: tuple[Drifted, ...]
+    files: tuple[DriftedConfiguration, ...]
     left_out: Mapping[str, str]
     nodes: Mapping[str, AnnouncedNodes]
 
@@ -762,8 +762,8 @@ class _RightsReader:
     def read(self, names: Sequence[str]) -> dict[str, _RulesOfEnclave | str]:
         """Map enclaves to their rules, or to the reason why they get none (a clause)."""
         rules: dict[str, _RulesOfEnclave | str] = {}
-        for begin in range(0, len(names), _IN_A_ROW):
-            rules |= self._read_some(names[begin : begin + _IN_A_ROW])
+        for begin in range(0, len(names), _BATCH_SIZE):
+            rules |= self._read_some(names[begin : begin + _BATCH_SIZE])
         return rules
 
     def _read_some(self, names: Sequence[str]) -> dict[str, _RulesOfEnclave | str]:
@@ -874,7 +874,7 @@ class _RightsReader:
             raise
 
 
-_PROOF = {
+_DECIDING_MESSAGES = {
     "publish": (Flow.INGRESS, Message.PUT),
     "subscribe": (Flow.EGRESS, Message.PUT),
     "request": (Flow.INGRESS, Message.QUERY),
@@ -894,13 +894,13 @@ def _prove(
     For names with wildcards, examples are tried.
     """
     control = AccessControl((remote,))
-    passing = {right: control.passing(enclave, *use) for right, use in _PROOF.items()}
+    passing = {right: control.passing(enclave, *use) for right, use in _DECIDING_MESSAGES.items()}
     tokens = control.passing(enclave, Flow.INGRESS, Message.LIVELINESS_TOKEN)
     announced = _announced_names(tokens, enclave)
     foreign = announced is None
     check_meaning(foreign, False, f"that {enclave} announces nodes of another enclave")
-    if _are_exactly(passing, stated_rights):
-        announces_more = announced != _to_announce(stated_rights)
+    if _have_equal_keys(passing, stated_rights):
+        announces_more = announced != _allowed_announcements(stated_rights)
         check_meaning(
             announces_more, False, f"that {enclave} announces names that it has no right to"
         )
@@ -932,14 +932,14 @@ def _prove(
                     check_meaning(not meant, meant, f"that {enclave} announces {right} {name}")
 
 
-def _are_exactly(
+def _have_equal_keys(
     passing: Mapping[str, KeyExpressions], stated_rights: Mapping[int, Sequence[StatedRight]]
 ) -> bool:
     """Return whether the rights have no wildcards, and the rules have exactly the rights' keys.
 
     The keys for the history of a topic, below its key, are not compared.
     """
-    keys: dict[str, set[str]] = {right: set() for right in _PROOF}
+    keys: dict[str, set[str]] = {right: set() for right in _DECIDING_MESSAGES}
     for domain, rights in stated_rights.items():
         if is_expression("".join([stated_right.right.name for stated_right in rights])):
             return False
@@ -973,7 +973,9 @@ def _announced_names(tokens: KeyExpressions, enclave: str) -> set[tuple[str, str
     return announced
 
 
-def _to_announce(stated_rights: Mapping[int, Sequence[StatedRight]]) -> set[tuple[str, str, str]]:
+def _allowed_announcements(
+    stated_rights: Mapping[int, Sequence[StatedRight]],
+) -> set[tuple[str, str, str]]:
     """Return the announcements that exact rights allow, in the form of `_announced_names`."""
     return {(str(domain), "", "") for domain in stated_rights} | {
         (str(domain), right, name)
@@ -1023,7 +1025,7 @@ def _present_file(keystore: OpenedKeystore, path: str) -> bytes | None:
 
 def stale_files(
     root: Path, wanted_paths: Collection[str], names: Iterable[str]
-) -> Iterable[Drifted]:
+) -> Iterable[DriftedConfiguration]:
     """Yield the configurations of the enclaves ``names`` that should not exist.
 
     A file without a signed document is left out, because it may be the user's own file.
@@ -1031,7 +1033,7 @@ def stale_files(
     for name in names:
         for path in (_router_path(name), _session_path(name)):
             if path not in wanted_paths and (root / signed_path(path)).is_file():
-                yield Drifted(name, path, Drift.STALE)
+                yield DriftedConfiguration(name, path, Drift.STALE)
 
 
 def _router_path(name: str) -> str:
@@ -1139,7 +1141,7 @@ def rights_in_domain(enclave: str, grant: Grant, domain: int) -> tuple[StatedRig
     for right in sorted(raw):
         if right.name.startswith(f"{_TOPICS}*"):
             rights |= {right._replace(name=right.name.removeprefix(_TOPICS))}
-        elif right.qualifier is not ALLOW or _meets_ros_names(right.name):
+        elif right.qualifier is not ALLOW or _overlaps_ros_names(right.name):
             raise PolicyError(
                 f"{source}: {right.describe()} cannot be expressed in Zenoh",
                 "It is a DDS name, and it is uncertain which ROS names it means.",
@@ -1149,7 +1151,7 @@ def rights_in_domain(enclave: str, grant: Grant, domain: int) -> tuple[StatedRig
     return tuple([StatedRight(right, source) for right in sorted(set(parted))])
 
 
-def _meets_ros_names(topic: str) -> bool:
+def _overlaps_ros_names(topic: str) -> bool:
     """Return whether a DDS topic with wildcards also matches topics of ROS names."""
     return is_expression(topic) and any(overlap(topic, f"{prefix}/*") for prefix in _PREFIXES)
 

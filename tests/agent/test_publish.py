@@ -40,7 +40,7 @@ from sros_tool.keystore.delivery.release import (
     seal_releases,
 )
 from sros_tool.keystore.delivery.repository import (
-    Composer,
+    MetadataComposer,
     Roots,
     load_signer,
     new_key,
@@ -337,7 +337,7 @@ def test_a_kill_after_the_keystore_changed_keeps_the_number(
 ) -> None:
     publisher.run("renew", "ks", "/r1/base")
     with monkeypatch.context() as patched:
-        patched.setattr(publishing._Run, "write", _raise_killed)
+        patched.setattr(publishing._Publication, "write", _raise_killed)
         with pytest.raises(_Killed):
             publisher.publish()
     number = read_published(OpenedKeystore(publisher.root)).robots["r1"].release.number
@@ -356,7 +356,7 @@ def test_a_kill_before_the_keystore_knows_its_first_releases(
         publisher.run("zenoh", "ks")
     shutil.rmtree(publisher.pub)
     with monkeypatch.context() as patched:
-        patched.setattr(publishing._Run, "compose", _raise_killed)
+        patched.setattr(publishing._Publication, "compose", _raise_killed)
         with pytest.raises(_Killed):
             publisher.publish(new_folder=is_lost)
     killed = archives(publisher)
@@ -462,7 +462,7 @@ def test_a_killed_rotation_of_a_root_key_elsewhere_recovers(
     safe, spare = (publisher.folder / name for name in ("safe.pem", "safe.pem.new"))
     (publisher.root / "private/fleet_root.pem").rename(safe)
     robot, old = publisher.robot(), safe.read_bytes()
-    owner = publishing._Keys if after == "stage_elsewhere" else publishing._Run
+    owner = publishing._RoleKeys if after == "stage_elsewhere" else publishing._Publication
     done = getattr(owner, after)
 
     def killed(*words: object) -> None:
@@ -1323,7 +1323,9 @@ def test_bins_grow_with_the_fleet(publisher: Home) -> None:
     for count in (60, 300, 1200, 300):
         present = read_present(publisher.pub, roots)
         more = {f"x{number}": PublishedRelease(1, "0" * 64, 1) for number in range(count)}
-        composer = Composer(present, signers, known={}, expiry=MetadataExpiry(), now=publisher.now)
+        composer = MetadataComposer(
+            present, signers, known={}, expiry=MetadataExpiry(), now=publisher.now
+        )
         for path, data in composer.compose(releases | more).files:
             (publisher.pub / path).write_bytes(data)
         now = read_present(publisher.pub, roots)

@@ -26,11 +26,11 @@ from sros_tool.keystore.confirmation import (
     MAX_BYTES,
     MESSAGE_FILE,
     Confirmation,
-    Received,
-    keep_confirmation,
+    ReceivedConfirmation,
     last_confirmation,
     refusals,
     render_confirmation,
+    store_confirmation,
 )
 from sros_tool.keystore.delivery import collect as collecting
 from sros_tool.keystore.delivery.collect import (
@@ -186,10 +186,10 @@ def test_two_at_once(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(transaction, "_LOCK_SECONDS", 0.0)
     (home.folder / "said").write_bytes(render_confirmation(home.said("r1", NOW, sequence=None)))
     home.send("r1")
-    kept = keep_confirmation
+    kept = store_confirmation
     refused = []
 
-    def meanwhile(keystore: OpenedKeystore, received: Received) -> str:
+    def meanwhile(keystore: OpenedKeystore, received: ReceivedConfirmation) -> str:
         assert home.collect(dry_run=True).complete
         with pytest.raises(KeystoreError, match="is busy"):
             home.collect()
@@ -198,7 +198,7 @@ def test_two_at_once(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
         return kept(keystore, received)
 
     with monkeypatch.context() as patched:
-        patched.setattr(collecting, "keep_confirmation", meanwhile)
+        patched.setattr(collecting, "store_confirmation", meanwhile)
         assert home.of("r1").outcome == "kept"
     assert refused == [(2, True)]
     assert home.of("r1").outcome == "unchanged" and not [*home.root.rglob(".sros-lock")]
@@ -206,12 +206,12 @@ def test_two_at_once(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_an_inbox_that_is_moved_away_meanwhile(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
-    def meanwhile(keystore: OpenedKeystore, received: Received) -> str:
+    def meanwhile(keystore: OpenedKeystore, received: ReceivedConfirmation) -> str:
         home.inbox.rename(home.folder / "elsewhere")
-        return keep_confirmation(keystore, received)
+        return store_confirmation(keystore, received)
 
     home.send("r1")
-    monkeypatch.setattr(collecting, "keep_confirmation", meanwhile)
+    monkeypatch.setattr(collecting, "store_confirmation", meanwhile)
     assert home.of("r1").outcome == "kept"
 
 

@@ -21,10 +21,10 @@ from sros_tool.errors import SrosError
 from sros_tool.explain.denials import propose, read_denials
 from sros_tool.explain.log import explain_log
 from sros_tool.keystore.confirmation import (
-    keep_confirmation,
     last_confirmation,
     locked_confirmations,
     receive,
+    store_confirmation,
 )
 from sros_tool.keystore.delivery.robot import import_answer
 from sros_tool.keystore.describe import describe, history
@@ -261,7 +261,7 @@ def _confirmation(data: bytes, place: Place) -> None:
     received = receive(data, "r7", "drawn", now=NOW)
     (place.keystore / "fleet.toml").write_text('enclaves = ["/{robot}"]\n[robots.r7]\n')
     with locked_confirmations(place.keystore):
-        keep_confirmation(OpenedKeystore(place.keystore), received)
+        store_confirmation(OpenedKeystore(place.keystore), received)
     kept = last_confirmation(OpenedKeystore(place.keystore), "r7")
     assert kept and kept.confirmation == received.confirmation
     found = fleet_status(OpenedKeystore(place.keystore)).with_overdue(NOW, timedelta(days=1))

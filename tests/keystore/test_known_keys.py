@@ -11,7 +11,7 @@ import pytest
 
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.delivery.robot import create_request, import_answer
-from sros_tool.keystore.delivery.signing import Signed, sign_request
+from sros_tool.keystore.delivery.signing import SignedRequests, sign_request
 from sros_tool.keystore.lifecycle.create import create_enclaves
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
@@ -26,7 +26,7 @@ NOW = datetime.now(UTC) + timedelta(hours=1)  # later than the keystore that is 
 LEDGER = ("ledger.jsonl", "ledger.p7s")
 
 
-def sign(keystore: Path, key: bytes, name: str, *, again: bool = False) -> Signed:
+def sign(keystore: Path, key: bytes, name: str, *, again: bool = False) -> SignedRequests:
     return sign_request(
         keystore, make_request(load_key(key, "of the test"), name), now=NOW, renew=again
     )

@@ -22,7 +22,7 @@ from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.errors import KeystoreError, PkiError, PolicyError, SrosError
 from sros_tool.keystore.delivery.archive import MAX_MEMBER, MAX_UNPACKED, pack, unpack
 from sros_tool.keystore.delivery.robot import create_request, import_answer
-from sros_tool.keystore.delivery.signing import Signed, certify_requests, sign_request
+from sros_tool.keystore.delivery.signing import SignedRequests, certify_requests, sign_request
 from sros_tool.keystore.describe import history
 from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.known_keys import KnownKeys
@@ -30,7 +30,7 @@ from sros_tool.keystore.layout import SEAL, list_enclaves
 from sros_tool.keystore.ledger import REPORTED, certificate_entry
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, create_permission
 from sros_tool.keystore.lifecycle.renew import renew
-from sros_tool.keystore.lifecycle.revocation_list import Forgotten
+from sros_tool.keystore.lifecycle.revocation_list import LostRecords
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, restore_revocations, revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import OpenedKeystore
@@ -89,7 +89,7 @@ def request_of(robot: Path) -> bytes:
     return (robot / FOLDER / "request.pem").read_bytes()
 
 
-def sign(home: Path, robot: Path, now: datetime = NOW, *, renew: bool = False) -> Signed:
+def sign(home: Path, robot: Path, now: datetime = NOW, *, renew: bool = False) -> SignedRequests:
     return sign_request(home, request_of(robot), now=now, renew=renew)
 
 
@@ -309,7 +309,7 @@ def test_a_restored_keystore_revokes_only_the_earlier_key_of_new_hardware(
     later = OpenedKeystore(home).certificate_of("/base")
     with pytest.raises(KeystoreError, match="has another key"):
         sign_request(backup, request, now=NOW, renew=True)
-    forgotten = Forgotten(OpenedKeystore(backup), NOW)
+    forgotten = LostRecords(OpenedKeystore(backup), NOW)
     assert forgotten.add_certificate(later, REPORTED)
     restore_revocations(backup, forgotten, now=NOW)
 

@@ -13,7 +13,7 @@ import pytest
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.delivery.archive import pack, unpack
 from sros_tool.keystore.delivery.robot import create_request, import_answer
-from sros_tool.keystore.delivery.signing import Signed, sign_request
+from sros_tool.keystore.delivery.signing import SignedRequests, sign_request
 from sros_tool.keystore.issuing.authority import load_authorities
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, SEAL
@@ -140,7 +140,7 @@ def test_no_new_certificate_is_made_for_older_permissions(tmp_path: Path) -> Non
 # ── answers ────────────────────────────────────────────────────────────────────────────────
 
 
-def answer(root: Path, tmp_path: Path, *topics: str, now: datetime = NOW) -> Signed:
+def answer(root: Path, tmp_path: Path, *topics: str, now: datetime = NOW) -> SignedRequests:
     request = (tmp_path / "robot/enclaves/arm/request.pem").read_bytes()
     file = tmp_path / "arm.xml"
     file.write_text(policy_text({"/arm": publish(*topics)}))

@@ -18,7 +18,7 @@ from sros_tool.faults import ORIGINAL_KEYSTORE, Fault
 from sros_tool.keystore.layout import PERMISSIONS, SESSION_FILE, SETTINGS, ZENOH_FILES
 
 if TYPE_CHECKING:
-    from sros_tool.keystore.zenoh_files import Drifted, OpenedZenoh
+    from sros_tool.keystore.zenoh_files import DriftedConfiguration, OpenedZenoh
 
 _AGAIN = "Run `sros zenoh KEYSTORE`, and restart the processes that it names."
 _SOURCE = "sros (docs/zenoh.md); Zenoh 1.10 verifies no signature of its configuration."
@@ -195,7 +195,7 @@ def check_network(
             yield LEFT_OUT.found(name, why.rstrip("."), folder, remedy=remedy)
 
 
-def _drift_findings(keystore: CheckedKeystore, drifted: Drifted) -> Iterator[Finding]:
+def _drift_findings(keystore: CheckedKeystore, drifted: DriftedConfiguration) -> Iterator[Finding]:
     """Yield a finding for each difference between a configuration and the keystore."""
     from sros_tool.keystore.zenoh_files import Drift, open_zenoh
 

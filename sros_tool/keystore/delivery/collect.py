@@ -34,14 +34,14 @@ from sros_tool.keystore.confirmation import (
     MESSAGE_FILE,
     Confirmation,
     LastMessage,
-    Received,
+    ReceivedConfirmation,
     RefusedMessage,
-    keep_confirmation,
-    keep_refusals,
     last_confirmation,
     locked_confirmations,
     parse_confirmation,
     refusals,
+    store_confirmation,
+    store_refusals,
 )
 from sros_tool.keystore.delivery.signing import certify_requests
 from sros_tool.keystore.expiry import read_credentials
@@ -56,7 +56,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import REPORTED, Entry
 from sros_tool.keystore.lifecycle.change import ChangeOptions, KeystoreChange
-from sros_tool.keystore.lifecycle.revocation_list import Forgotten
+from sros_tool.keystore.lifecycle.revocation_list import LostRecords
 from sros_tool.keystore.lifecycle.revoke import (
     REVOKED_AGAIN,
     restore_revocations,
@@ -218,7 +218,7 @@ def collect(
             fleet.robot(name)
         verifier = _Verifier(keystore, fleet, now, frozenset(restored))
         renewals = _Renewals(keystore, fleet, now)
-        forgotten = Forgotten(keystore, now)
+        forgotten = LostRecords(keystore, now)
         robots_with_lists: list[str] = []
         changes: list[FileChange] = []
         taken: list[_ReceivedMessage] = []
@@ -228,18 +228,18 @@ def collect(
                 message.crl = message.verified.confirmation.crl
             if message.crl and forgotten.add(message.crl.encode()):
                 robots_with_lists.append(message.robot.name)
-            if message.stranger:
-                forgotten.add_certificate(message.stranger, REPORTED)
+            if message.signer_certificate:
+                forgotten.add_certificate(message.signer_certificate, REPORTED)
             if message.received:
                 path = confirmation_file(message.robot.name)
                 action = "replace" if (root / path).exists() else "create"
                 changes.append(FileChange(action, str(root / path)))
                 if not dry_run:
                     # Kept now: if this run is killed, the next run decides on the same requests.
-                    keep_confirmation(keystore, message.received)
+                    store_confirmation(keystore, message.received)
             taken.append(message.without_confirmation())
         if not dry_run:
-            keep_refusals(keystore, refused_before, _refusals(refused_before, taken), now=now)
+            store_refusals(keystore, refused_before, _refusals(refused_before, taken), now=now)
         not_signed, notes, signed = _revoke_again(
             root, forgotten, robots_with_lists, taken, now=now, keyring=keyring, dry_run=dry_run
         )
@@ -303,10 +303,10 @@ class _ReceivedMessage:
     enclave: str = ""
     sequence: int | None = None
     verified: _Verified | None = None
-    received: Received | None = None
+    received: ReceivedConfirmation | None = None
     crl: str | None = None
     """The revocation list in the message, which counts only if a CA of the keystore signed it."""
-    stranger: x509.Certificate | None = None
+    signer_certificate: x509.Certificate | None = None
     """The signer's certificate, if the message itself is not accepted."""
     remarks: list[str] = field(default_factory=list)
     requests: list[_DecidedRequest] = field(default_factory=list)
@@ -314,7 +314,7 @@ class _ReceivedMessage:
     def without_confirmation(self) -> _ReceivedMessage:
         """Return a copy without the verified content, to save memory."""
         if self.verified is None:
-            return replace(self, crl=None, stranger=None)
+            return replace(self, crl=None, signer_certificate=None)
         return replace(
             self,
             enclave=self.verified.enclave,
@@ -390,7 +390,7 @@ def _add_signed_by_others(received: _ReceivedMessage, message: bytes) -> None:
     """Add the signer's certificate and the revocation list of a message that is not accepted."""
     with suppress(SrosError):
         signed = smime.parse_new(message)
-        received.stranger = signed.signer()
+        received.signer_certificate = signed.signer()
         received.crl = parse_confirmation(signed.text, "it").crl
 
 
@@ -511,7 +511,7 @@ class _Verifier:
         arrived = self._arrival(file, last)
         message = LastMessage(sequence, sha256, verified.enclave)
         boots, alternated = (before or message).successor(verified.confirmation.boot, arrived)
-        received = Received(
+        received = ReceivedConfirmation(
             replace(verified.confirmation, requests=None, crl=None),
             arrived,
             message._replace(boots=boots, alternated=alternated),
@@ -528,7 +528,7 @@ class _Verifier:
             robot, "kept", verified=verified, received=received, remarks=remarks
         )
 
-    def _arrival(self, file: _File, last: Received | None) -> datetime:
+    def _arrival(self, file: _File, last: ReceivedConfirmation | None) -> datetime:
         """Return when the file of a message was written, but no earlier than the last message.
 
         Messages may have been in the inbox for a long time before they are collected.
@@ -821,7 +821,7 @@ class _Renewals:
 
 def _revoke_again(
     root: Path,
-    forgotten_lists: Forgotten,
+    forgotten_lists: LostRecords,
     robots_with_lists: Sequence[str],
     messages: Sequence[_ReceivedMessage],
     *,

@@ -71,7 +71,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import REPORTED, RESTORED, Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
-from sros_tool.keystore.lifecycle.revocation_list import Forgotten
+from sros_tool.keystore.lifecycle.revocation_list import LostRecords
 from sros_tool.keystore.lifecycle.revoke import (
     REPLACED_AFTER_BACKUP,
     restore_revocations,
@@ -107,7 +107,7 @@ from sros_tool.xml import read_bytes
 if TYPE_CHECKING:
     from securesystemslib.signer import CryptoSigner
 
-    from sros_tool.keystore.delivery.repository import Composed, Roots
+    from sros_tool.keystore.delivery.repository import NewMetadata, Roots
     from sros_tool.keystore.issuing.authority import Authority
 
 _ROLES = ("root", "targets", "snapshot", "timestamp")
@@ -118,7 +118,7 @@ _MOST_NAMES = 3
 """Maximum number of enclaves that a message names."""
 _KEPT = timedelta(days=2)
 """How long unused files are kept, because robots may be in the middle of an update."""
-_OURS = re.compile(
+_REMOVABLE = re.compile(
     r"metadata/[0-9]+\.(?:targets|snapshot|robots-[0-9a-f]+)\.json"
     r"|targets/robots/[0-9a-f]{64}\.[A-Za-z0-9_]+\.tar\.gz"
     r"|(?:metadata|targets/robots)/\.[^/]+\.new"
@@ -240,10 +240,10 @@ def publish(
             lock = KeystoreLock(opened, "publishing folder")
             stack.callback(lock.release)
             lock.acquire()
-        run = _Run(keystore, folder, now, expiry or MetadataExpiry(), dry_run)
+        run = _Publication(keystore, folder, now, expiry or MetadataExpiry(), dry_run)
         stack.enter_context(run.reporting_restore())
         run.check_restored(restored, new_folder, keyring)
-        keys = _Keys(run.roots, root, root_key)
+        keys = _RoleKeys(run.roots, root, root_key)
         keys.recover(dry_run)
         keys.open(rotate, now, run.expiry)
         changed = run.changed_robots()
@@ -281,7 +281,7 @@ def later_in_folder(keystore: OpenedKeystore) -> str:
         if may_have_later_releases(keystore):
             check_tuf()
             folder, never = Path(read_published(keystore).folder), datetime.min.replace(tzinfo=UTC)
-            run = _Run(keystore, folder, never, MetadataExpiry(), dry_run=True)
+            run = _Publication(keystore, folder, never, MetadataExpiry(), dry_run=True)
             try:
                 run.check_restored(restored=False, new_folder=False, keyring=IN_KEYSTORE)
             except KeystoreError as error:
@@ -305,7 +305,7 @@ def _check_apart(root: Path, folder: Path) -> None:
         )
 
 
-class _Keys:
+class _RoleKeys:
     """The keys of the metadata roles, and the versions of the root metadata that name them."""
 
     def __init__(self, roots: Roots, root: Path, root_key: Path | None) -> None:
@@ -574,7 +574,7 @@ def _digest_without_lists(files: Mapping[str, bytes]) -> str:
     return hashlib.sha256(__version__.encode() + b"\n" + listed_digests(others)).hexdigest()
 
 
-class _Run:
+class _Publication:
     """One run of `publish`: the published state, the intended state, and the writing."""
 
     def __init__(
@@ -613,7 +613,7 @@ class _Run:
                 raise self._unknown_error(unknown) from error
             raise
         self._there = self._present.releases()
-        self._composed: Composed | None = None
+        self._composed: NewMetadata | None = None
         self._made: list[_ReleaseOutcome] = []
         self._removed: list[str] = []
         self._damaged: set[str] = set()
@@ -668,7 +668,7 @@ class _Run:
         if restored and not is_later:
             self._check_removed()
         if restored:
-            forgotten = Forgotten(self.keystore, self._now)
+            forgotten = LostRecords(self.keystore, self._now)
             if is_later or unknown:
                 unknown = [self._last_read()] if is_later else unknown
                 self._check_authorities(unknown[-1])
@@ -917,7 +917,7 @@ class _Run:
             f"(docs/howto/keystore_is_lost.md).{by_hand}",
         )
 
-    def _restore(self, forgotten_lists: Forgotten, keyring: Keyring) -> None:
+    def _restore(self, forgotten_lists: LostRecords, keyring: Keyring) -> None:
         """Record that the keystore was restored, and revoke again what ``forgotten_lists`` revoke.
 
         Certificates in releases that the keystore sealed are recorded, so that `revoke` knows them.
@@ -998,7 +998,7 @@ class _Run:
         was only interrupted before the ledger recorded its number.
         """
         known = self._known_numbers()
-        forgotten = Forgotten(self.keystore, self._now)
+        forgotten = LostRecords(self.keystore, self._now)
         unknown = [
             release
             for release in self._sealed_releases()
@@ -1250,11 +1250,11 @@ class _Run:
 
     # ── metadata ───────────────────────────────────────────────────────────────────────────
 
-    def compose(self, keys: _Keys) -> None:
+    def compose(self, keys: _RoleKeys) -> None:
         """Compose the metadata, and note which files it no longer names."""
-        from sros_tool.keystore.delivery.repository import Composer
+        from sros_tool.keystore.delivery.repository import MetadataComposer
 
-        composer = Composer(
+        composer = MetadataComposer(
             self._present,
             keys.signers,
             known=self.list.versions,
@@ -1286,9 +1286,9 @@ class _Run:
         with Folder(self._folder) as folder:
             for part in (_METADATA, _ARCHIVES):
                 paths = (f"{part}/{name}" for name in folder.names(part))
-                yield from (path for path in paths if _OURS.fullmatch(path))
+                yield from (path for path in paths if _REMOVABLE.fullmatch(path))
 
-    def stage(self, change: KeystoreChange, keys: _Keys) -> None:
+    def stage(self, change: KeystoreChange, keys: _RoleKeys) -> None:
         """Stage the keys, the versions of the root, and the list of what is published."""
         if not self._dry_run:
             keys.stage_elsewhere()
@@ -1311,7 +1311,7 @@ class _Run:
         """Remember the committed changes of the keystore for the result."""
         self._changes = changes_below(self.keystore.root, change.transaction.changes)
 
-    def write(self, keys: _Keys) -> None:
+    def write(self, keys: _RoleKeys) -> None:
         """Write the metadata, with the timestamp last; then remove files that are long unused.
 
         A new root is written first if the current metadata already fits it.  Otherwise it is
@@ -1344,7 +1344,7 @@ class _Run:
 
     # ── the result ─────────────────────────────────────────────────────────────────────────
 
-    def result(self, keys: _Keys) -> PublishedFleet:
+    def result(self, keys: _RoleKeys) -> PublishedFleet:
         """Return the result of publishing."""
         outcomes = {robot: RobotRelease(robot, "removed", None, "") for robot in self._removed}
         for robot, kept in self.list.robots.items():

@@ -208,7 +208,7 @@ def _is_signed(
 
 
 @dataclass
-class Present:
+class PresentMetadata:
     """The metadata in a publishing folder that its timestamp names; empty without a timestamp."""
 
     timestamp: Metadata[Timestamp] | None = None
@@ -242,7 +242,7 @@ class Present:
         return all(part is not None and _is_signed(root, role, part) for role, part in parts)
 
 
-def read_present(folder: Path, roots: Roots) -> Present:
+def read_present(folder: Path, roots: Roots) -> PresentMetadata:
     """Return the metadata in a publishing folder, verified by any version of the root.
 
     Raises:
@@ -254,11 +254,11 @@ def read_present(folder: Path, roots: Roots) -> Present:
             if not opened.is_folder(_METADATA) or not opened.state(
                 f"{_METADATA}/{_TIMESTAMP}.json"
             ):
-                return Present()
+                return PresentMetadata()
             return _read_present(opened, roots)
     except FileNotFoundError as error:
         if not folder.exists():
-            return Present()
+            return PresentMetadata()
         raise KeystoreError(
             f"'{error.filename}' is missing, which robots fetch",
             "The keystore wrote the metadata that leads there.",
@@ -289,7 +289,7 @@ def _without_metadata(folder: Path) -> str:
     )
 
 
-def _read_present(folder: Folder, roots: Roots) -> Present:
+def _read_present(folder: Folder, roots: Roots) -> PresentMetadata:
     timestamp = _read(folder, Timestamp, _TIMESTAMP)
     roots.verify(_TIMESTAMP, timestamp)
     described = timestamp.signed.snapshot_meta
@@ -305,7 +305,7 @@ def _read_present(folder: Folder, roots: Roots) -> Present:
     for name in roles.get_roles() if roles else ():
         bins[name] = _read(folder, Targets, name, meta[f"{name}.json"].version)
         _verify(targets.signed, name, bins[name])
-    present = Present(timestamp, snapshot, file, targets, bins)
+    present = PresentMetadata(timestamp, snapshot, file, targets, bins)
     for version in present.versions().values():
         check_count(version)
     present.releases()
@@ -326,7 +326,7 @@ def _read(
 # ── what is to be ──────────────────────────────────────────────────────────────────────────
 
 
-class Composed(NamedTuple):
+class NewMetadata(NamedTuple):
     """New metadata: the files in the order in which to write them.
 
     ``versions`` and ``expires`` map the names of all metadata, changed or not, to version and
@@ -338,7 +338,7 @@ class Composed(NamedTuple):
     expires: Mapping[str, datetime]
 
 
-class Composer:
+class MetadataComposer:
     """A composer of the metadata for releases, which keeps existing metadata that still fits.
 
     ``signers`` has the signers of each role.  While a key is rotated, this includes the previous
@@ -347,7 +347,7 @@ class Composer:
 
     def __init__(
         self,
-        present: Present,
+        present: PresentMetadata,
         signers: Mapping[str, Sequence[CryptoSigner]],
         *,
         known: Mapping[str, int],
@@ -376,7 +376,7 @@ class Composer:
         self._files: list[tuple[str, bytes]] = []
         self._expires: dict[str, datetime] = {}
 
-    def compose(self, releases: Mapping[str, PublishedRelease]) -> Composed:
+    def compose(self, releases: Mapping[str, PublishedRelease]) -> NewMetadata:
         """Return the metadata for ``releases``, which maps robots to releases."""
         roles = self._roles(len(releases))
         targets: dict[str, dict[str, TargetFile]] = {name: {} for name in roles.get_roles()}
@@ -402,7 +402,7 @@ class Composer:
         else:
             self._add(_TARGETS, Targets(delegations=delegations), self._signers[_TARGETS])
         self._add_snapshot()
-        return Composed(self._files, self.versions, self._expires)
+        return NewMetadata(self._files, self.versions, self._expires)
 
     def _roles(self, robots: int) -> SuccinctRoles:
         """Return the bins (TUF); their number is a power of two, and grows with the fleet.

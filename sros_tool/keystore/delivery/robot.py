@@ -100,7 +100,7 @@ from sros_tool.xml import read_bytes
 
 
 @dataclass(frozen=True, slots=True)
-class Requested:
+class NewRequest:
     """A new signing request for the enclave ``name``; ``key`` is the SHA-256 of its public key.
 
     ``token`` is the place of the key on a PKCS#11 token; None for a key in a file.
@@ -122,7 +122,7 @@ def create_request(
     key: str = "",
     secrets: Secrets = no_secrets,
     dry_run: bool = False,
-) -> Requested:
+) -> NewRequest:
     """Create an enclave's private key in ``folder``, and a signing request for the key.
 
     ``folder`` becomes a keystore without CAs.  With ``again``, the request is made for the existing
@@ -185,7 +185,7 @@ def create_request(
         load_request(request, f"of enclave {name}")
         transaction.write(f"{place}/{REQUEST}", request)
         transaction.commit()
-    return Requested(
+    return NewRequest(
         name,
         folder / place / REQUEST,
         key_digest(made.public_key()),
@@ -683,7 +683,9 @@ class MadeRequest(NamedTuple):
     notes: Notes
 
 
-def shown_request(folder: Path, requested: Requested, *, again: bool, dry_run: bool) -> MadeRequest:
+def shown_request(
+    folder: Path, requested: NewRequest, *, again: bool, dry_run: bool
+) -> MadeRequest:
     """Return the value that ``--json`` prints for a new signing request."""
     key = (
         requested.key if again or not dry_run else None

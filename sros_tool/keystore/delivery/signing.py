@@ -63,7 +63,7 @@ from sros_tool.keystore.lifecycle.shown import enclave_results, shown
 from sros_tool.keystore.outcomes import (
     AuthorityFacts,
     EnclaveResult,
-    KeptZenoh,
+    StagedZenoh,
     changes_below,
     trusted_authorities,
 )
@@ -89,7 +89,7 @@ from sros_tool.wording import first_few
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Signed(Changed):
+class SignedRequests(Changed):
     """The result of signing requests.
 
     ``keys`` maps each enclave to the SHA-256 of its public key (DER, hexadecimal).  ``outcomes``
@@ -116,7 +116,7 @@ def sign_request(
     force: bool = False,
     domain: int | None = None,
     **options: Unpack[ChangeOptions],
-) -> Signed:
+) -> SignedRequests:
     """Certify the key of a request, sign the permissions, and make the answer for the robot.
 
     The keystore gets all files of the enclave except the key.  The rights come from ``policy``;
@@ -157,7 +157,7 @@ def sign_request(
         issued = signer.certify(
             request, renew=renew, named=bool(only_enclaves) and not refuse_revoked
         )
-        signer.keep_zenoh()
+        signer.stage_zenoh()
         files = _answer_files(change.keystore, issued, change.zenoh)
         number = change.keystore.ledger_file.next_number()
         sealed = seal(files, number, change.permissions)
@@ -216,7 +216,7 @@ def certify_requests(
     replace_keys: bool = False,
     domain: int | None = None,
     **options: Unpack[ChangeOptions],
-) -> Signed:
+) -> SignedRequests:
     """Certify the keys of several requests (PEM, one after the other), all or none.
 
     The arguments are those of `sign_request`, but no answers are made: an export without keys
@@ -255,7 +255,7 @@ def certify_requests(
                     request, renew=renew, named=bool(only_enclaves) and not refuse_revoked
                 )
         if len(kept) < len(requests):
-            signer.keep_zenoh()
+            signer.stage_zenoh()
             change.record()
             change.finish()
         else:
@@ -442,7 +442,7 @@ class _Signer:
             self._change.notes.append(Note("request.key-on-robot", text))
         return True
 
-    def keep_zenoh(self) -> None:
+    def stage_zenoh(self) -> None:
         """Stage the Zenoh configurations that follow from all certified requests."""
         change = self._change
         change.notes += [
@@ -450,7 +450,7 @@ class _Signer:
             *change.known.missing_key_notes(),
             *change.edit_notes(),
         ]
-        change.keep_zenoh(self._writer.signed, stated=self._certified)
+        change.stage_zenoh(self._writer.signed, stated=self._certified)
         change.notes += self.name_notes()
         change.entries += self._writer.entries
 
@@ -469,11 +469,11 @@ class _Signer:
         renew: bool,
         kept: Collection[str] = (),
         archive: bytes = b"",
-    ) -> Signed:
+    ) -> SignedRequests:
         """Return the result; the enclaves in ``kept`` already had a certificate for their key."""
         done = "renewed" if renew else "created"
         return self._change.result(
-            Signed,
+            SignedRequests,
             outcomes={
                 request.name: "kept" if request.name in kept else done for request in requests
             },
@@ -632,7 +632,7 @@ def _earlier_rights(
     return change.recorded.rights_to_sign(name, earlier.digest, earlier.grant)
 
 
-def _answer_files(keystore: OpenedKeystore, issued: Issued, zenoh: KeptZenoh) -> dict[str, bytes]:
+def _answer_files(keystore: OpenedKeystore, issued: Issued, zenoh: StagedZenoh) -> dict[str, bytes]:
     """Map the paths of the answer's files to their content, sorted by path."""
     name = issued.issuance.name
     folder = enclave_folder(name)
@@ -693,7 +693,7 @@ class SignedRequest(NamedTuple):
 
 
 def shown_signed(
-    signed: Signed, answer: Path | None = None, more: Sequence[FileChange] = ()
+    signed: SignedRequests, answer: Path | None = None, more: Sequence[FileChange] = ()
 ) -> SignedRequest:
     """Return the value that ``--json`` prints for signed requests.
 

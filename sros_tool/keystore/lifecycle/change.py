@@ -55,7 +55,7 @@ from sros_tool.keystore.ledger import (
     document_entry,
 )
 from sros_tool.keystore.lifecycle.replaced import ReplacedRights, Superseded
-from sros_tool.keystore.outcomes import KeptZenoh
+from sros_tool.keystore.outcomes import StagedZenoh
 from sros_tool.keystore.reader import OpenedKeystore, check_domain
 from sros_tool.keystore.rights import RecordedRights, SignedRights
 from sros_tool.keystore.settings import (
@@ -69,7 +69,7 @@ from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction import Change, Transaction, recover_keystore
 from sros_tool.keystore.zenoh_files import (
     Drift,
-    Drifted,
+    DriftedConfiguration,
     ZenohChange,
     drifted_configurations,
     signed_path,
@@ -130,7 +130,7 @@ class Changed:
     may_work_longer: bool = False
     revoked: int = 0
     restart: tuple[str, ...] = ()
-    zenoh: KeptZenoh = field(default_factory=KeptZenoh)
+    zenoh: StagedZenoh = field(default_factory=StagedZenoh)
     remarks: tuple[Note, ...] = ()
     notes: tuple[Note, ...] = ()
 
@@ -184,7 +184,7 @@ class KeystoreChange:
         self.outcomes: Mapping[str, str] = {}
         self.revoked = 0
         self.restart: tuple[str, ...] = ()
-        self.zenoh = KeptZenoh()
+        self.zenoh = StagedZenoh()
         self.crl = b""
         self._allowed = allow_refusal
 
@@ -416,7 +416,7 @@ class KeystoreChange:
         self.remarks += lists.remarks
         self.revoked = len(revocations)
 
-    def keep_zenoh(
+    def stage_zenoh(
         self,
         issued: Mapping[str, SignedRights],
         *,
@@ -461,7 +461,7 @@ class KeystoreChange:
             _stage(self.transaction, wanted.files, changed, self.permissions) if changed else {}
         )
         names = tuple(wanted.enclaves.values())
-        self.zenoh = KeptZenoh(
+        self.zenoh = StagedZenoh(
             {name: path for path, name in wanted.enclaves.items()},
             wanted.nodes,
             {name: why.rstrip(".") for name, why in wanted.left_out.items()},
@@ -579,10 +579,10 @@ class KeystoreChange:
                 revoked_before=revoked_before,
                 remedy=lambda: self._another_ca(command) if command else "",
             )
-        self._note_strangers()
+        self._note_unknown_authorities()
         self.transaction.commit()
 
-    def _note_strangers(self) -> None:
+    def _note_unknown_authorities(self) -> None:
         """Add a note if a CA file has a CA that is not in the ledger, unless this has gaps."""
         written = (change.path for change in self.transaction.changes)
         replaced = any(path.startswith(f"{PUBLIC}/") and "_ca.cert" in path for path in written)
@@ -700,7 +700,7 @@ def _settings_of_ros2(
 def _stage(
     transaction: Transaction,
     files: Mapping[str, bytes],
-    changed: Sequence[Drifted],
+    changed: Sequence[DriftedConfiguration],
     authority: Authority,
 ) -> dict[str, bytes]:
     """Stage changed Zenoh configurations and their signed documents, and map paths to content.
@@ -708,7 +708,7 @@ def _stage(
     All cores sign together.
     """
 
-    def stage(part: Sequence[Drifted]) -> list[bytes]:
+    def stage(part: Sequence[DriftedConfiguration]) -> list[bytes]:
         documents = [files[drift.path] for drift in part]
         messages = [b""] * len(part)
         if not transaction.dry_run:

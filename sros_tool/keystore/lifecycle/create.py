@@ -787,7 +787,7 @@ def write_enclaves(
     ]
     superseded = [made.superseded for made in done.values() if made.superseded]
     change.revoke(superseded)
-    change.keep_zenoh(
+    change.stage_zenoh(
         writer.signed,
         replaced=[old.name for old in superseded],
         stated=wanted_enclaves,

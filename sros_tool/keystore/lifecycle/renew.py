@@ -123,7 +123,7 @@ def renew(
         if revoke_old:
             change.revoke(replaced)
         if replaced:
-            change.keep_zenoh(writer.signed, replaced=renewed if change.revoked else ())
+            change.stage_zenoh(writer.signed, replaced=renewed if change.revoked else ())
         change.record()
         lasting = () if change.revoked else replaced
         until = certificates_until(change.keystore, lasting, change.template)

@@ -77,7 +77,7 @@ from sros_tool.pki.crl import (
 from sros_tool.validity import BACKDATE, Window, iso
 
 
-class Forgotten:
+class LostRecords:
     """Lists and certificates that a keystore issued but has lost, as after restoring a backup.
 
     An identity CA of the keystore signed these ``lists`` and ``certificates``, so they are

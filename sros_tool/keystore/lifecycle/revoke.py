@@ -28,7 +28,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import RESTORED, Entry, certificate_entry
 from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
-from sros_tool.keystore.lifecycle.revocation_list import Forgotten
+from sros_tool.keystore.lifecycle.revocation_list import LostRecords
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.names import check_enclave_name
@@ -118,7 +118,7 @@ def revoke(
         )
         change.remarks += lists.remarks
         _drop_routers(change, gone)
-        change.keep_zenoh({}, gone_enclaves=gone)
+        change.stage_zenoh({}, gone_enclaves=gone)
         change.record()
         change.finish(command="revoke")
     return change.result(
@@ -151,7 +151,7 @@ def _later_keys_notes(
 
 def restore_revocations(
     root: Path,
-    forgotten_lists: Forgotten,
+    forgotten_lists: LostRecords,
     **options: Unpack[ChangeOptions],
 ) -> Changed:
     """Revoke again all certificates on revocation lists that the keystore signed and lost.
@@ -229,7 +229,7 @@ def restore_revocations(
             change.entries += entries
         change.remarks += lists.remarks
         _drop_routers(change, gone)
-        change.keep_zenoh({}, gone_enclaves=gone)
+        change.stage_zenoh({}, gone_enclaves=gone)
         change.record()
         revoked = known | {int(serial, 16) for serial in reasons}
         change.finish(command="revoke", revoked_before=revoked)
@@ -347,7 +347,7 @@ def refresh_crl(
     keystore = OpenedKeystore(root)
     keyring = options.get("keyring", IN_KEYSTORE)
     if crl and not keyring.ca_service(root, IDENTITY, keystore.template):
-        lost, forgotten = load_crls(crl, "that was given"), Forgotten(keystore, options["now"])
+        lost, forgotten = load_crls(crl, "that was given"), LostRecords(keystore, options["now"])
         authorities = keystore.authority(IDENTITY)
         if not any(signed_by(each.list, ca) for each in lost for ca in authorities):
             raise KeystoreError(

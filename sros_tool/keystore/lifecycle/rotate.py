@@ -707,7 +707,7 @@ class _Rotator:
         change.notes += writer.notes
         if permissions:
             change.permissions = permissions.new
-            change.keep_zenoh(writer.signed)
+            change.stage_zenoh(writer.signed)
         if identity:
             change.notes += change.known.shared_notes(change.names)
 

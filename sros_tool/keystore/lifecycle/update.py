@@ -480,7 +480,7 @@ class _Updater:
         change.notes += self._writer.notes if reissued else ()
         if done:
             replaced = [old.name for old in superseded] if revoked else ()
-            change.keep_zenoh(self._writer.signed, replaced=replaced)
+            change.stage_zenoh(self._writer.signed, replaced=replaced)
         change.record()
         rights = tuple(document.rights for document in reissued)
         if revoked:
