@@ -1,9 +1,9 @@
 """Known vulnerabilities of DDS products, as advisories in the OSV format.
 
 The advisories that ship with sros are in ``advisories.json`` next to this module: for each release
-line of Fast DDS, they say what the git history of eProsima/Fast-DDS says (as of 2026-08-20).  An
-event ``fixed`` names the first release with the fix.  A release line that was never fixed has no
-such event, so all its later releases count as affected until newer advisories name a fix.
+line of Fast DDS, they repeat the git history of eProsima/Fast-DDS (as of 2026-08-20).  An event
+``fixed`` names the first release with the fix.  A release line that was never fixed has no such
+event, so all its later releases count as affected until newer advisories name a fix.
 
 ``database_specific`` has three members.  ``needs`` is what an attack needs: ``security`` (DDS
 Security is on), ``identity`` (a certificate of the keystore's CA), ``document`` (a document that

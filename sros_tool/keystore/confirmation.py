@@ -410,7 +410,7 @@ class LastMessage(NamedTuple):
     boots: tuple[str, ...] = ()
     """Ids of the computer's starts that sent messages, the latest first."""
     alternated: datetime | None = None
-    """When a message last came from an earlier start of the computer than the one before it."""
+    """When a message last came from an earlier start of the computer than the message before."""
 
     def successor(self, boot: str | None, now: datetime) -> tuple[tuple[str, ...], datetime | None]:
         """Return the next ``boots`` and ``alternated``, after a message from the start ``boot``.

@@ -83,7 +83,7 @@ NamedPath = Annotated[Path, "PATH, as given on the command line."]
 Problems = Annotated[Sequence[str], "Problems that keep a process from running in the enclave."]
 
 
-# ── what is described, and its JSON ────────────────────────────────────────────────────────
+# ── descriptions and their JSON ────────────────────────────────────────────────────────────
 
 
 class CertificateFacts(NamedTuple):
@@ -964,7 +964,7 @@ def _describe_remote_rights(configuration: Configuration) -> list[RemoteFacts]:
 
 
 def _opened_at(folder: Path, now: datetime) -> OpenedZenoh | None:
-    """Return the Zenoh configurations of the enclave in ``folder``; None if it is no enclave."""
+    """Return the Zenoh configurations of the enclave in ``folder``; None without an enclave."""
     if not all((folder / file).exists() for file in (CERTIFICATE_FILE, PERMISSIONS_FILE)):
         return None
     state = open_enclave(folder, now=now)
@@ -1022,7 +1022,7 @@ class HistoryStatus(StrEnum):
 
 @shows(spread=("entry",))
 class HistoryItem(NamedTuple):
-    """An entry of the ledger, and the present state of what it records."""
+    """An entry of the ledger, and the present state of the recorded certificate or document."""
 
     entry: Entry
     """Entry of the ledger."""
@@ -1046,7 +1046,7 @@ class History(NamedTuple):
 
 
 def history(keystore: OpenedKeystore, *, now: datetime) -> History:
-    """Return the entries of a keystore's ledger, each with the present state of what it records."""
+    """Return the entries of a keystore's ledger, with the present state of the recorded items."""
     issued = _files(keystore, _active_paths(keystore))
     revoked_files = _files(keystore, _revoked_paths(keystore))
     retired = _files(keystore, _retired_paths(keystore))
@@ -1122,7 +1122,7 @@ def _retired_paths(keystore: OpenedKeystore) -> Iterator[str]:
 
 
 def _files(keystore: OpenedKeystore, paths: Iterator[str]) -> dict[str, list[str]]:
-    """Map the SHA-256 that the ledger uses to those of ``paths`` that have it."""
+    """Map the digests that the ledger uses to the ``paths`` of files with this digest."""
     paths_by_digest: dict[str, list[str]] = {}
     for path in paths:
         file = keystore.root / path

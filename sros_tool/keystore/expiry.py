@@ -136,7 +136,7 @@ class ExpiringEnclaves(NamedTuple):
     unreadable: Sequence[EnclaveProblem]
     """Enclaves whose expiry cannot be read."""
     short_lived: Sequence[DueEnclave]
-    """Short-lived enclaves with their expiry; they are only renewed if they are named."""
+    """Short-lived enclaves with their expiry; only naming them renews them."""
 
 
 def expiring_enclaves(renewals: ExpiryCheck) -> ExpiringEnclaves:

@@ -64,9 +64,10 @@ def load_fleet(keystore: OpenedKeystore) -> Fleet | None:
 
 
 def stated_distributions(keystore: OpenedKeystore, enclave: str) -> tuple[str, ...]:
-    """Return the ROS 2 distributions for which an enclave is; () if they are not stated.
+    """Return the ROS 2 distributions of an enclave; () if neither file states any.
 
-    The fleet file can state the distribution of a robot; otherwise, the keystore's settings apply.
+    The fleet file can state the distribution of a robot; otherwise, the distributions in the
+    keystore's settings apply.
 
     Raises:
         SrosError: the fleet or the settings cannot be read.

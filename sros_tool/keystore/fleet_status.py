@@ -186,8 +186,8 @@ class ConfirmedFile:
     since: str = ""
     """When the keystore issued the robot's file, in UTC; null if the ledger does not record it."""
     enclave: str = ""
-    """The enclave to which the robot's file belongs, if it is another one than that of the path;
-    else null.
+    """The enclave to which the robot's file belongs, if it is not the enclave of the path; else
+    null.
     """
     robot: str = ""
     """The robot to which ``enclave`` belongs, or null."""
@@ -225,7 +225,7 @@ class RobotStatus:
     - ``is_doubtful``: its files are not known, whatever it confirmed, because its last message was
       refused, its release was never published, or two computers have its keys;
     - ``may_trust_replaced``: one of its processes may trust an identity CA that was replaced;
-    - ``reported``: so many of the problems, the first ones, are in its own words.
+    - ``reported``: this number of problems, the first ones in the list, are in its own words.
     """
 
     robot: str
@@ -443,7 +443,7 @@ class PublishedMetadata:
         return bool(self.accepted and not self.lacks)
 
     def at(self, now: datetime) -> PublishedMetadata:
-        """Return what was published, as robots see it at ``now``."""
+        """Return this publication as robots see it at the time ``now``."""
         return replace(self, accepted=now < self.expires if self.expires else None)
 
 
@@ -550,11 +550,11 @@ class FleetStatus:
         return all(robot.settled for robot in self.robots)
 
     def with_overdue(self, now: datetime, max_age: timedelta | None = None) -> FleetStatus:
-        """Return a copy with what to do for each robot, in which silent robots are offline.
+        """Return a copy in which silent robots are offline, with the remedy for each robot.
 
         A robot is offline if its last confirmation is older than ``max_age``; without ``max_age``,
-        if it fetches and has sent nothing for more than a day.  The times that messages of fetching
-        robots state count, too, because whoever has the inbox could hold messages back.
+        if it fetches and has sent nothing for more than a day.  For robots that fetch, the time in
+        the message itself counts, too, because whoever has the inbox could hold messages back.
         """
         overdue = frozenset(
             robot.robot
@@ -846,7 +846,7 @@ class _KeystoreFiles:
         return _KeystoreFile(hashlib.sha256(data).hexdigest(), certificates)
 
 
-# ── what a robot has instead ───────────────────────────────────────────────────────────────
+# ── origin of different files ──────────────────────────────────────────────────────────────
 
 
 class _Expiring(NamedTuple):

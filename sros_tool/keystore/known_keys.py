@@ -135,11 +135,10 @@ def _since_trusted(
 
 
 def revoked_issues(keystore: OpenedKeystore, listed: Collection[str] = ()) -> Iterator[Entry]:
-    """Yield what was issued to enclaves with revoked certificates of CAs that are trusted now.
+    """Yield the entries of revoked certificates, and of the permissions of their enclaves.
 
-    For each such certificate, this is the entry that records it, or else the entry of its
-    revocation; and all permissions of its enclave.  Certificates with serial numbers in ``listed``
-    are left out.
+    Only certificates of CAs that are trusted now count, without those with serial numbers in
+    ``listed``.  The entry of a certificate is that of its issue, or else that of its revocation.
     """
     serials = {f"{serial:x}" for serial in revoked_serials(keystore)}.difference(listed)
     recorded = keystore.ledger_file.with_values("serial", serials).entries if serials else ()
@@ -157,9 +156,9 @@ def revoked_issues(keystore: OpenedKeystore, listed: Collection[str] = ()) -> It
 
 
 def removed_enclaves(keystore: OpenedKeystore, now: datetime) -> Mapping[str, str]:
-    """Map enclaves that were removed from a keystore without being revoked to their expiry.
+    """Map enclaves that were removed from a keystore, but not revoked, to their files' expiry.
 
-    Until then, whoever has their files can use them with a CA that the keystore trusts.
+    Until then, whoever has these files can use them with a CA that the keystore trusts.
     """
     recorded = keystore.ledger_file.recorded_enclaves()
     if recorded is None:

@@ -277,7 +277,7 @@ def document_entry(
 
 
 class _Reading(NamedTuple):
-    """The ledger as read, and what is needed to add lines.
+    """The ledger as it was read, with the values needed for adding lines.
 
     ``unrecorded`` are the faults that no entry ``gap`` records yet.  ``previous`` is the digest for
     the next line.  ``ended`` says whether the last line has a line end.  ``sound`` says that every
@@ -406,7 +406,7 @@ class LedgerFile:
 
     @property
     def is_indexed(self) -> bool:
-        """Whether there is an index, so that it takes little time to find few entries."""
+        """Whether there is an index, so that a few entries are found quickly."""
         return self._opened().ledger_index is not None
 
     @property
@@ -420,7 +420,7 @@ class LedgerFile:
         return self._files
 
     def reading_for_append(self) -> _Reading:
-        """Return what is needed to add lines; its ``ledger`` may lack entries."""
+        """Return a reading with the values needed for adding lines; ``ledger`` may lack entries."""
         return self._readings.get(_EVERY) or self._reading(_NONE, ())
 
     def index_with(self, new: int, reading: _Reading) -> IndexUpdate | None:

@@ -55,7 +55,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.policy.model import Enclave
 
-# ── what DDS loads ─────────────────────────────────────────────────────────────────────────
+# ── enclaves as DDS loads them ─────────────────────────────────────────────────────────────
 
 _VENDOR_DECIDES = frozenset(
     {
@@ -79,9 +79,9 @@ class LoadedEnclave(NamedTuple):
     """An enclave as DDS loads it.
 
     ``governance`` and ``permissions`` are the XML in the signed documents.  ``signed`` are the
-    signed permissions; b"" if they are not signed yet.  ``state`` is the state of the files in
-    ``folder`` at the time ``at``; None if they do not exist yet.  ``key_elsewhere`` says that the
-    key is on the robot that generated it.
+    signed permissions; b"" before signing.  ``state`` is the state of the files in ``folder`` at
+    the time ``at``; None if they do not exist yet.  ``key_elsewhere`` says that the key is on the
+    robot that generated it.
 
     ``keystore`` is the enclave's keystore, and ``policy`` the enclave's part of ``policy_file``, if
     known.  With ``has_placeholders``, the policy is for the robots of a fleet.  ``portable`` are
@@ -247,7 +247,7 @@ def _expiries(state: OpenedEnclave, folder: Path) -> Iterator[tuple[str, datetim
             yield "crl.pem", load_crl(data, "").next_update
 
 
-# ── what a vendor makes of it ──────────────────────────────────────────────────────────────
+# ── the participant of a vendor ────────────────────────────────────────────────────────────
 
 _ONLY_PEERS_NOTICE = {
     *((vendor, Fault.KEY_MISMATCH) for vendor in CYCLONE_DDS),

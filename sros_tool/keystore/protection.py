@@ -213,7 +213,7 @@ def _strength(level: str) -> int:
 def less_protected(
     governance: Governance, stated_protections: Iterable[StatedProtection]
 ) -> Iterator[tuple[StatedProtection, Level]]:
-    """Yield statements to which a governance gives less protection, each with the actual level.
+    """Yield the statements that a governance does not fulfill, with the level that it gives.
 
     The level of a name is the lowest level of its DDS topics in all domains.  A topic without a
     rule does not count, because no vendor allows its use.

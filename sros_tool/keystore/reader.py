@@ -260,7 +260,7 @@ class OpenedKeystore:
         """Return whether there is a file or folder at ``path``, relative to the keystore."""
         return (self.root / path).exists()
 
-    # ── what it is ──
+    # ── the kind of keystore ──
 
     def check(self) -> None:
         """Raise `KeystoreError` if the folder is not a keystore."""

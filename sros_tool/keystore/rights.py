@@ -557,7 +557,7 @@ def _left_out_notes(grants: Iterable[Grant]) -> Iterator[Note]:
             yield Note("rights.rule-order", text)
 
 
-# ── what is printed of a comparison ─────────────────────────────────────────────────────────
+# ── the JSON of a comparison ────────────────────────────────────────────────────────────────
 
 OnlySide = Annotated[str, Words(("a", "b"))]
 

@@ -221,7 +221,7 @@ def hand_edits(
 def _unsigned_clauses(
     present: Template, recorded: Template | None, settings: Sequence[str]
 ) -> Iterator[str]:
-    """Yield a clause if the signed governance does not have what sros.toml states."""
+    """Yield a clause if the signed governance differs from the protection in sros.toml."""
     if not settings or (recorded and recorded.protection == present.protection):
         yield f"the signed governance differs from [protection] in {SETTINGS}"
 

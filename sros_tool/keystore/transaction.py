@@ -75,9 +75,9 @@ _EARLIER = 2
 class Move(NamedTuple):
     """The change of a path in an existing folder of the keystore.
 
-    ``before`` and ``after`` say what is at the path: None for nothing, "" for a file, or the target
-    of a symbolic link.  If the path is the certificate of an enclave whose whole folder moves,
-    ``to`` is the new path of that folder.
+    ``before`` and ``after`` describe the file at the path: None for no file, "" for a regular file,
+    or the target of a symbolic link.  If the path is the certificate of an enclave whose whole
+    folder moves, ``to`` is the new path of that folder.
     """
 
     path: str
@@ -711,7 +711,7 @@ class Transaction:
         return name == CRL_FILE and (folder.removeprefix(ENCLAVES) or "/") in self._linked
 
     def _present_content(self, path: str) -> str | None:
-        """Return what is now at a path, in the form of `Move.before`."""
+        """Return the description of the present file at a path, in the form of `Move.before`."""
         state = self._in.state(path)
         if state is None:
             return None

@@ -348,7 +348,7 @@ _NO_CHANGE = ZenohChange()
 
 
 class Drift(StrEnum):
-    """The ways in which a configuration can differ from the one that the keystore should have."""
+    """The ways in which a configuration can differ from what the keystore should have."""
 
     MISSING = "missing"
     DIFFERS = "differs"
@@ -360,7 +360,7 @@ class Drift(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class DriftedConfiguration:
-    """A configuration that differs from what it should be; ``path`` is relative to the keystore."""
+    """A configuration with a `Drift`; ``path`` is relative to the keystore."""
 
     enclave: str
     path: str
@@ -421,7 +421,7 @@ def _without_rules_for(
 
 
 class ZenohDrift(NamedTuple):
-    """The configurations of a keystore that differ from what they should be.
+    """The configurations of a keystore that have drifted from the needed ones.
 
     ``left_out`` maps enclaves that get no configuration to the reason (a clause).  ``nodes`` maps
     all other enclaves to the nodes that they may announce in the graph.
@@ -443,7 +443,7 @@ def zenoh_drift(
     among: Collection[str] = (),
     reader: RenderedReader | None = None,
 ) -> ZenohDrift:
-    """Return the configurations that differ from what they should be, and the enclaves without one.
+    """Return the drifted configurations of a keystore, and the enclaves without a configuration.
 
     If ``now`` is None, permissions that have expired count, too.  ``only_enclaves`` are the
     enclaves whose files are examined, ``among`` the enclaves whose rights are compared in these

@@ -808,8 +808,8 @@ def load_request(data: bytes, label: str) -> SigningRequest:
     """Read a PEM request and verify its signature; ``label`` names the request in errors.
 
     Only keys that every DDS vendor accepts are allowed: EC prime256v1 and RSA 2048, and no RSA key
-    that is easy to break.  Extensions in
-    a request are ignored: the keystore decides the content of a certificate.
+    that is easy to break.  Extensions in a request are ignored, because the keystore decides what a
+    certificate contains.
 
     Raises:
         PkiError: the request cannot be read, its signature does not verify, its key is weak or of

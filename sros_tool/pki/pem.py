@@ -136,7 +136,7 @@ def _decoded(encoded: bytes, name: str) -> bytes:
     return base64.b64decode(text)
 
 
-# ── what a file is ─────────────────────────────────────────────────────────────────────────
+# ── kinds of files ─────────────────────────────────────────────────────────────────────────
 
 ENCRYPTED_MESSAGE = "an S/MIME message that is encrypted, not signed"
 SIGNED_MESSAGE = "an S/MIME signed message"

@@ -269,7 +269,7 @@ class SignedDocument(NamedTuple):
         return min((signature.digest for signature in self.signatures), key=_bits).name
 
     def signer(self) -> x509.Certificate | None:
-        """Return the certificate of the first signer, or None if it is not embedded."""
+        """Return the first signer's certificate; None if the certificate is not embedded."""
         return self.signatures[0].signer_among(self.certificates)
 
     def verify(self, authority: x509.Certificate) -> None:

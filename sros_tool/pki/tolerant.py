@@ -569,7 +569,7 @@ def _encoded(oid: ObjectIdentifier, content: bytes) -> bytes:
     return der.encode(der.SEQUENCE, identifier, der.encode(der.OCTET_STRING, content))
 
 
-# ── what the library reads ─────────────────────────────────────────────────────────────────
+# ── extensions that `cryptography` reads ───────────────────────────────────────────────────
 
 _ED25519 = der.encode(der.SEQUENCE, der.encode(der.OID, der.encode_oid("1.3.101.112")))
 _NOBODY = der.encode(der.SEQUENCE)
@@ -621,7 +621,7 @@ def _parse_in_entry(extension: bytes) -> x509.Extensions:
     return next(iter(_list(der.encode(der.SEQUENCE, entry), b""))).extensions
 
 
-# ── what it does not ───────────────────────────────────────────────────────────────────────
+# ── extensions that `cryptography` refuses ─────────────────────────────────────────────────
 
 
 def _basic_constraints(content: bytes) -> _LooseConstraints:

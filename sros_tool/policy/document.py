@@ -165,7 +165,7 @@ class Includer:
         return self._expanded(parent, place)
 
     def target(self, element: etree._Element, place: IncludedFile) -> Path:
-        """Return the real path of the file that an include names; it need not exist.
+        """Return the real path of the file that an include names, which may be missing.
 
         Raises:
             PolicyError: the file is outside of the policy's folder, or other XInclude processors
@@ -618,7 +618,7 @@ class _Reader:
     def _read_groups(
         self, element: etree._Element, place: IncludedFile, node: str
     ) -> Iterator[Group]:
-        """Yield groups for an XML group, with one for each protection level of its names."""
+        """Yield the groups for an XML group: one for each protection level of its names."""
         kind = tag_of(element)
         if kind not in RIGHTS:
             raise PolicyError(

@@ -706,7 +706,7 @@ class _Editor:
         text.insert(place, rendered)
 
     def _rendered(self, new: _NewElement, indent: str | None) -> str:
-        """Return the XML of an element: with one line for each child if ``indent`` is given."""
+        """Return the XML of an element, with a line for each child if ``indent`` is given."""
         tag = new.start.split(" ", 1)[0]
         before = "" if indent is None else self._text.newline + indent
         if not new.children:

@@ -379,7 +379,7 @@ class _Beginnings:
         self._sizes = sorted({len(text) for text in self._open})
 
     def numbers_of_texts(self, begin: str) -> list[int]:
-        """Return the numbers of the texts that begin with ``begin`` or, if open, can do so."""
+        """Return the numbers of the texts that begin with ``begin``, or can if they are open."""
         first = bisect_left(self._texts, begin)
         numbers = self._numbers[first : bisect_left(self._texts, begin + _LAST, lo=first)]
         for size in self._sizes:
@@ -475,7 +475,7 @@ def _search(wanted: tuple[str, ...], unwanted_names: tuple[str, ...], absolute: 
     return (both - NameSet.union(map(_names_of, unwanted_names))).example()
 
 
-# ── what characters stand for ──────────────────────────────────────────────────────────────
+# ── expressions without ? and sets ─────────────────────────────────────────────────────────
 
 
 class TooManyNames(Exception):  # noqa: N818 - the caller makes an error of it

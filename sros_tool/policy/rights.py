@@ -160,7 +160,7 @@ def profile_rights(enclave: str, profile: Profile) -> Iterator[Right]:
 
 
 def parts(right: Right) -> tuple[Right, ...]:
-    """Return the rights to the five topics and services of an action; or the right itself."""
+    """Return the rights to an action's five topics and services; any other right stays itself."""
     part_rights = ACTION_PARTS.get(right.right)
     if part_rights is None:
         return (right,)
@@ -170,7 +170,7 @@ def parts(right: Right) -> tuple[Right, ...]:
 
 
 def action_right(right: str, name: str) -> tuple[str, str]:
-    """Return the right to the action of which ``right`` to ``name`` is a part, and its name.
+    """Return the right to the action of which ``right`` to ``name`` is a part, with its name.
 
     Other pairs are returned unchanged.  So are subscriptions, because watching an action does not
     need the right to command it.

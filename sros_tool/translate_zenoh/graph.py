@@ -261,7 +261,7 @@ def _part(name: str) -> str:
 
 
 class SharedNodes(NamedTuple):
-    """Nodes that several enclaves may announce; each can remove those of the others."""
+    """Nodes that several enclaves may announce; each enclave can remove the others' nodes."""
 
     enclaves: tuple[str, ...]
     """The enclaves that may announce all nodes in `nodes`."""

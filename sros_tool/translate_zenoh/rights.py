@@ -487,7 +487,7 @@ class RouterLinks(NamedTuple):
 def rights_in_rules(access: Enforcement) -> RightsInRules:
     """Return the rights that access control gives to enclaves, with their ROS domains.
 
-    Subjects without a common name are no enclaves, and are left out.
+    Subjects without a common name are not enclaves, and are left out.
     """
     domains: dict[Right, set[int | None]] = {}
     left_out: set[str] = set()
@@ -666,8 +666,8 @@ class RightsOfSubject:
     """The rights that rules give to the processes that match a subject.
 
     ``names`` are the common names of the processes' certificates; None stands for any name.  With
-    ``self_limiting``, the rights are those of the process that has the rules, which can ignore
-    them.  ``unsaid`` are pairs of a right and a key that no ROS name expresses exactly; ``denied``
+    ``self_limiting``, the rights belong to the process that has the rules, and which can ignore the
+    rules.  ``unsaid`` are pairs of a right and a key that no ROS name expresses exactly; ``denied``
     are pairs of a right and a denied key.
     """
 

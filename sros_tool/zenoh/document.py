@@ -542,7 +542,7 @@ def _check_ids(section: _Section, enforcement: Enforcement) -> None:
 def _check_size(section: _Section, enforcement: Enforcement) -> None:
     """Raise an error if access control would need many millions of decisions.
 
-    Even a small file can state enough rules for that.
+    Even a small file can state that many rules.
     """
     values = {
         subject.id: prod(len(getattr(subject, name) or (None,)) for name in PROPERTIES)

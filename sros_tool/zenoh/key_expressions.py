@@ -286,7 +286,7 @@ def _sequences_intersect(
     return len(second) in reached
 
 
-# ── what two expressions have in common ────────────────────────────────────────────────────
+# ── intersections of expressions ───────────────────────────────────────────────────────────
 
 _MOST_COMMON = 4096
 """Maximum number of key expressions that describe the intersection of two key expressions."""

@@ -377,7 +377,7 @@ def _chunks_less(wide: str, denied: frozenset[str]) -> Chunks:
 
 
 class _SearchState(NamedTuple):
-    """A state of the search: names that begin with ``read`` and go on as ``wide`` matches.
+    """A state of the search: names that begin with ``read``, then text that ``wide`` matches.
 
     ``denied`` are the denied chunks for the continuation.  ``letters`` are the letters that the
     continuation may have; names with other letters are already kept.

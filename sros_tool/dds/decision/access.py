@@ -203,7 +203,7 @@ def _state(
 def includes_domain(rule: OpenRange, domains: DomainSet, domain: int) -> bool | None:
     """Return whether ``domain`` is in ``domains``; None if the check crashes the vendor's process.
 
-    ``rule`` says what a range with only a minimum or only a maximum means.
+    ``rule`` gives the meaning of a range with only a minimum or only a maximum.
     """
     for part in domains.ranges:
         first, last = part.first, part.last

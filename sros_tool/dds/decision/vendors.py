@@ -45,7 +45,7 @@ class DateRule(Enum):
     LOCAL = auto()
     """A date is in the host's standard time; its offset is ignored (Fast DDS)."""
     CYCLONE = auto()
-    """As in the standard, but dates before 1970, after 2262 or incomplete have passed."""
+    """As in the standard, but dates before 1970, after 2262 or incomplete are past."""
 
 
 class OpenRange(Enum):
@@ -187,7 +187,7 @@ class VendorTraits:
     The first rule that names the topic decides, for publishing or for subscribing.
     """
     asks_both_directions: bool = False
-    """Creating a topic takes a right to publish or subscribe; the first rule of each decides."""
+    """Creating a topic takes a right to publish or subscribe; for each, its first rule decides."""
     always_needs_allow_rule: bool = False
     """A participant without allow rules never starts, even without join control."""
     needs_domain_rule: bool = True

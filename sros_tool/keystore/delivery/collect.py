@@ -87,7 +87,7 @@ _FEW = 4
 """Number of certificates up to which a ledger without index is searched once per certificate."""
 
 
-# ── what is done with messages and requests ────────────────────────────────────────────────
+# ── outcomes of messages and requests ──────────────────────────────────────────────────────
 
 REQUEST_OUTCOMES = ("renewed", "answered", "not_due", "not_allowed", "refused", "not_signed")
 _GOOD = REQUEST_OUTCOMES[:3]

@@ -438,7 +438,7 @@ def _check_list(keystore: OpenedKeystore, now: datetime) -> None:
 
 
 def _check_authorities(keystore: OpenedKeystore, role: str, path: Path, data: bytes) -> None:
-    """Raise `KeystoreError` if a CA file has a CA that is not in the ledger, unless it has gaps."""
+    """Raise `KeystoreError` if a CA file has a CA that a ledger without gaps lacks."""
     known = known_authorities(keystore, role)
     if known is None or keystore.ledger_with("what", "ca").gaps:
         return

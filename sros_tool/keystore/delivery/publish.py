@@ -198,7 +198,7 @@ def publish(
 
     Args:
         root: the keystore.
-        folder: the publishing folder; it is made if it is missing.
+        folder: the publishing folder, which is made if missing.
         now: the current time.
         expiry: how long new metadata is valid.
         root_key: the file of the root key, or None for a key in the keystore.  A missing key is
@@ -339,7 +339,7 @@ class _RoleKeys:
             remove_file(spare)
 
     def _is_root_key(self, path: Path) -> bool | None:
-        """Return whether a file has the root key that robots trust; None if it has no key."""
+        """Return whether a file has the root key that robots trust; None if no key is in it."""
         from sros_tool.keystore.delivery.repository import load_signer
 
         try:
@@ -745,7 +745,7 @@ class _Publication:
         )
 
     def _learned_after_restore(self) -> bool:
-        """Return whether, after the last release, the ledger recorded what the backup lacked."""
+        """Return whether the ledger recorded a restore after its last release."""
         marked = self.keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
         marks = [entry.what for entry in marked if entry.what in (RESTORED, "release")]
         return marks[-1:] == [RESTORED]
@@ -1123,7 +1123,7 @@ class _Publication:
         return changed_robots
 
     def _enclaves(self, fleet: Fleet, robot: str) -> list[str]:
-        """Return a robot's enclaves that have certificates; none if it is not in the fleet."""
+        """Return a robot's enclaves that have certificates; [] for a robot outside of the fleet."""
         if robot not in fleet.robots:
             return []
         return [

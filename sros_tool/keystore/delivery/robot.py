@@ -611,7 +611,7 @@ def _lists_here_and_sent(
 
 
 def _lost_revocation_notes(place: Path, answer: RequestAnswer) -> Iterator[Note]:
-    """Yield a note if the answer's revocation list lacks certificates of the one here.
+    """Yield a note if the answer's revocation list lacks certificates of the installed list.
 
     They may have expired since.
     """

@@ -115,7 +115,7 @@ def _lists(
             yield here, new
 
 
-# ── an export over what is there ───────────────────────────────────────────────────────────
+# ── an export to an existing folder ────────────────────────────────────────────────────────
 
 
 def check_rollback(
@@ -313,7 +313,7 @@ def _lost_revocations(
 def check_own_keys(target: Path, files: Mapping[str, bytes]) -> None:
     """Raise `KeystoreError` if a certificate does not belong to the key that stays in ``target``.
 
-    A key on a token is the one of the signing request.
+    If the key is on a token, the signing request has the public key.
     """
     for path, data in files.items():
         folder, _, file = path.rpartition("/")

@@ -108,7 +108,7 @@ class CaService:
         """Return the certificate that the service issues; ``authority`` is the identity CA.
 
         Raises:
-            CaServiceError: the program fails, or the certificate is not what was asked for.
+            CaServiceError: the program fails, or the certificate is not the requested one.
         """
         answer = self._answer(request)
         try:

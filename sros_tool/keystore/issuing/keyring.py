@@ -270,7 +270,7 @@ IN_KEYSTORE = Keyring()
 
 
 def check_places(keyring: Keyring, template: Template) -> None:
-    """Raise `KeystoreError` if a CA with both roles has a different key place for each."""
+    """Raise `KeystoreError` if one CA has both roles, but a different key place for each role."""
     named = {role: keyring.places.get(role) for role in ROLES}
     if not template.separate_authorities and len({place or "" for place in named.values()}) > 1:
         raise KeystoreError(

@@ -146,7 +146,7 @@ def minimized_policy(
         fleet: the robots for which placeholders of the policies stand.  A right that was observed
             on one robot stays for all robots; sizes are computed for the robot with the longest
             path.
-        strict: also remove rights that every node needs if they were not observed.
+        strict: remove rights that were not observed even if every node needs them.
         output: the file to which the caller will write the policy.
 
     Raises:

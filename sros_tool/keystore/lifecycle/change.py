@@ -102,7 +102,7 @@ class ChangeOptions(TypedDict, total=False):
     allow_refusal: Sequence[Vendor]
     """Vendors whose nodes may stop working."""
     dry_run: bool
-    """Change nothing; the result is the one that the change would have."""
+    """Change nothing, and return the result that the change would have."""
 
 
 _NOTED = timedelta(days=1)
@@ -205,7 +205,7 @@ class KeystoreChange:
     def __exit__(self, *error: object) -> None:
         self.transaction.__exit__(*error)
 
-    # ── what is there, and what is to be ───────────────────────────────────────────────────
+    # ── the present and the new state ──────────────────────────────────────────────────────
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -382,7 +382,7 @@ class KeystoreChange:
             secrets=self.keyring.secrets,
         )
 
-    # ── what follows from it ───────────────────────────────────────────────────────────────
+    # ── consequences of the new state ──────────────────────────────────────────────────────
 
     def revocation_lists(self) -> RevocationListSigner:
         """Return the signer of the revocation lists."""
@@ -583,7 +583,7 @@ class KeystoreChange:
         self.transaction.commit()
 
     def _note_unknown_authorities(self) -> None:
-        """Add a note if a CA file has a CA that is not in the ledger, unless this has gaps."""
+        """Add a note if a CA file has a CA that a ledger without gaps lacks."""
         written = (change.path for change in self.transaction.changes)
         replaced = any(path.startswith(f"{PUBLIC}/") and "_ca.cert" in path for path in written)
         if replaced or self.keystore.ledger_with("what", "ca").gaps:

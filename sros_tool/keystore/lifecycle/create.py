@@ -279,7 +279,7 @@ def generate_artifacts(
 
     Raises:
         KeystoreError: a policy names a revoked enclave that ``enclaves`` does not name, or a robot
-            is in a domain that the keystore is not for.
+            is in a domain that the keystore does not have.
     """
     wanted = _rights_by_enclave(enclaves, policies)
     protections = stated_protections(_enclaves_with_protection(policies))

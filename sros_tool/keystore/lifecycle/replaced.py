@@ -180,9 +180,9 @@ def counterpart_notes(
 
 
 def _enclaves_naming(keystore: OpenedKeystore, names: Collection[str]) -> list[str]:
-    """Return the enclaves whose permissions may have one of some ROS names, perhaps by a wildcard.
+    """Return the enclaves whose permissions may have one of ``names``, perhaps by a wildcard.
 
-    Most permissions need not be parsed for that.
+    So most permissions need not be parsed.
     """
     if len(names) > _FEW_NAMES or any(map(is_expression, names)):
         return list(keystore.names)

@@ -262,7 +262,7 @@ class RevocationListSigner:
             return None
         return self._keystore.ledger_file.recorded_enclaves()
 
-    # ── what is revoked ────────────────────────────────────────────────────────────────────
+    # ── revocations ────────────────────────────────────────────────────────────────────────
 
     def revocations(
         self, last: Mapping[str, Entry], reason: str, *, keep: Mapping[str, str] | None = None
@@ -529,7 +529,7 @@ class RevocationListSigner:
     def _lost_revocations(self, expiries: Mapping[int, str]) -> list[Revoked]:
         """Return the revocations that the present list lacks.
 
-        If the present list is the last one, these are only those because of which
+        If the present list is the last one, these are only the revocations because of which
         `unlisted_revocations` refuses an export, because a list need not have certificates of
         replaced CAs.
         """

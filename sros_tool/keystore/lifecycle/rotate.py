@@ -818,7 +818,7 @@ def _issuance(
     identity: _Successor | None,
     permissions: _Successor | None,
 ) -> Issuance | None:
-    """Return what the new CAs issue for an enclave; None if it has no certificate yet.
+    """Return the issuance by the new CAs for an enclave; None for one without a certificate.
 
     Raises:
         KeystoreError: the old CA did not issue the certificate or sign the permissions, or the

@@ -148,7 +148,7 @@ class KeystoreUpdate(Changed):
         )
 
 
-# ── what is, and what shall be ─────────────────────────────────────────────────────────────
+# ── present and wanted settings ────────────────────────────────────────────────────────────
 
 
 def edited_settings(
