@@ -69,7 +69,7 @@ class FetchProblem(StrEnum):
     TOO_LARGE = "too_large"
     """A file is larger than allowed, or than the metadata says."""
     NOT_FOR_ROBOT = "not_for_robot"
-    """Nothing is published for this robot, or what is published is another robot's."""
+    """Nothing is published for this robot, or the published release belongs to another robot."""
     NOT_KEPT = "not_kept"
     """The agent's folder cannot be written, for example because the disk is full."""
 

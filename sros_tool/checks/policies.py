@@ -458,7 +458,7 @@ def _check_instances(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
 
 
 def _check_node_names(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
-    """Yield findings about nodes that have nearly the name of their enclave, if none has it."""
+    """Yield findings about nodes with nearly the name of their enclave, if no node has it."""
     for enclave in checked_policy.policy.enclaves:
         own = enclave.path.rpartition("/")[2]
         near = []

@@ -175,7 +175,7 @@ def merge_policy(
 
 _MOST_ADDED = 20
 _MOST_OF_ENCLAVE = 2
-"""The most rights that a merge lists; if there are more, the most of each enclave."""
+"""Highest number of rights that a merge lists; if there are more, the number of each enclave."""
 
 
 def _print_added(merged: Merged) -> None:

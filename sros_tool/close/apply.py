@@ -186,7 +186,7 @@ class _RemainingProcesses:
                 )
 
     def say_how_to_start(self) -> None:
-        """Show how to start processes open that do not run, or that run by another command."""
+        """Show how to start, without security, processes that ended or run by another command."""
         running, nodes = self._running, ObservedNodes(self._robot)
         known = running.with_later_processes(self._robot.processes)
         unknown = [

@@ -180,7 +180,7 @@ class ZenohAnswer:
     text: str
     checks: tuple[Check, ...] = ()
     reached: tuple[Reached, ...] = ()
-    """The enclaves with the matching right, such as to subscribe to what this one publishes."""
+    """The enclaves with the matching right, such as to subscribe to what this enclave publishes."""
     wildcards: tuple[DecidingWildcard, ...] = ()
     """Key expressions with wildcards on which the decision depends."""
     until: datetime | None = None

@@ -157,7 +157,7 @@ def less_protection(
 def _looser_later(
     old: AccessSource, new: AccessSource, limit: SearchLimit
 ) -> Iterator[SettingChange]:
-    """Yield changes that would protect enclaves created later less."""
+    """Yield changes by which enclaves that are created later get less protection."""
     if old.later is None or new.later is None:
         return
     domains = DomainSet.of((0, 0))

@@ -38,8 +38,8 @@ def test_keystores_and_their_exports_are_strangers(keystore: Path, tmp_path: Pat
     sros("distribute_key", keystore, "/a", export).ok()
     (text,) = strangers(keystore, other, export)
     assert text == (
-        f"nodes of {keystore}, {export} do not communicate with nodes of {other}: they do not "
-        "both trust the other's identity CA and permissions CA"
+        f"nodes of {keystore}, {export} do not communicate with nodes of {other}: one side does "
+        "not trust the other's identity CA and permissions CA"
     )
     assert strangers(keystore, export) == strangers(keystore, keystore / "enclaves/a") == []
     assert strangers(other) == strangers(keystore / "enclaves/a/cert.pem", other) == []

@@ -191,7 +191,7 @@ def _strangers(
             authorities = " and ".join(f"{ROLES[role]} CA" for role in refused)
             text = (
                 f"nodes of {names_text(group)} do not communicate with nodes of "
-                f"{names_text(other_group)}: they do not both trust the other's {authorities}"
+                f"{names_text(other_group)}: one side does not trust the other's {authorities}"
             )
             yield STRANGERS.found(other_group[0], text, other_group[0])
             refused_pairs.update(map(frozenset, product(group, other_group)))
