@@ -24,7 +24,7 @@ from cryptography.hazmat.primitives import serialization
 
 from sros_tool.cli import main
 from sros_tool.dds.permissions import parse_permissions
-from sros_tool.keystore.layout import LOCK, REQUIRED_FILES
+from sros_tool.keystore.layout import LEDGER_INDEX, LOCK, REQUIRED_FILES
 from sros_tool.pki import smime
 from tests.support.children import Forked
 
@@ -309,12 +309,15 @@ def _bytes_of(path: str) -> bytes:
 
 
 def remains(folder: Path) -> list[str]:
-    """Return the stages of transactions that were left below a folder."""
+    """Return the stages of transactions that were left below a folder.
+
+    The index of a long ledger is no such stage.
+    """
     return [
         os.path.relpath(os.path.join(parent, name), folder)
         for parent, folders, files in os.walk(folder)
         for name in (*folders, *files)
-        if ".sros-" in name or ".sros-" in os.path.relpath(parent, folder)
+        if ".sros-" in os.path.relpath(os.path.join(parent, name), folder) and name != LEDGER_INDEX
     ]
 
 
