@@ -665,7 +665,8 @@ class _Round:
         routers = [
             name for name in names if (enclave_path(self._folder, name) / ROUTER_FILE).exists()
         ]
-        states, due = processes.restartable, self._state.due
+        # A process that may only claim to run in an enclave makes a restart due without new files.
+        states, due = processes.restartable, self._state.replaced
         done = restart_units(
             settings,
             [
