@@ -586,7 +586,9 @@ class ComparedFleet(NamedTuple):
     help="Robots without a confirmation for longer than this are offline. [default: 1d for robots "
     "that fetch]",
 )
-@click.option("--prometheus", is_flag=True, help="Print metrics for node_exporter's textfile.")
+@click.option(
+    "--prometheus", is_flag=True, help="Print metrics for the textfile collector of node_exporter."
+)
 @click.option("--html", is_flag=True, help="Print the status as an HTML page.")
 @advisories_option
 @click.option(

@@ -233,8 +233,8 @@ def _possible_endpoints(
 ) -> Sequence[Endpoint]:
     """Return the possible endpoints of a renamed node for an old one, the likeliest first.
 
-    Private names of the node change with the node.  Another name of its namespace changes only if
-    the program wrote it as a relative name, which the graph does not show.
+    Private names of the node change with the node.  Another name in the node's namespace changes
+    only if the program wrote it as a relative name, which the graph does not show.
     """
     prefix, fqn = endpoint.topic[:2], endpoint.topic[2:]
     private, near = expand("~/", node.ns, node.name), expand("", node.ns, "")
