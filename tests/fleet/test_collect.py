@@ -41,6 +41,7 @@ from sros_tool.keystore.delivery.collect import (
     collect,
 )
 from sros_tool.keystore.delivery.published import read_published
+from sros_tool.keystore.delivery.signing import certify_requests
 from sros_tool.keystore.fleet import recorded_fleet
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
@@ -871,6 +872,27 @@ def test_only_an_enclave_itself_vouches_for_its_new_key(home: Home) -> None:
     assert done.outcome == "renewed" and done.key_sha256 == key_digest(new.public_key())
     assert home.certificate("/r1/arm").public_key() == new.public_key()
     assert key_on_robot(home.root / "enclaves/r1/arm")
+
+
+@pytest.mark.parametrize("change", ["renew", "revoke"])
+def test_a_key_that_is_revoked_while_its_request_waits_vouches_for_no_other(
+    home: Home, change: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Collecting waits for a change that runs, and examined the request before."""
+    words = ("--new-key", "--revoke-old") if change == "renew" else ()
+    original = certify_requests
+
+    def after_the_change(*arguments: Any, **options: Any) -> Any:
+        if not changed:
+            changed.append(sros(change, home.root, "/r1/base", *words).ok())
+        return original(*arguments, **options)
+
+    changed: list[Any] = []
+    monkeypatch.setattr(collecting, "certify_requests", after_the_change)
+    home.send("r1", DUE, requests=(home.request("r1", key=generate_key()),))
+    (done,) = home.of("r1", DUE).requests
+    assert done.outcome == "refused" and "was changed while its request was exam" in done.why
+    assert (home.root / "enclaves/r1/base/key.pem").exists() is (change == "renew")
 
 
 def test_a_key_that_was_replaced_vouches_for_no_other(home: Home) -> None:

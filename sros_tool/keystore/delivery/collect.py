@@ -892,7 +892,8 @@ def _sign(
 
     def sign(robots: Sequence[Sequence[_DecidedRequest]]) -> SrosError | None:
         """Sign the requests of some robots; return the error if this fails."""
-        requests = [request.request for judged in robots for request in judged if request.request]
+        decided = [request for judged in robots for request in judged if request.request]
+        requests = [request.request for request in decided if request.request]
         try:
             signed = certify_requests(
                 root,
@@ -900,6 +901,8 @@ def _sign(
                 only_enclaves=[request.name for request in requests],
                 renew=True,
                 replace_keys=True,
+                # Another change may have come first, while this one waited for the lock.
+                vouching={request.result.enclave: request.vouching for request in decided},
                 **options,
             )
         except SrosError as error:

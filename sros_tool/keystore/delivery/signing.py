@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
+from types import MappingProxyType
 from typing import Annotated, NamedTuple, Unpack
 
 from cryptography import x509
@@ -36,7 +37,7 @@ from sros_tool.keystore.issuing.enclave import (
     shared_files,
     stated_enclave,
 )
-from sros_tool.keystore.known_keys import KnownKeys
+from sros_tool.keystore.known_keys import KnownKeys, revoked_serials
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     GOVERNANCE_FILE,
@@ -214,6 +215,7 @@ def certify_requests(
     refuse_revoked: bool = False,
     renew: bool = False,
     replace_keys: bool = False,
+    vouching: Mapping[str, Collection[int]] = MappingProxyType({}),
     domain: int | None = None,
     **options: Unpack[ChangeOptions],
 ) -> SignedRequests:
@@ -223,7 +225,9 @@ def certify_requests(
     brings the enclaves to their robots.  Unless ``renew`` is set, an enclave whose key is already
     certified stays as it is.  ``only_enclaves`` are the enclaves for which there must be requests;
     empty for any.  With ``replace_keys``, an enclave's private key in the keystore is removed if
-    the request has another key: from then on, the enclave's key is on its robot.
+    the request has another key: from then on, the enclave's key is on its robot.  ``vouching`` maps
+    enclaves to the serial numbers of the certificates that vouch for their requests: the enclave
+    must still have one of them, and none of them may be revoked.
 
     Raises:
         PkiError: a request is not valid.
@@ -244,6 +248,7 @@ def certify_requests(
     change = KeystoreChange(root, **options)
     kept: tuple[str, ...] = ()
     with change:
+        _check_vouching(change.keystore, vouching)
         if not renew:
             kept = tuple(
                 request.name for request in requests if _is_certified(change.keystore, request)
@@ -261,6 +266,19 @@ def certify_requests(
         else:
             change.notes += signer.name_notes()
     return signer.result(requests, renew=renew, kept=kept)
+
+
+def _check_vouching(keystore: OpenedKeystore, vouching: Mapping[str, Collection[int]]) -> None:
+    """Raise `KeystoreError` if what vouches for a request was replaced or revoked since."""
+    revoked = revoked_serials(keystore) if vouching else frozenset()
+    for name, serials in vouching.items():
+        present = keystore.certificate_of(name) if keystore.has_enclave(name) else None
+        if not present or present.serial_number not in serials or not revoked.isdisjoint(serials):
+            raise KeystoreError(
+                f"enclave {name} was changed while its request was examined",
+                "What vouches for the request may have been revoked. Nothing was signed.",
+                "Repeat the command: it examines the request again.",
+            )
 
 
 _END = b"-----END CERTIFICATE REQUEST-----"
