@@ -241,7 +241,7 @@ def concerns_key(problem: str) -> bool:
 
 
 def shows_old_copy(problem: str) -> bool:
-    """Return whether an agent's problem shows that it may fetch from an old copy."""
+    """Return whether an agent's problem shows that the agent may fetch from an old copy."""
     phrases = (OLDER_THAN_SEEN, OLDER_THAN_INSTALLED, OF_OTHER_CA)
     return any(phrase in problem for phrase in phrases)
 

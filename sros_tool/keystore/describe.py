@@ -382,8 +382,8 @@ class DescribedKeystore(NamedTuple):
     authorities: Mapping[str, AuthorityFile | UnreadableFile]
     """CAs of the keystore, by role (``identity``, ``permissions``)."""
     unknown_authorities: Sequence[str]
-    """CAs in CA files of the keystore or of an enclave that the keystore does not know, as text;
-    somebody else added them.
+    """CAs unknown to the keystore, as text, that somebody else added to CA files of the keystore or
+    of an enclave.
     """
     governance: DescribedGovernance | UnreadableFile | None
     """Governance of the keystore, or null."""

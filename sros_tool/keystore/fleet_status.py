@@ -234,7 +234,7 @@ class RobotStatus:
     """The worst state of the robot's files; ``revoked`` also if all its enclaves were revoked
     (``enclaves`` is 0); ``restart``: they are current, but processes still run with earlier ones;
     ``unusable``: they are current, but the robot says that no process could start in an enclave,
-    such as without its key;
+    for example without its key;
     ``expired``: one of its files has expired (`expiry`);
     ``offline``: its last confirmation is too old (`overdue`); ``later``: it says that it has a
     later release than was ever published for it, so that nothing in its message is reliable;
@@ -288,9 +288,9 @@ class RobotStatus:
     dds: RobotDds | None
     """The DDS of the robot by its last confirmation; null if the confirmation does not tell."""
     problems: tuple[str, ...] | None
-    """What the robot's agent could not do, or what is wrong on the robot, in the agent's words, or
-    that the robot fetches from an old copy of the publication; null if the confirmation does not
-    tell.
+    """Problems of the robot, in its agent's words: what the agent could not do, what is wrong on
+    the robot, or that the robot fetches from an old copy of the publication; null if the
+    confirmation does not tell.
     """
     notes: tuple[str, ...]
     """Remarks (clauses), such as on the robot's clock."""
@@ -877,7 +877,10 @@ class _KeystoreRecords:
         """Maps robots to the number of the release that was published last for them."""
         self.publication = (
             PublishedMetadata(
-                published.folder, published.until, published.root_until, lacks=published.lacking()
+                published.folder,
+                published.until,
+                published.root_until,
+                lacks=published.first_missing(),
             )
             if published.robots
             else None

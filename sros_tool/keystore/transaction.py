@@ -68,8 +68,8 @@ from sros_tool.xml import read_bytes
 
 _BEFORE, _AFTER, _LIVE, _ADDED, MANIFEST = "before", "after", "live", "added", "manifest.json"
 _VERSION = 3
-_EARLIER = 2
-"""The earlier version of the manifest, without moves of folders."""
+_EARLIER_VERSION = 2
+"""The earlier version of the manifest, which lists no moves of folders."""
 
 
 class Move(NamedTuple):
@@ -234,7 +234,7 @@ def _read_manifest(folder: Folder) -> tuple[Move, ...]:
     """
     try:
         read = json.loads(folder.read(f"{STAGE}/{MANIFEST}"))
-        if read["version"] not in (_EARLIER, _VERSION):
+        if read["version"] not in (_EARLIER_VERSION, _VERSION):
             raise ValueError(f"its version is not {_VERSION}")
         return tuple(_move(*move) for move in read["moves"])
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:

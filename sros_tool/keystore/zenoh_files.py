@@ -333,8 +333,8 @@ class ZenohChange:
 
     ``issued`` are the new permissions of enclaves.  ``gone`` are the revoked enclaves, and
     ``replaced`` the enclaves whose earlier certificates are revoked.  ``recorded`` are the entries
-    that the transaction adds to the ledger.  ``stated`` are the policies of the enclaves, for the
-    lines that errors name.
+    that the transaction adds to the ledger.  ``stated`` are the policies of the enclaves;
+    errors name lines of them.
     """
 
     issued: Mapping[str, SignedRights] = field(default_factory=dict)

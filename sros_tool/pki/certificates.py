@@ -719,7 +719,7 @@ def holds_at(form: CertificateForm, now: datetime) -> bool | None:
     return times and times[0] <= now.astimezone(UTC).strftime("%Y%m%d%H%M%SZ") <= times[1]
 
 
-@lru_cache(maxsize=256)  # certificates that were issued together share it
+@lru_cache(maxsize=256)  # certificates issued together share their dates
 def _times(validity: bytes) -> tuple[str, str] | None:
     """Return the start and the end of a validity (DER), as GeneralizedTime (RFC 5280, 4.1.2.5)."""
     with suppress(PkiError, ValueError):

@@ -406,7 +406,7 @@ class _GrantRules:
         return NameSet.first(self._decisions_by_topic(self._entries), self._otherwise.allowed)
 
     def _decisions_by_topic(self, entries: Iterable[_Entry]) -> Iterator[tuple[NameSet, bool]]:
-        """Yield topics in the order of the rules, each time with whether these topics are allowed.
+        """Yield sets of topics, in the order of the rules, and whether the topics are allowed.
 
         Consecutive entries with the same verdict are joined.
         """

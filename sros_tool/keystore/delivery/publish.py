@@ -1136,7 +1136,7 @@ class _Publication:
         """Return whether the folder has the archive of a release, undamaged."""
         return bool(self._read(robot, release))
 
-    def _bring_files_of(self, robot: str, release: PublishedRelease) -> bool:
+    def _ensure_files_of(self, robot: str, release: PublishedRelease) -> bool:
         """Return whether the folder has a release; copy it from the earlier folder if needed."""
         if self._has_files_of(robot, release):
             return True
@@ -1212,7 +1212,9 @@ class _Publication:
                 files = evaluator.files(robot.enclaves, before.evaluated if before else None)
             except SrosError as error:
                 kept = (
-                    before if before and self._bring_files_of(robot.robot, before.release) else None
+                    before
+                    if before and self._ensure_files_of(robot.robot, before.release)
+                    else None
                 )
                 yield _ReleaseOutcome(robot.robot, kept, why=str(error))
                 continue
@@ -1220,7 +1222,7 @@ class _Publication:
             if (
                 before
                 and before.content == content
-                and self._bring_files_of(robot.robot, before.release)
+                and self._ensure_files_of(robot.robot, before.release)
             ):
                 kept = before._replace(files=robot.state, evaluated=files.evaluated)
                 yield _ReleaseOutcome(robot.robot, kept)

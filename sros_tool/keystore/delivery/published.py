@@ -37,7 +37,7 @@ Replaced archives are kept for two days.
 MOST_NUMBER = 10**12 - 1
 """Highest number of a release that a seal can have, and highest version of metadata."""
 BEGIN_AGAIN = "Start again as after a theft of all keys: docs/fetching.md says how."
-"""The remedy if somebody has used up the numbers."""
+"""The remedy if somebody has used up the version numbers."""
 _TIMESTAMP = "metadata/timestamp.json"
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 
@@ -132,7 +132,7 @@ class Published:
         yield from self.metadata
         yield from (robot.release.path(name) for name, robot in sorted(self.robots.items()))
 
-    def lacking(self) -> str:
+    def first_missing(self) -> str:
         """Return the first file that is missing in the publishing folder, or "".
 
         The result is also "" if the folder is not here, for example on a disk that is not mounted.

@@ -532,7 +532,8 @@ def _check_name(
         intended = (
             "add --renew"
             if _is_certified(keystore, request) or _is_shown(known, request)
-            else f"for example because the robot has new hardware, first {_revoke(keystore, name)}"
+            else "for example because the robot has new hardware, first "
+            + _revocation_advice(keystore, name)
         )
         raise KeystoreError(
             f"enclave {name} already exists in keystore '{keystore.root}'",
@@ -581,12 +582,12 @@ def _check_same_key(
         raise KeystoreError(
             f"enclave {request.name} has another key in keystore '{root}'",
             f"Its {path.name} would not fit a certificate for the key in the request.",
-            f"First {_revoke(keystore, request.name)}, without --renew.",
+            f"First {_revocation_advice(keystore, request.name)}, without --renew.",
         )
 
 
-def _revoke(keystore: OpenedKeystore, name: str) -> str:
-    """Return the words for how an enclave gets a key that its robot made."""
+def _revocation_advice(keystore: OpenedKeystore, name: str) -> str:
+    """Return advice, as a clause, on how an enclave gets a key made on its robot."""
     return (
         f"revoke the old key with `sros revoke {quote(str(keystore.root))} {name}` (or, with "
         f"--robot, all keys of its robot), and then repeat this command with --enclave {name}"

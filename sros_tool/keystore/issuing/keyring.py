@@ -196,7 +196,7 @@ class Keyring:
         return None
 
     def settings_with_places(self, template: Template) -> Template:
-        """Return ``template`` with the places of the CA keys, to be a new keystore's settings."""
+        """Return a new keystore's settings: ``template`` with the places of the CA keys."""
         identity = self.places.get(IDENTITY) or template.identity_key
         permissions = self.places.get(PERMISSIONS) or template.permissions_key
         if not template.separate_authorities:

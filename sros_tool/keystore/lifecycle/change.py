@@ -480,7 +480,7 @@ class KeystoreChange:
             return self.permissions.certificate
         return self.keystore.ca_certificate(PERMISSIONS)
 
-    # ── the flip ───────────────────────────────────────────────────────────────────────────
+    # ── ledger and commit ──────────────────────────────────────────────────────────────────────
 
     def record(self, signer: Authority | None = None) -> None:
         """Stage the ledger with the new entries, signed by the identity CA or by ``signer``.

@@ -182,7 +182,7 @@ def counterpart_notes(
 def _enclaves_naming(keystore: OpenedKeystore, names: Collection[str]) -> list[str]:
     """Return the enclaves whose permissions may have one of ``names``, perhaps by a wildcard.
 
-    So most permissions need not be parsed.
+    The files are searched for the text of the names, so that most need not be parsed.
     """
     if len(names) > _FEW_NAMES or any(map(is_expression, names)):
         return list(keystore.names)
