@@ -63,7 +63,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     enclave_path,
 )
-from sros_tool.keystore.ledger import RESTORED, SAME_KEY, Entry, behind_clause
+from sros_tool.keystore.ledger import SAME_KEY, Entry, behind_clause
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.parallel import map_slices
@@ -975,14 +975,9 @@ class _KeystoreRecords:
     @cached_property
     def age_clause(self) -> str:
         """Why the keystore is older than its robots, as a clause; "" if nothing shows this."""
-        entries = self._keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
-        marks = [entry for entry in entries if entry.what in (RESTORED, "release")]
-        if marks and marks[-1].what == RESTORED:
-            return "robots have files that it signed but does not know"
-        # Few folders have later releases.
-        from sros_tool.keystore.delivery.publish import later_in_folder
+        from sros_tool.keystore.delivery.publish import age_clause
 
-        return later_in_folder(self._keystore)
+        return age_clause(self._keystore)
 
     def is_ahead(self, confirmed: Confirmation) -> bool:
         """Return whether a robot reports a release from after the keystore's backup."""

@@ -45,13 +45,14 @@ from sros_tool.keystore.delivery.signing import certify_requests
 from sros_tool.keystore.fleet import recorded_fleet
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
-from sros_tool.keystore.layout import PUBLISHED, key_on_robot
-from sros_tool.keystore.ledger import RESTORED
+from sros_tool.keystore.known_keys import KnownKeys
+from sros_tool.keystore.layout import IDENTITY, PUBLISHED, key_on_robot
+from sros_tool.keystore.ledger import RESTORED, certificate_entry
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.reader import OpenedKeystore, read_certificate
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, key_digest, make_request, validity_of
-from sros_tool.pki.crl import load_crl
+from sros_tool.pki.crl import SUPERSEDED, Revoked, load_crl, sign_crl
 from sros_tool.pki.keys import PrivateKey, generate_key, load_key
 from sros_tool.validity import BACKDATE, iso, parse_iso
 from tests.dds.signer_rows import signed_by
@@ -623,6 +624,46 @@ def test_a_certificate_that_was_replaced_after_the_backup(home: Home) -> None:
     crl_at_home = OpenedKeystore(home.root).revocation_list
     assert crl_at_home and not crl_at_home.revokes(home.certificate("/r1/base").serial_number)
     assert not home.collect().notes
+
+
+def test_a_key_that_was_revoked_after_the_backup_vouches_for_no_other(home: Home) -> None:
+    """The publishing folder shows it, before anybody has read it with --restored."""
+    home.run("fleet", "publish", "ks", "pub")
+    backup = copy_of(home.root, home.folder / "backup")
+    home.run("renew", "ks", "/r1/base", "--new-key", "--revoke-old")
+    home.run("fleet", "publish", "ks", "pub")
+    shutil.rmtree(home.root)
+    backup.rename(home.root)
+    before = home.certificate("/r1/base")
+    home.send("r1", DUE, requests=(home.request("r1", key=generate_key()),))
+    found = home.of("r1", DUE)
+    assert (found.outcome, found.requests[0].outcome) == ("kept", "refused")
+    assert f"`sros fleet publish {home.root} {home.folder}/pub --restored`" in found.requests[0].why
+    assert home.certificate("/r1/base") == before
+
+
+@pytest.mark.parametrize(("revoked", "is_replaced"), [(-1, True), (1, False)])
+def test_a_key_that_a_revoked_key_vouched_for(home: Home, revoked: int, is_replaced: bool) -> None:
+    """The list that revoked the vouching key comes later; ``revoked`` is in days since then."""
+    old, authority = (
+        home.certificate("/r1/base"),
+        OpenedKeystore(home.root).ca_certificate(IDENTITY),
+    )
+    home.send("r1", DUE, requests=(home.request("r1", key=generate_key()),))
+    assert home.of("r1", DUE).requests[0].outcome == "renewed"
+    later, new = DUE + timedelta(days=2), home.certificate("/r1/base")
+    key = load_key((home.root / "private/identity_ca.key.pem").read_bytes(), "the CA's key")
+    entry = Revoked(old.serial_number, DUE + timedelta(days=revoked), SUPERSEDED)
+    crl = sign_crl(authority, key, [entry], number=99, this_update=DUE, next_update=LATE)
+    home.send("r2", later, crl=crl.decode())
+    texts = {note.id: note.text for note in home.collect(later).notes}
+    command = f"`sros renew {home.root} /r1/base --new-key --revoke-old`"
+    assert (command in texts.get("fleet.replaced-after-backup", "")) == is_replaced
+    keystore = OpenedKeystore(home.root)
+    assert keystore.revocation_list
+    assert keystore.revocation_list.revokes(new.serial_number) == is_replaced
+    key_of_new = certificate_entry(DUE, "certificate", new, "/r1/base").key
+    assert KnownKeys(keystore).is_revoked(key_of_new) == is_replaced
 
 
 def test_the_verb_names_the_next_step(home: Home) -> None:

@@ -43,6 +43,7 @@ from sros_tool.keystore.confirmation import (
     store_confirmation,
     store_refusals,
 )
+from sros_tool.keystore.delivery.published import read_published
 from sros_tool.keystore.delivery.signing import certify_requests
 from sros_tool.keystore.expiry import read_credentials
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, recorded_fleet
@@ -243,6 +244,7 @@ def collect(
         not_signed, notes, signed = _revoke_again(
             root, forgotten, robots_with_lists, taken, now=now, keyring=keyring, dry_run=dry_run
         )
+        _defer_new_keys(OpenedKeystore(root), taken, is_restored=bool(signed))
         if not not_signed:
             not_signed, more_notes, more_signed = _sign(
                 root,
@@ -691,6 +693,8 @@ class _DecidedRequest:
     request: SigningRequest | None = None
     vouching: Collection[int] = ()
     """Serial numbers of the certificates that vouch for the request."""
+    is_new_key: bool = False
+    """Whether the request has another key than the enclave's current certificate."""
 
     def set_outcome(self, outcome: str, why: str = "") -> None:
         """Set the outcome of a request that is not signed."""
@@ -728,7 +732,8 @@ class _Renewals:
             if outcome == "renewed":
                 present = self._keystore.certificate_of(request.name)
                 vouching = (message.certificate.serial_number, present.serial_number)
-                judged.append(_DecidedRequest(result, request, vouching))
+                is_new_key = present.public_key() != request.public_key
+                judged.append(_DecidedRequest(result, request, vouching, is_new_key))
             else:
                 judged.append(_DecidedRequest(result))
         return judged
@@ -870,6 +875,32 @@ def _revoke_again(
         return why, [], []
     notes = [restored_note(restored, have)] if robots_with_lists else []
     return "", [*notes, *restored.notes], [*changes_below(root, restored.changes)]
+
+
+def _defer_new_keys(
+    keystore: OpenedKeystore, messages: Sequence[_ReceivedMessage], *, is_restored: bool
+) -> None:
+    """Refuse requests with new keys while something shows that the keystore was restored.
+
+    The key that vouches for a new key may have been revoked after the backup.  ``is_restored`` says
+    that messages of this run show it.
+    """
+    requests = [request for message in messages for request in message.requests]
+    new_keys = [request for request in requests if request.request and request.is_new_key]
+    if not new_keys:
+        return
+    from sros_tool.keystore.delivery.publish import age_clause
+
+    if is_restored or age_clause(keystore):
+        where = quote(str(keystore.root))
+        folder = quote(read_published(keystore).folder or "PUB")
+        why = (
+            "the keystore was restored from a backup, or is a copy, so the key that vouches for "
+            f"the new key may be revoked: first run `sros fleet publish {where} {folder} "
+            "--restored`"
+        )
+        for request in new_keys:
+            request.set_outcome("refused", why)
 
 
 def _sign(

@@ -271,7 +271,7 @@ def publish(
         return run.result(keys)
 
 
-def later_in_folder(keystore: OpenedKeystore) -> str:
+def _later_in_folder(keystore: OpenedKeystore) -> str:
     """Return a clause with evidence that the publishing folder is newer than the keystore, or "".
 
     The result is also "" if this cannot be determined here.  Only metadata that the keystore's own
@@ -287,6 +287,23 @@ def later_in_folder(keystore: OpenedKeystore) -> str:
             except KeystoreError as error:
                 return error.what
     return ""
+
+
+def age_clause(keystore: OpenedKeystore) -> str:
+    """Return why the keystore is older than its robots, as a clause; "" if nothing shows this.
+
+    It was restored from a backup, or is a copy, and has not published with ``--restored`` since.
+    """
+    if _learned_after_restore(keystore):
+        return "robots have files that it signed but does not know"
+    return _later_in_folder(keystore)
+
+
+def _learned_after_restore(keystore: OpenedKeystore) -> bool:
+    """Return whether the ledger recorded a restore after its last release."""
+    marked = keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
+    marks = [entry.what for entry in marked if entry.what in (RESTORED, "release")]
+    return marks[-1:] == [RESTORED]
 
 
 def is_all_published(root: Path, published: PublishedRobot, enclaves: Sequence[str]) -> bool:
@@ -696,7 +713,7 @@ class _Publication:
         """Return whether the ledger or a robot shows that the keystore was restored."""
         entries = self.keystore.ledger_with("what", "release").entries
         last = max((entry.number for entry in entries if entry.what == "release"), default=0)
-        if self._learned_after_restore():
+        if _learned_after_restore(self.keystore):
             return True
         for robot in recorded_fleet(self.keystore).robots:
             with suppress(SrosError):
@@ -723,7 +740,7 @@ class _Publication:
 
         Once the keystore records another folder, the later releases would no longer be noticed.
         """
-        if evidence := later_in_folder(self.keystore):
+        if evidence := _later_in_folder(self.keystore):
             where = f"{quote(str(self.keystore.root))} {quote(self._earlier_folder)}"
             raise KeystoreError(
                 evidence,
@@ -744,17 +761,11 @@ class _Publication:
             f"revoke again what was revoked, and add --restored to {self._command}.",
         )
 
-    def _learned_after_restore(self) -> bool:
-        """Return whether the ledger recorded a restore after its last release."""
-        marked = self.keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
-        marks = [entry.what for entry in marked if entry.what in (RESTORED, "release")]
-        return marks[-1:] == [RESTORED]
-
     def _not_shown_note(self) -> Note:
         """Return a note on revocations that neither keystore nor publishing folder shows."""
         where, since = quote(str(self.keystore.root)), "the backup"
         last = self.keystore.ledger_file.last_time()
-        if last and not self._learned_after_restore():
+        if last and not _learned_after_restore(self.keystore):
             since = f"{iso(last)}, the last entry of the ledger"
         return Note(
             "fleet.revocations-not-shown",

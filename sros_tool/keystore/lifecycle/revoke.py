@@ -25,6 +25,7 @@ from sros_tool.keystore.layout import (
     REVOKED,
     ZENOH_FILES,
     enclave_folder,
+    has_key,
 )
 from sros_tool.keystore.ledger import RESTORED, Entry, certificate_entry
 from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
@@ -159,10 +160,10 @@ def restore_revocations(
     The next list has a higher number than the lost lists.  Enclaves that were revoked are moved to
     ``revoked`` again, even if they were renewed since then.  Enclaves that only had an earlier
     certificate replaced stay.  The key of a replaced certificate is revoked, too, unless a
-    certificate that the ledger lacked has the same key.  Certificates that the ledger lacks are
-    recorded, so that they can be revoked; those of a revoked enclave are revoked immediately.  The
-    ledger also records that the keystore was restored, with a number that it never had: the seconds
-    since 1970.
+    certificate that the ledger lacked has the same key; so is each key that such a key vouched for
+    since then.  Certificates that the ledger lacks are recorded, so that they can be revoked; those
+    of a revoked enclave are revoked immediately.  The ledger also records that the keystore was
+    restored, with a number that it never had: the seconds since 1970.
 
     Raises:
         KeystoreError: as `revoke`.
@@ -199,6 +200,9 @@ def restore_revocations(
             is_known = entry.serial in reasons or int(entry.serial or "0", 16) in known
             if (entry.enclave, entry.key) in replaced_keys and not is_known:
                 reasons[entry.serial], issued[entry.serial] = SUPERSEDED, entry
+        for entry in _vouched_since(change, forgotten_lists, issued):
+            reasons[entry.serial], issued[entry.serial] = SUPERSEDED, entry
+            replaced_keys.add((entry.enclave, entry.key))
         _check_names(change, tuple(lost_revocations))
         revocations = []
         for name, reason in lost_revocations.items():
@@ -251,6 +255,34 @@ def _replaced_keys(
     kept = {(of.enclave, of.key) for serial, of in unknown.items() if serial not in reasons}
     replaced = {(of.enclave, of.key) for s, of in issued.items() if reasons[s] == SUPERSEDED}
     return {of for of in replaced - kept if of[1]}
+
+
+def _vouched_since(
+    change: KeystoreChange, forgotten_lists: LostRecords, issued: Mapping[str, Entry]
+) -> Iterator[Entry]:
+    """Yield the certificates of other keys that enclaves with ``issued`` certificates got since.
+
+    The keystore certified them after the date on which a lost list revoked an ``issued``
+    certificate, whose key vouched for the first of them (`sros_tool.keystore.delivery.collect`).
+    Left out are keys in the keystore, and those that were certified before the keystore was lost.
+    """
+    dates = {f"{e.serial:x}": iso(e.date) for crl in forgotten_lists.lists for e in crl.revoked}
+    since: dict[str, str] = {}
+    for serial in issued.keys() & dates.keys():
+        name = issued[serial].enclave
+        since[name] = min(dates[serial], since.get(name, dates[serial]))
+    shown = change.known.shown_after_restore(since)
+    others = {"", *(entry.key for entry in (*issued.values(), *shown))}
+    for name in since:
+        with suppress(SrosError):  # the enclave does not exist, or a file of it is broken
+            if has_key(change.keystore.folder(name)):
+                others.add(key_digest(change.keystore.certificate_of(name).public_key()))  # type: ignore[arg-type]
+    for entry in change.keystore.ledger_file.with_values("enclave", since).entries:
+        if entry.what == "certificate" and entry.enclave in since and entry.key not in others:
+            if entry.time > since[entry.enclave]:
+                yield entry
+            else:
+                others.add(entry.key)
 
 
 def _key_revoked_by_enclave(
