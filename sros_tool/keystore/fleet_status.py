@@ -323,7 +323,7 @@ class RobotStatus:
 
     @property
     def sharing_name(self) -> tuple[str, ...]:
-        """Enclaves elsewhere that the fleet does not record, but with the robot's name in the path,
+        """Enclaves that the fleet does not record, with the robot's name elsewhere in their path,
         such as ``/desk/r3``; ``sros revoke --robot`` does not revoke them, but names them.
         """
         return self.others.naming
@@ -1119,7 +1119,7 @@ class _KeystoreRecords:
         return None
 
     def revoked(self, robot: Robot) -> tuple[str, ...]:
-        """Return the revoked enclaves of a robot that are not in the keystore."""
+        """Return a robot's revoked enclaves that are no longer in the keystore."""
         if not self._revoked:
             return ()
         names = {name for name in enclaves_of(self._fleet, robot) if name in self._revoked}

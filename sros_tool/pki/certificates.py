@@ -797,7 +797,7 @@ class SigningRequest(NamedTuple):
 def make_request(key: PrivateKey, subject: str | x509.Name) -> bytes:
     """Return a PEM request, signed with ``key``, for a certificate with this subject.
 
-    A text is the common name, the only part of the subject.
+    If ``subject`` is text, the name has only this common name.
     """
     name = common_name(subject) if isinstance(subject, str) else subject
     builder = x509.CertificateSigningRequestBuilder().subject_name(name)

@@ -388,7 +388,7 @@ class EditedText:
 
 
 def _encoding(data: bytes, root: etree._Element) -> str:
-    """Return the encoding with which decoding a document keeps a byte order mark as a character."""
+    """Return the encoding for decoding a document so that a byte order mark stays a character."""
     declared = root.getroottree().docinfo.encoding or "utf-8"
     if data.startswith(codecs.BOM_UTF16_LE):
         return "utf-16-le"

@@ -526,7 +526,7 @@ class KeystoreChange:
         return [entry for entry in self.entries if entry.what == "certificate"]
 
     def _check_served(self) -> None:
-        """Note certificates of a CA service that expire earlier than requested.
+        """Add notes on certificates of a CA service that expire earlier than requested.
 
         Raises:
             KeystoreError: a serial number was used before, so that a revocation would revoke both

@@ -805,7 +805,7 @@ def write_enclaves(
 
 @dataclass(frozen=True, slots=True)
 class _EnclaveOutcome:
-    """The outcome for an enclave; ``superseded`` is its old certificate, if to be revoked."""
+    """The outcome for an enclave; ``superseded`` is its old certificate if that must be revoked."""
 
     outcome: str
     notes: tuple[Note, ...]
