@@ -385,7 +385,7 @@ def _os_problem(error: OSError) -> str:
             return "the working directory no longer exists. Change to another one."
         return f"the operating system refuses: {error.strerror or error}."
     path = os.fsdecode(error.filename)
-    return f"the operating system refuses '{path}': {error.strerror or error}. Nothing was changed."
+    return f"the operating system refuses '{path}': {error.strerror or error}."
 
 
 def _outdated_dependency() -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -21,6 +22,7 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 from cryptography.x509.oid import NameOID
 
 from sros_tool.errors import DocumentError, KeystoreError
+from sros_tool.folders import Folder
 from sros_tool.keystore import transaction
 from sros_tool.keystore.confirmation import (
     MAX_BYTES,
@@ -437,7 +439,18 @@ def test_a_certificate_that_proves_nothing(home: Home) -> None:
     assert home.of("r1").outcome == "kept"
 
 
-def test_a_revoked_robot_that_is_still_in_the_fleet(home: Home) -> None:
+def refuse_state_of_r2(folder: Folder, path: str) -> os.stat_result | None:
+    if path.startswith("r2"):
+        raise PermissionError(errno.EACCES, "Permission denied", path)
+    return state_of(folder, path)
+
+
+state_of = Folder.state
+
+
+def test_a_revoked_robot_that_is_still_in_the_fleet(
+    home: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its messages do not count, and fail no run; nor does what it said before."""
     home.send("r2")
     home.send("r3")
@@ -455,6 +468,10 @@ def test_a_revoked_robot_that_is_still_in_the_fleet(home: Home) -> None:
         assert "r2: revoked: all its enclaves were revoked; its message does not count" in ended.out
     shutil.rmtree(home.inbox / "r2")
     assert (home.of("r2").outcome, home.of("r2").why) == ("revoked", "")
+    with monkeypatch.context() as patched:
+        patched.setattr(Folder, "state", refuse_state_of_r2)  # as of a dead network mount
+        home.send("r3")
+        assert [robot.outcome for robot in home.collect().robots] == ["missing", "revoked", "kept"]
     found = json.loads(sros("fleet", "status", "ks", "--json", cwd=home.folder).out)
     assert found["robots"][1]["state"] == "revoked" and "r2" not in found["overdue"]
 
@@ -1028,6 +1045,7 @@ def test_what_was_renewed_is_published_at_once(home: Home) -> None:
     (home.folder / "file").touch()
     ended = sros("fleet", "collect", "ks", "inbox", "--publish", "file/pub", cwd=home.folder)
     assert ended.status == 2 and "1 unchanged" in ended.out
+    assert "Nothing was changed" not in ended.err, "a message may have been kept"
     assert "not published yet" in sros("fleet", "status", "ks", cwd=home.folder).out
 
 

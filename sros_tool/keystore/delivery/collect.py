@@ -381,7 +381,7 @@ def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_Rec
             except _RefusedError as refusal:
                 outcome = "revoked" if is_revoked else "refused"
                 taken = _ReceivedMessage(robot, outcome, _shortened(refusal.what))
-            if is_revoked and folder.state(robot.name) is not None:
+            if is_revoked and (file or taken.why):
                 taken.why = "all its enclaves were revoked; its message does not count"
             if file:
                 _add_signed_by_others(taken, file.data)
