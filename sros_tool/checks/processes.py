@@ -157,10 +157,14 @@ ROOT_IS_NOT_ENOUGH = (
 _NEW_AUTHORITY = Fault.CA_EXPIRED.remedy_in_export("").format(root="KEYSTORE")
 """Remedy for an expired CA, which can no longer renew anything."""
 _MOST_LEDGER = 64 * 1024 * 1024
+_MOST_LEDGERS = 2 * _MOST_LEDGER
+"""Highest number of bytes of the ledger of one process, and of those of all processes."""
 _LOADED_BY_ZENOH = (IDENTITY_CA_FILE, CERTIFICATE_FILE, KEY_FILE)
 
 
-def _file_findings(process: Process, *, now: datetime, zone: tzinfo) -> Iterator[Finding]:
+def _file_findings(
+    process: Process, ledgers: _Ledgers, *, now: datetime, zone: tzinfo
+) -> Iterator[Finding]:
     """Yield findings about the enclave files with which a process runs."""
     enclave = process.enclave
     if enclave is None:
@@ -173,7 +177,7 @@ def _file_findings(process: Process, *, now: datetime, zone: tzinfo) -> Iterator
     newer = list(newer_files(process, enclave))
     # If the order is unknown, the process most likely loaded the newer files.
     changed = () if order_unknown(process) else newer
-    loaded = _loaded_files(enclave, changed, process.started)
+    loaded = _loaded_files(enclave, changed, process.started, ledgers)
     if revoked := loaded.revoked:
         yield PROCESS_REVOKED.found(process.label, f"the certificate of {name} was {revoked}")
     elif not enclave.is_there or len(enclave.lacking) == len(_required_files(enclave)):
@@ -283,13 +287,13 @@ class _Loaded:
 
 
 def _loaded_files(
-    enclave: ProcessEnclave, newer_files: Sequence[str], started: datetime
+    enclave: ProcessEnclave, newer_files: Sequence[str], started: datetime, ledgers: _Ledgers
 ) -> _Loaded:
     """Return the files that a process loaded; files that changed since are in the ledger."""
     windows: dict[str, Window] = {}
     changed = {file.split()[0] for file in newer_files}
     certificate = next(iter(_certificates_in(enclave, CERTIFICATE_FILE)), None)
-    entries, unknown = _entries(enclave)
+    entries, unknown = ledgers.entries(enclave)
     before = [entry for entry in entries if entry.time <= iso(started)]
     serial = 0
     if certificate and CERTIFICATE_FILE not in changed:
@@ -350,22 +354,34 @@ def _revocation_clause(enclave: ProcessEnclave, entries: Sequence[Entry], serial
     return ""
 
 
-def _entries(enclave: ProcessEnclave) -> tuple[Sequence[Entry], str]:
-    """Return an enclave's ledger entries, and a clause that says why they cannot be read, or ""."""
-    if enclave.here is None:
-        return (), "its keystore is not at this path here"
-    ledger = enclave.here / LEDGER
-    try:
-        size = ledger.stat().st_size
-    except OSError:
-        return (), "its keystore has no ledger"
-    if size > _MOST_LEDGER:
-        return (), f"the ledger of its keystore has more than {_MOST_LEDGER // 1024**2} MiB"
-    try:
-        entries = OpenedKeystore(enclave.here).ledger_with("enclave", enclave.name).entries
-    except SrosError as error:
-        return (), f"the ledger of its keystore cannot be read: {error.what}"
-    return [entry for entry in entries if entry.enclave == enclave.name], ""
+class _Ledgers:
+    """The ledgers of the keystores that processes name, as far as they are read.
+
+    Any user can start processes that name a ledger of his own, so all of them together are bounded.
+    """
+
+    def __init__(self) -> None:
+        self._left = _MOST_LEDGERS
+
+    def entries(self, enclave: ProcessEnclave) -> tuple[Sequence[Entry], str]:
+        """Return an enclave's entries, and a clause that says why they cannot be read, or ""."""
+        if enclave.here is None:
+            return (), "its keystore is not at this path here"
+        try:
+            size = (enclave.here / LEDGER).stat().st_size
+        except OSError:
+            return (), "its keystore has no ledger"
+        if size > _MOST_LEDGER:
+            return (), f"the ledger of its keystore has more than {_MOST_LEDGER // 1024**2} MiB"
+        if size > self._left:
+            most = _MOST_LEDGERS // 1024**2
+            return (), f"the ledgers that processes name have more than {most} MiB together"
+        self._left -= size
+        try:
+            entries = OpenedKeystore(enclave.here).ledger_with("enclave", enclave.name).entries
+        except SrosError as error:
+            return (), f"the ledger of its keystore cannot be read: {error.what}"
+        return [entry for entry in entries if entry.enclave == enclave.name], ""
 
 
 def _certificates_in(enclave: ProcessEnclave, file: str) -> tuple[x509.Certificate, ...]:
@@ -643,6 +659,7 @@ def process_findings(
     closed = {_network_and_domain(node) for node in nodes if node.asks_for_security}
     closed |= {own_domain} if is_secured_here else set()
     open_nodes: list[Process] = []
+    ledgers = _Ledgers()
     for process in running.processes:
         if process.is_daemon:
             # Each domain has its own daemon; commands ask the daemon of their domain.
@@ -651,7 +668,7 @@ def process_findings(
             continue
         yield from zenoh_findings(process)
         if process.asks_for_security:
-            yield from _file_findings(process, now=now, zone=zone)
+            yield from _file_findings(process, ledgers, now=now, zone=zone)
             yield from _unsecured_findings(process)
         elif security[process.pid] is Security.OPEN:
             if _network_and_domain(process) in closed:

@@ -14,7 +14,7 @@ from zoneinfo import ZoneInfo
 
 import pytest
 
-from sros_tool.checks import runtime
+from sros_tool.checks import processes, runtime
 from sros_tool.checks.environment import secured_by
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingFilter
 from sros_tool.checks.processes import may_lack_list
@@ -268,6 +268,21 @@ def test_a_process_of_a_revoked_enclave_whose_files_are_gone(bench: Bench) -> No
     state = sound_state(bench)
     sros("revoke", bench.root, "/base", env={"SROS_CA_PASSPHRASE": SECRET}).ok()
     assert "runtime.process-revoked" in ids(state)
+
+
+def test_the_ledgers_of_all_processes_together_are_bounded(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Any user can start a thousand processes that name a large ledger of his own."""
+    enclave = ProcessEnclave(str(bench.root), "/base", here=bench.root)
+    size = (bench.root / "ledger.jsonl").stat().st_size
+    monkeypatch.setattr(processes, "_MOST_LEDGERS", 2 * size + 1)
+    ledgers = processes._Ledgers()
+    for _ in range(2):
+        entries, unknown = ledgers.entries(enclave)
+        assert entries and not unknown
+    entries, unknown = ledgers.entries(enclave)
+    assert not entries and "the ledgers that processes name have more than" in unknown
 
 
 @pytest.mark.parametrize(
