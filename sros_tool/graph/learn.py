@@ -45,6 +45,7 @@ from sros_tool.names import (
     expand,
     expression_problem,
     is_expression,
+    node_name_problem,
 )
 from sros_tool.policy.document import IncludedFile, Includer, read_policy
 from sros_tool.policy.merge import (
@@ -259,7 +260,7 @@ def _is_place(ns: str, name: str) -> bool:
         plain = check_namespace(ns) == ns and not is_expression(ns)
     except InvalidNameError:
         return False
-    return plain and name.replace("_", "a").isalnum() and name.isascii() and not name[0].isdigit()
+    return plain and not node_name_problem(name) and not is_expression(name)
 
 
 class Folded(NamedTuple):

@@ -191,7 +191,7 @@ def test_silent_nodes_and_strays_are_said() -> None:
 
 
 @pytest.mark.parametrize(
-    "topic", ["rt/*", "rt/a/*", "rt/?", "rt/[ab]", "rt/a b", "rt//x", "rt/<x>"]
+    "topic", ["rt/*", "rt/a/*", "rt/?", "rt/[ab]", "rt/a b", "rt//x", "rt/<x>", f"rt/{'x' * 2000}"]
 )
 def test_a_topic_named_like_a_wildcard_never_becomes_one(topic: str) -> None:
     endpoint = Endpoint(topic, "publish")
@@ -205,6 +205,9 @@ def test_a_topic_named_like_a_wildcard_never_becomes_one(topic: str) -> None:
     [
         ("/robot", "/", "*"),
         ("/robot", "/", 'n"/>'),
+        ("/robot", "/", "x" * 256),
+        ("/robot", "/", "~"),
+        ("/robot", "/" + "x" * 245, "n"),
         ("/robot", "/*", "n"),
         ("/robot", "relative", "n"),
         ("/robot/../x", "/", "n"),
