@@ -52,6 +52,7 @@ from sros_tool.keystore.layout import CRL, ca_key
 from sros_tool.keystore.layout import ROLES as ROLES_OF_CAS
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
+from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.crl import load_crl
@@ -1175,14 +1176,18 @@ def test_a_key_that_was_replaced_after_a_rotation_is_not_certified_again(
     """The new certificate is from a CA that the keystore has lost, as is what that CA revoked."""
 
     def rotate() -> None:
-        publisher.run("rotate_ca", "ks", "--identity", "--finish", "--allow-unconfirmed")
+        options = {"finish": True, "allow_unconfirmed": True, "now": publisher.now}
+        rotate_ca(publisher.root, roles=["identity"], **options)
+
+    def replace() -> None:
+        options = {"new_key": is_replaced, "revoke_old": is_replaced, "now": publisher.now}
+        renew(publisher.root, ["/r2/base"], **options)
 
     publisher.publish()
     backup = copy_of(publisher.root, publisher.folder / "backup")
     rotate()
     publisher.publish()
-    replace = ("--new-key", "--revoke-old") if is_replaced else ()
-    publisher.run("renew", "ks", "/r2/base", *replace)
+    replace()
     publisher.publish()
     shutil.rmtree(publisher.root)
     backup.rename(publisher.root)
@@ -1191,7 +1196,7 @@ def test_a_key_that_was_replaced_after_a_rotation_is_not_certified_again(
         for _ in range(2):
             with pytest.raises(KeystoreError, match="after the backup, /r2/base got another key"):
                 publisher.publish(restored=True)
-        publisher.run("renew", "ks", "/r2/base", *replace)
+        replace()
     assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
 
 
