@@ -412,8 +412,8 @@ class RobotStatus:
 
 
 @shows(
-    *("folder", "expires", "root_expires", "accepted", "lacks"),
-    null_if_empty=("folder", "lacks"),
+    *("folder", "expires", "root_expires", "accepted", "lacks", "refused"),
+    null_if_empty=("folder", "lacks", "refused"),
 )
 @dataclass(frozen=True, slots=True)
 class PublishedMetadata:
@@ -436,6 +436,10 @@ class PublishedMetadata:
     """Path of a published file that is missing in ``folder``, such as metadata or a robot's
     archive.  Null if nothing is missing, or if the folder is not on this machine.
     """
+    refused: str = ""
+    """Why robots refuse the metadata in ``folder`` whatever the time, as a clause: for example, its
+    signature is wrong.  Null if it can be verified, or if the folder is not on this machine.
+    """
 
     @property
     def is_in_order(self) -> bool:
@@ -444,7 +448,8 @@ class PublishedMetadata:
 
     def at(self, now: datetime) -> PublishedMetadata:
         """Return this publication as robots see it at the time ``now``."""
-        return replace(self, accepted=now < self.expires if self.expires else None)
+        accepted = now < self.expires if self.expires else None
+        return replace(self, accepted=False if self.refused else accepted)
 
 
 @shows(
@@ -871,6 +876,9 @@ class _KeystoreRecords:
         self._root = keystore.root
         self.has_list = keystore.has(CRL)
         """Whether the keystore has a revocation list."""
+        # Most keystores publish nothing.
+        from sros_tool.keystore.delivery.publish import metadata_problem
+
         published = read_published(keystore)
         self._published = published.robots
         self.published = {name: robot.release.number for name, robot in published.robots.items()}
@@ -881,6 +889,7 @@ class _KeystoreRecords:
                 published.until,
                 published.root_until,
                 lacks=published.first_missing(),
+                refused=metadata_problem(keystore),
             )
             if published.robots
             else None

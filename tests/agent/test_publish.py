@@ -24,6 +24,7 @@ from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.folders import Folder
 from sros_tool.keystore import transaction
 from sros_tool.keystore.delivery import publish as publishing
+from sros_tool.keystore.delivery import published
 from sros_tool.keystore.delivery.export import ReleasedEnclave
 from sros_tool.keystore.delivery.export import released_enclave as evaluate
 from sros_tool.keystore.delivery.publish import publish
@@ -845,6 +846,32 @@ def test_a_thief_with_all_keys_who_counts_versions_up(publisher: Home, version: 
     assert snapshot(publisher.root) == before
     shutil.rmtree(publisher.pub)
     publisher.publish(new_folder=True)
+
+
+def test_a_forged_timestamp_is_refused_without_unpacking_everything(
+    publisher: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever runs the web server can write archives that unpack to much more."""
+    publisher.publish()
+    publication = fleet_status(OpenedKeystore(publisher.root)).publication
+    assert publication and not publication.refused
+    timestamp = publisher.pub / "metadata/timestamp.json"
+    forged = json.loads(timestamp.read_bytes())
+    forged["signed"]["version"] += 1
+    timestamp.write_text(json.dumps(forged))
+    for number in range(2):
+        archive = gzip.compress(bytes(2**20))
+        (publisher.pub / f"targets/robots/{number:064x}.r1.tar.gz").write_bytes(archive)
+    read: list[bytes] = []
+    monkeypatch.setattr(published, "_MEAN_SIZE", 1024)
+    monkeypatch.setattr(published, "read_release", read.append)
+    publication = fleet_status(OpenedKeystore(publisher.root)).publication
+    assert publication and "metadata that this keystore did not write" in publication.refused
+    assert not publication.at(publisher.now).is_in_order and not read
+    ended = sros("fleet", "status", "ks", cwd=publisher.folder)
+    assert "robots refuse what was published" in ended.out and ended.status == 1
+    with pytest.raises(KeystoreError, match="more than 0 MiB, unpacked, of archives"):
+        publisher.publish()
 
 
 def test_a_publishing_folder_that_was_lost(publisher: Home) -> None:

@@ -19,8 +19,14 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from cryptography.x509.oid import NameOID
 
 from sros_tool.checks.keystores.arrival import verify_arrival
-from sros_tool.errors import KeystoreError, PkiError, PolicyError, SrosError
-from sros_tool.keystore.delivery.archive import MAX_MEMBER, MAX_UNPACKED, pack, unpack
+from sros_tool.errors import DocumentError, KeystoreError, PkiError, PolicyError, SrosError
+from sros_tool.keystore.delivery.archive import (
+    MAX_MEMBER,
+    MAX_UNPACKED,
+    ArchiveLimits,
+    pack,
+    unpack,
+)
 from sros_tool.keystore.delivery.robot import create_request, import_answer
 from sros_tool.keystore.delivery.signing import SignedRequests, certify_requests, sign_request
 from sros_tool.keystore.describe import history
@@ -621,6 +627,12 @@ def changed(files: Files, file: str, old: bytes, new: bytes) -> bytes:
 
 def without(files: Files, path: str) -> bytes:
     return rebuilt({name: data for name, data in files.items() if name != path})
+
+
+def test_no_more_is_unpacked_than_an_archive_states() -> None:
+    archive = gzip.compress(bytes(2000))[:-4] + bytes(4)
+    with pytest.raises(DocumentError, match="damaged"):
+        unpack(archive, ArchiveLimits(packed=1000, unpacked=1000, members=1))
 
 
 def sparse(files: Files) -> bytes:

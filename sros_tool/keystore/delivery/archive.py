@@ -102,11 +102,19 @@ def unpack(data: bytes, limits: ArchiveLimits = _OF_ONE_ENCLAVE) -> dict[str, by
         raise DocumentError("it is not a .tar.gz archive, or it is damaged") from error
 
 
+def stated_size(data: bytes) -> int:
+    """Return the size in bytes that a ``.gz`` file states for its content; `unpack` reads no more.
+
+    RFC 1952, 2.3.1: ISIZE, at the end of the file.
+    """
+    return int.from_bytes(data[-4:], "little")
+
+
 def _unzip(data: bytes, limits: ArchiveLimits) -> bytes:
     if len(data) > limits.packed:
         raise DocumentError(f"it is too large: more than {limits.packed // 1024**2} MiB")
     stream = zlib.decompressobj(_GZIP)
-    plain = stream.decompress(data, limits.unpacked + 1)
+    plain = stream.decompress(data, min(limits.unpacked, stated_size(data)) + 1)
     if len(plain) > limits.unpacked:
         raise DocumentError(f"it unpacks to more than {limits.unpacked // 1024**2} MiB")
     if not stream.eof:

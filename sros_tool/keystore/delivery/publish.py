@@ -29,7 +29,7 @@ from sros_tool.files import remove_file, staged_file
 from sros_tool.fleet.robots import Fleet
 from sros_tool.folders import Folder, make_folders, remove_folders
 from sros_tool.keystore.confirmation import OF_SAME_NUMBER, last_confirmation
-from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT, listed_digests
+from sros_tool.keystore.delivery.archive import listed_digests
 from sros_tool.keystore.delivery.export import released_enclave, released_files
 from sros_tool.keystore.delivery.published import (
     BEGIN_AGAIN,
@@ -41,6 +41,7 @@ from sros_tool.keystore.delivery.published import (
     damaged_list_error,
     may_have_later_releases,
     read_published,
+    releases_in,
 )
 from sros_tool.keystore.delivery.release import (
     RELEASE_FILES,
@@ -278,7 +279,8 @@ def _later_in_folder(keystore: OpenedKeystore) -> str:
     keys signed counts.
     """
     with suppress(SrosError, ValueError, OSError, KeyError, TypeError):
-        if may_have_later_releases(keystore):
+        # Archives are read only where the keystore signed the metadata: anybody can write many.
+        if may_have_later_releases(keystore) and not metadata_problem(keystore):
             check_tuf()
             folder, never = Path(read_published(keystore).folder), datetime.min.replace(tzinfo=UTC)
             run = _Publication(keystore, folder, never, MetadataExpiry(), dry_run=True)
@@ -287,6 +289,43 @@ def _later_in_folder(keystore: OpenedKeystore) -> str:
             except KeystoreError as error:
                 return error.what
     return ""
+
+
+def metadata_problem(keystore: OpenedKeystore) -> str:
+    """Return why robots refuse the metadata in the publishing folder, as a clause, or "".
+
+    The result is also "" if this cannot be determined here: the folder or the package ``tuf`` is
+    missing.  Expiry is not considered.
+
+    Raises:
+        DocumentError: the list of what is published is damaged.
+    """
+    known = read_published(keystore)
+    if not known.folder or not keystore.has(FLEET_ROOT):
+        return ""
+    folder = Path(known.folder)
+    try:
+        from sros_tool.keystore.delivery.repository import read_present
+
+        roots = _roots(keystore)
+        roots.follow(folder)
+        version = read_present(folder, roots).versions().get("timestamp")
+    except ImportError:
+        return ""
+    except KeystoreError as error:
+        return error.what
+    last = known.versions.get("timestamp", 0)
+    return f"'{folder}' has an older copy of the metadata" if version and version < last else ""
+
+
+def _roots(keystore: OpenedKeystore) -> Roots:
+    """Return the root metadata in the keystore."""
+    from sros_tool.keystore.delivery.repository import Roots
+
+    documents = ()
+    if keystore.has(FLEET_ROOT):
+        documents = parse_json(keystore.read(FLEET_ROOT, "root metadata"))["roots"]
+    return Roots(documents)
 
 
 def age_clause(keystore: OpenedKeystore) -> str:
@@ -603,15 +642,12 @@ class _Publication:
         dry_run: bool,
     ) -> None:
         """Read what was published before, and what is in the folder now."""
-        from sros_tool.keystore.delivery.repository import Roots, read_present
+        from sros_tool.keystore.delivery.repository import read_present
 
         self.keystore = keystore
         self.expiry = expiry
         self.list = read_published(keystore)
-        documents = ()
-        if keystore.has(FLEET_ROOT):
-            documents = parse_json(keystore.read(FLEET_ROOT, "root metadata"))["roots"]
-        self.roots = Roots(documents)
+        self.roots = _roots(keystore)
         own = len(self.roots.versions)
         self._published_before = bool(own)
         self.roots.follow(folder)
@@ -1098,11 +1134,7 @@ class _Publication:
 
     def _releases(self) -> Iterator[Release]:
         """Yield the releases in all archives, by any CA."""
-        for path in self._paths():
-            if path.startswith(f"{_ARCHIVES}/"):
-                with suppress(SrosError):
-                    data = read_bytes(self._folder / path, "archive", max_bytes=OF_ONE_ROBOT.packed)
-                    yield read_release(data)
+        return releases_in(self._folder, len(recorded_fleet(self.keystore).robots))
 
     # ── which robots ───────────────────────────────────────────────────────────────────────
 

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
-from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT
-from sros_tool.keystore.delivery.release import read_release, release_target
+from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT, stated_size
+from sros_tool.keystore.delivery.release import Release, read_release, release_target
 from sros_tool.keystore.layout import IDENTITY, LIST_FILES, PUBLISHED
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.crl import load_crls, signed_by
@@ -34,6 +34,8 @@ _ARCHIVES_OF_FLEET, _ARCHIVES_OF_ROBOT = 500, 50
 
 Replaced archives are kept for two days.
 """
+_MEAN_SIZE = 512 * 1024
+"""Maximum mean size of these archives in bytes, unpacked."""
 MOST_NUMBER = 10**12 - 1
 """Highest number of a release that a seal can have, and highest version of metadata."""
 BEGIN_AGAIN = "Start again as after a theft of all keys: docs/fetching.md says how."
@@ -206,33 +208,53 @@ def later_revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
     """Return the serial numbers that the keystore's lists in later releases revoke.
 
     Raises:
-        KeystoreError: the folder has more archives than the fleet can need.  Without this limit,
-            whoever runs the web server could keep the keystore busy forever.
+        KeystoreError: as `releases_in`.
     """
     serials: set[int] = set()
     read_lists: set[bytes] = set()
     if may_have_later_releases(keystore):
         authorities, published = keystore.authority(IDENTITY), read_published(keystore)
-        most = _ARCHIVES_OF_FLEET + _ARCHIVES_OF_ROBOT * len(published.robots)
-        folder = Path(published.folder) / "targets/robots"
-        archives = [*islice(folder.glob("*.tar.gz"), most + 1)]
-        if len(archives) > most:
-            raise KeystoreError(
-                f"'{folder}' has more than {most} archives",
-                "The keystore did not publish so many. It has to read them, because the metadata "
-                "there is later than what it published last.",
-                "Find out who else can write there, and remove what is not from a keystore.",
-            )
-        for path in archives:
-            with suppress(SrosError, OSError):
-                release = read_release(read_bytes(path, "archive", max_bytes=OF_ONE_ROBOT.packed))
-                lists = {data for file, data in release.files.items() if file.endswith(LIST_FILES)}
-                for data in lists - read_lists:
-                    read_lists.add(data)
-                    for crl in load_crls(data, f"'{path}'"):
+        for release in releases_in(Path(published.folder), len(published.robots)):
+            lists = {data for file, data in release.files.items() if file.endswith(LIST_FILES)}
+            for data in lists - read_lists:
+                read_lists.add(data)
+                with suppress(SrosError):
+                    for crl in load_crls(data, f"of {release.robot}"):
                         if any(signed_by(crl.list, authority) for authority in authorities):
                             serials.update(entry.serial for entry in crl.revoked)
     return frozenset(serials)
+
+
+def releases_in(folder: Path, robots: int) -> Iterator[Release]:
+    """Yield the releases in all archives of a publishing folder, by any CA.
+
+    Archives that cannot be read are left out.  ``robots`` is the number of robots of the fleet.
+
+    Raises:
+        KeystoreError: the folder has more archives, or larger ones, than the fleet can need.
+            Without these limits, whoever runs the web server could keep the keystore busy forever.
+    """
+    most = _ARCHIVES_OF_FLEET + _ARCHIVES_OF_ROBOT * robots
+    archives = [*islice((folder / "targets/robots").glob("*.tar.gz"), most + 1)]
+    excess, size = f"more than {most}" if len(archives) > most else "", 0
+    for path in () if excess else archives:
+        try:
+            data = read_bytes(path, "archive", max_bytes=OF_ONE_ROBOT.packed)
+        except (SrosError, OSError):
+            continue
+        size += max(len(data), min(stated_size(data), OF_ONE_ROBOT.unpacked))
+        if size > most * _MEAN_SIZE:
+            excess = f"more than {most * _MEAN_SIZE // 1024**2} MiB, unpacked, of"
+            break
+        with suppress(SrosError):
+            yield read_release(data)
+    if excess:
+        raise KeystoreError(
+            f"'{folder / 'targets/robots'}' has {excess} archives",
+            "The keystore did not publish so many. It has to read them, because it does not know "
+            "the metadata there.",
+            "Find out who else can write there, and remove what is not from a keystore.",
+        )
 
 
 def damaged_list_error(keystore: OpenedKeystore, why: str = "") -> DocumentError:
