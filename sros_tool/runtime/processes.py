@@ -22,10 +22,11 @@ import re
 import stat
 import struct
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
+from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -307,7 +308,8 @@ class ProcessTable:
 
         ``now`` is the time on the clock of this machine.
         """
-        uptime = timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME))
+        begin = now - timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME))
+        longest_advance = cache(partial(self._longest_clock_advance, begin))
         self._reader.begin()
         before, self._looked = self._looked, {}
         processes: list[Process] = []
@@ -318,7 +320,7 @@ class ProcessTable:
                 continue
             try:
                 with self._opened(pid) as folder:
-                    looked = self._look(pid, folder, before.get(pid), now, uptime)
+                    looked = self._look(pid, folder, before.get(pid), begin, longest_advance)
                     if looked is None:
                         continue
                     self._looked[pid] = looked
@@ -353,13 +355,13 @@ class ProcessTable:
         pid: int,
         folder: int,
         before: _ProcessData | None,
-        now: datetime,
-        uptime: timedelta,
+        begin: datetime,
+        longest_advance: Callable[[], timedelta],
     ) -> _ProcessData | None:
         """Return the data of a process; None if it has ended or runs no program.
 
-        The kernel counts the start times of processes from when the machine started: ``uptime``
-        ago.
+        ``begin`` is when the machine started, from which the kernel counts the start times of
+        processes; ``longest_advance`` returns how far the clock was set forward since.
         """
         for _ in range(_MOST_TRIES):
             stat = _stat(folder)
@@ -370,10 +372,10 @@ class ProcessTable:
             command: tuple[str, ...] = ()
             try:
                 command = tuple(_words(folder, "cmdline"))
-                started = now - uptime + timedelta(seconds=stat.ticks / self._ticks) + _LOADING
+                started = begin + timedelta(seconds=stat.ticks / self._ticks) + _LOADING
                 advanced = _clock_advanced(folder, started)
                 if advanced:
-                    advanced = max(advanced, *self._clock_advances(now - uptime))
+                    advanced = max(advanced, longest_advance())
                     started -= advanced + _FIRST_LOOK
                 if before and before.process and before.stat.identity == stat.identity:
                     # Kept from the last look, because the clock may have been set since.
@@ -390,17 +392,18 @@ class ProcessTable:
         why = "it keeps starting other programs"
         return _ProcessData(stat, None, UnseenProcess(pid, command, why, _may_speak(command)))
 
-    def _clock_advances(self, begin: datetime) -> Iterator[timedelta]:
-        """Yield how far the clock was set forward since each process started, as /proc shows.
+    def _longest_clock_advance(self, begin: datetime) -> timedelta:
+        """Return how far the clock was set forward since a process started, as /proc shows at most.
 
         ``begin`` is when the machine started, by the present clock.  The later somebody first
-        looked at a process, the smaller is the result.
+        looked at a process, the less it shows.
         """
-        yield timedelta()
+        longest = timedelta()
         for pid in filter(str.isdigit, os.listdir(self._proc)):
             with suppress(OSError), self._opened(int(pid)) as folder:
-                ticks = _stat(folder).ticks
-                yield _clock_advanced(folder, begin + timedelta(seconds=ticks / self._ticks))
+                started = begin + timedelta(seconds=_stat(folder).ticks / self._ticks)
+                longest = max(longest, _clock_advanced(folder, started))
+        return longest
 
     def _with_files(self, process: Process, folder: int) -> Process:
         """Return the process with the state of its files, resolved as the process sees them."""

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -276,6 +277,20 @@ def test_a_clock_that_was_set_forward_makes_no_process_newer_than_it_is(proc: Pr
     (process,) = ProcessTable(proc.path).look(later).processes
     assert timedelta(minutes=64) < process.clock_advanced < timedelta(minutes=66)
     assert first_look - timedelta(minutes=7) < process.started < first_look - timedelta(minutes=5)
+
+
+def test_a_look_asks_once_how_far_the_clock_was_set(
+    proc: Proc, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a robot without a battery for its clock, all processes are older than the clock shows."""
+    clock_advanced = Mock(wraps=processes._clock_advanced)
+    monkeypatch.setattr(processes, "_clock_advanced", clock_advanced)
+    for pid in range(2, 12):
+        proc.add(pid, *ROS, start="0")
+    boot = datetime.now(UTC) + timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME))
+    found = ProcessTable(proc.path).look(boot + timedelta(hours=1)).processes
+    assert len(found) == 10 and all(process.clock_advanced for process in found)
+    assert clock_advanced.call_count == 2 * len(found)
 
 
 @pytest.mark.parametrize(
