@@ -9,8 +9,10 @@ from __future__ import annotations
 import os
 import shlex
 import stat
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -158,18 +160,19 @@ def _remember_later_processes(robot: LocalRobot) -> None:
 def _with_renamed_enclaves(robot: LocalRobot, observed: ObservedProcesses) -> ObservedProcesses:
     """Return observed processes in the enclaves to which the policy moved all of their nodes.
 
-    A process keeps its enclave if the policy still has it, or if the other enclave has a process.
+    A process keeps its enclave if the policy still has it, or if the other enclave has a process or
+    gets nodes of several enclaves.
     """
     nodes, moved = ObservedNodes(robot), dict[str, set[str]]()
     if robot.observation_file.exists():
         for old, new in zip(nodes.as_observed, nodes.in_their_enclaves(), strict=True):
             moved.setdefault(old.enclaves[0], set()).add(new.enclaves[0])
+    origins = Counter(chain.from_iterable(moved.values()))
     taken = {process.enclave for process in observed.processes}
     renamed = []
     for process in observed.processes:
-        enclaves = moved.get(process.enclave, set()) - taken
-        if len(enclaves) == len(moved.get(process.enclave, ())) == 1 and not process.shares:
-            (name,) = enclaves
+        name, *others = moved.get(process.enclave, {process.enclave})
+        if not others and origins[name] == 1 and name not in taken and not process.shares:
             robot.shell.say(f"{name} was {process.enclave} before the policy moved its nodes")
             process = process._replace(enclave=name)
         renamed.append(process)

@@ -1554,6 +1554,27 @@ def test_an_enclave_that_gets_another_name_keeps_its_process(robot: Robot) -> No
     )
 
 
+def test_only_a_process_alone_follows_its_nodes_into_a_new_enclave(tmp_path: Path) -> None:
+    """Otherwise, processes of one enclave would count as several with the same node name."""
+    nodes = [{"enclaves": [f"/{name}"], "namespace": "/", "name": name} for name in "abc"]
+    ends: dict[str, Any] = {"publish": [], "subscribe": []}
+    observed_nodes = [{**node, "participant": node["name"], **ends} for node in nodes]
+    profiles = [f'<profile ns="/" node="{name}"/>' for name in "abc"]
+    enclaves = {"both": profiles[:2], "new": profiles[2:]}
+    stated = (
+        f'<enclave path="/{name}"><profiles>{"".join(of)}</profiles></enclave>'
+        for name, of in enclaves.items()
+    )
+    policy = f'<policy version="0.2.0"><enclaves>{"".join(stated)}</enclaves></policy>'
+    (tmp_path / "policy.xml").write_text(policy)
+    robot = LocalRobot(tmp_path, 0, Shell(close._run, print, {}, lambda: datetime.now(UTC), UTC))
+    robot.observation_file.write_text(json.dumps({"nodes": observed_nodes}))
+    start = ClosedProcess("", 7, ("run",), "/opt", 0, "", "process id")
+    observed = ObservedProcesses(0, [start._replace(enclave=f"/{name}") for name in "abc"])
+    renamed = preparation._with_renamed_enclaves(robot, observed)
+    assert [process.enclave for process in renamed.processes] == ["/a", "/b", "/new"]
+
+
 def test_the_nodes_of_a_process_that_has_several(tmp_path: Path) -> None:
     profiles = "".join(f'<profile ns="/p" node="{name}"/>' for name in ("tracker", "detector"))
     file = tmp_path / "policy.xml"
