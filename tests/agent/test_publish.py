@@ -7,6 +7,7 @@ import gzip
 import hashlib
 import json
 import os
+import re
 import shutil
 import stat
 import tarfile
@@ -47,15 +48,20 @@ from sros_tool.keystore.delivery.repository import (
     new_key,
     read_present,
 )
+from sros_tool.keystore.delivery.robot import create_request
+from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.keyring import Keyring
+from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import CRL, ca_key
 from sros_tool.keystore.layout import ROLES as ROLES_OF_CAS
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.pki.certificates import key_digest, load_request
 from sros_tool.pki.crl import load_crl
 from sros_tool.validity import iso
 from tests.agent.published import DAY, LATER, ROLES, Home, Thief
@@ -1225,6 +1231,30 @@ def test_a_key_that_was_replaced_after_a_rotation_is_not_certified_again(
                 publisher.publish(restored=True)
         replace()
     assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
+
+
+def test_a_later_key_of_a_robot_is_certified_again_as_publishing_advises(publisher: Home) -> None:
+    """Publishing records the certificate of this key, so that `revoke` would revoke the key."""
+    root, name = publisher.root, "/r2/base"
+    files = [create_request(publisher.folder / each, name).file for each in ("first", "second")]
+    first, second = (file.read_bytes() for file in files)
+    revoke(root, [name], now=publisher.now)
+    sign_request(root, first, only_enclaves=[name], now=publisher.now)
+    publisher.publish()
+    backup = copy_of(root, publisher.folder / "backup")
+    sign_request(root, second, renew=True, now=publisher.now)
+    publisher.publish()
+    shutil.rmtree(root)
+    backup.rename(root)
+    with pytest.raises(KeystoreError, match=f"{name} got another key") as said:
+        publisher.publish(restored=True)
+    _, *commands = re.findall(r"`sros ([^`]+)`", said.value.remedy)
+    for command in commands:
+        publisher.run(*command.replace("REQUEST", str(files[1])).split())
+    assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
+    known = KnownKeys(OpenedKeystore(root))
+    keys = (key_digest(load_request(each, "it").public_key) for each in (first, second))
+    assert [known.is_revoked(key) for key in keys] == [True, False]
 
 
 @pytest.mark.parametrize("steps", [(0, 1), (1, 3)])

@@ -1012,16 +1012,17 @@ class _Publication:
             if self._has_earlier_key(name, files.get(CERTIFICATE_FILE, b""))
         )
         if replaced:
-            names = " ".join(map(quote, replaced))
+            root, names = quote(str(self.keystore.root)), " ".join(map(quote, replaced))
             raise KeystoreError(
                 f"'{self._folder}' cannot be published yet: after the backup, "
                 f"{first_few(replaced, _MOST_NAMES)} got another key, and the keystore has only "
                 "the earlier one",
                 "Whoever has the earlier key could be trusted again.",
                 "Give these enclaves new keys: "
-                f"`sros renew {quote(str(self.keystore.root))} {names} --new-key --revoke-old`; "
-                "for keys that were made on the robot, `sros revoke` the enclaves, and sign the "
-                "requests again. Then repeat this command, with --restored.",
+                f"`sros renew {root} {names} --new-key --revoke-old`. For keys that were made on "
+                f"the robot, sign each request again, with `sros sign_request {root} REQUEST "
+                f"--no-answer --renew`, and then run `sros renew {root} {names} --revoke-old`. "
+                "Then repeat this command, with --restored.",
             )
 
     def _has_earlier_key(self, name: str, sent: bytes) -> bool:
