@@ -1209,12 +1209,22 @@ def test_a_key_that_was_replaced_after_a_rotation_is_not_certified_again(
     """The new certificate is from a CA that the keystore has lost, as is what that CA revoked."""
 
     def rotate() -> None:
-        options = {"finish": True, "allow_unconfirmed": True, "now": publisher.now}
-        rotate_ca(publisher.root, roles=["identity"], **options)
+        rotate_ca(
+            publisher.root,
+            roles=["identity"],
+            finish=True,
+            allow_unconfirmed=True,
+            now=publisher.now,
+        )
 
     def replace() -> None:
-        options = {"new_key": is_replaced, "revoke_old": is_replaced, "now": publisher.now}
-        renew(publisher.root, ["/r2/base"], **options)
+        renew(
+            publisher.root,
+            ["/r2/base"],
+            new_key=is_replaced,
+            revoke_old=is_replaced,
+            now=publisher.now,
+        )
 
     publisher.publish()
     backup = copy_of(publisher.root, publisher.folder / "backup")
