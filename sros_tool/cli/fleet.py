@@ -813,7 +813,7 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         yield f"'{folder}' lacks {publication.lacks}, which robots fetch: `{publish}`{decide}"
     elif publication and publication.refused:
         why = publication.refused
-        yield f"robots refuse what was published: {why}. `{publish}` says what to do"
+        yield f"what was published does not verify: {why}. `{publish}` says what to do"
     elif publication and publication.accepted is False and publication.expires:
         ago = elapsed(compared_fleet.at - publication.expires)
         yield f"what was published expired {ago} ago, so robots get no new files: `{publish}`"

@@ -437,8 +437,8 @@ class PublishedMetadata:
     archive.  Null if nothing is missing, or if the folder is not on this machine.
     """
     refused: str = ""
-    """Why robots refuse the metadata in ``folder`` whatever the time, as a clause: for example, its
-    signature is wrong.  Null if it can be verified, or if the folder is not on this machine.
+    """Why the metadata in ``folder`` does not verify, so that robots refuse it, as a clause.  Null
+    if the metadata verifies, or if the folder is not on this machine.
     """
 
     @property

@@ -292,7 +292,7 @@ def _later_in_folder(keystore: OpenedKeystore) -> str:
 
 
 def metadata_problem(keystore: OpenedKeystore) -> str:
-    """Return why robots refuse the metadata in the publishing folder, as a clause, or "".
+    """Return why the metadata in the publishing folder does not verify, as a clause, or "".
 
     The result is also "" if this cannot be determined here: the folder or the package ``tuf`` is
     missing.  Expiry is not considered.
@@ -313,7 +313,7 @@ def metadata_problem(keystore: OpenedKeystore) -> str:
     except ImportError:
         return ""
     except KeystoreError as error:
-        return error.what
+        return f"{error.what}: {error.why.removesuffix('.')}"
     last = known.versions.get("timestamp", 0)
     return f"'{folder}' has an older copy of the metadata" if version and version < last else ""
 
