@@ -859,9 +859,14 @@ def test_a_forged_timestamp_is_refused_without_unpacking_everything(
 ) -> None:
     """Whoever runs the web server can write archives that unpack to much more."""
     publisher.publish()
-    publication = fleet_status(OpenedKeystore(publisher.root)).publication
-    assert publication and not publication.refused
     timestamp = publisher.pub / "metadata/timestamp.json"
+    earlier = timestamp.read_bytes()
+    publisher.publish()
+    last = timestamp.read_bytes()
+    for data, why in ((last, ""), (earlier, "an older copy"), (last, "")):
+        timestamp.write_bytes(data)
+        publication = fleet_status(OpenedKeystore(publisher.root)).publication
+        assert publication and why in publication.refused and bool(why) == bool(publication.refused)
     forged = json.loads(timestamp.read_bytes())
     forged["signed"]["version"] += 1
     timestamp.write_text(json.dumps(forged))
