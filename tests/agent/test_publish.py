@@ -61,7 +61,7 @@ from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.pki.certificates import key_digest, load_request
+from sros_tool.pki.certificates import key_digest, load_request, validity_of
 from sros_tool.pki.crl import load_crl
 from sros_tool.validity import iso
 from tests.agent.published import DAY, LATER, ROLES, Home, Thief
@@ -681,8 +681,8 @@ def test_a_key_that_was_replaced_after_the_backup_is_not_certified_again(
     crl = OpenedKeystore(publisher.root).revocation_list
     assert crl and crl.revokes(stolen.serial_number)
     assert "key of enclave /r2/base was revoked" in sros("renew", publisher.root, "/r2/base").err
-    publisher.run("renew", "ks", "/r1/base")
-    publisher.run("renew", "ks", "/r2/base", "--new-key", "--revoke-old")
+    renew(publisher.root, ["/r1/base"], now=publisher.now)
+    renew(publisher.root, ["/r2/base"], new_key=True, revoke_old=True, now=publisher.now)
     assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
 
 
@@ -1245,6 +1245,33 @@ def test_a_key_that_was_replaced_after_a_rotation_is_not_certified_again(
             with pytest.raises(KeystoreError, match="after the backup, /r2/base got another key"):
                 publisher.publish(restored=True)
         replace()
+    assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
+
+
+def test_a_key_that_was_replaced_is_found_where_all_certificates_begin_at_a_fixed_date(
+    publisher: Home,
+) -> None:
+    root, name = publisher.root, "/r2/base"
+    validity = f"certificates.validity={iso(publisher.now - DAY / 2)}/90d"
+    publisher.run("update_keystore", "ks", "--set", validity)
+
+    def replace(*, revoke_old: bool = False) -> None:
+        renew(root, [name], new_key=True, revoke_old=revoke_old, now=publisher.now)
+        begins.add(validity_of(OpenedKeystore(root).certificate_of(name)).not_before)
+
+    begins: set[datetime] = set()
+    replace()
+    publisher.publish()
+    backup = copy_of(root, publisher.folder / "backup")
+    replace()
+    publisher.publish()
+    shutil.rmtree(root)
+    backup.rename(root)
+    with pytest.raises(KeystoreError, match=f"{name} got another key"):
+        publisher.publish(restored=True)
+    publisher.now += LATER
+    replace(revoke_old=True)
+    assert len(begins) == 1
     assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
 
 

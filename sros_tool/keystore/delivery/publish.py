@@ -1026,17 +1026,29 @@ class _Publication:
             )
 
     def _has_earlier_key(self, name: str, sent: bytes) -> bool:
-        """Return whether the keystore's key of an enclave is older than that of a certificate."""
+        """Return whether the keystore's key of an enclave is older than that of a certificate.
+
+        If the validity of both began at the same time, as at a fixed date, the older key is the one
+        that the ledger had first.
+        """
         with suppress(SrosError):  # without a certificate on one side, no key was replaced
             later, own = load_certificates(sent, name)[0], self.keystore.certificate_of(name)
-            keys = [key_digest(each.public_key()) for each in (later, own)]  # type: ignore[arg-type]
-            issued = [
-                entry.not_before
-                for entry in self.keystore.ledger_file.with_values("enclave", [name]).entries
-                if entry.what == "certificate" and entry.key == keys[1]
-            ]
-            began, later_began = (iso(validity_of(each).not_before) for each in (own, later))
-            return keys[0] != keys[1] and min(began, *issued) < later_began
+            later_key, own_key = (key_digest(each.public_key()) for each in (later, own))  # type: ignore[arg-type]
+            if own_key == later_key:
+                return False
+            entries = self.keystore.ledger_file.with_values("enclave", [name]).entries
+
+            def first(certificate: x509.Certificate, key: str, recorded: str) -> tuple[str, str]:
+                """Return when a key's validity began, and when the ledger had the key first."""
+                issued = (
+                    (entry.not_before, entry.time)
+                    for entry in entries
+                    if entry.what == "certificate" and entry.key == key
+                )
+                began = iso(validity_of(certificate).not_before)
+                return min(issued, default=(began, recorded))
+
+            return first(own, own_key, "") < first(later, later_key, iso(self._now))
         return False
 
     def _unknown_releases(self) -> list[Release]:
