@@ -1087,7 +1087,7 @@ class _Review:
             self.is_compared_elsewhere = False
             return
         both = sources()
-        namespaces = _namespaces_of_change(*(source.rights for source in both))
+        namespaces = _namespaces_to_try(*both)
         if len(namespaces) > _MOST_NAMESPACES:
             self.is_compared_elsewhere = False
         left = {
@@ -1326,21 +1326,25 @@ def _moved_rights(enclave: Enclave) -> Iterator[tuple[PlacedRight, Right]]:
         yield placed, moved_right.right
 
 
-def _namespaces_of_change(before: frozenset[Right], after: frozenset[Right]) -> list[str]:
+def _namespaces_to_try(before: AccessSource, after: AccessSource) -> list[str]:
     """Return namespaces in which requirements may be broken that hold in ``/``.
 
     The first namespace has a name that is in no right; it stands for all other such namespaces.
-    The other namespaces are those in the names of added and removed rights, or are matched by
-    wildcards of these rights.
+    The other namespaces are those in names that do not move with the namespace, or are matched by
+    wildcards of these names; those of added and removed rights come first.
     """
-    changed = sorted({right.name for right in before ^ after})
-    examples = [name for name in (common_name([name, "/*/*"]) for name in changed) if name]
+    enclaves = (*before.enclaves.values(), *after.enclaves.values())
+    placed = chain.from_iterable(map(placed_rights, enclaves))
+    fixed = {of.right.name for of in placed if of.written.startswith(("/", "*"))}
+    changed = {right.name for right in before.rights ^ after.rights}
+    names = sorted(fixed, key=lambda name: (name not in changed, name))
+    examples = [name for name in (common_name([name, "/*/*"]) for name in names) if name]
     parts_of_names = (name.split("/")[:-1] for name in examples)
     namespaces = [
         "/".join(parts[:end]) for parts in parts_of_names for end in range(2, len(parts) + 1)
     ]
     ordinary = "/any_namespace"
-    while any(ordinary in right.name for right in (*before, *after)):
+    while any(ordinary in right.name for right in (*before.rights, *after.rights)):
         ordinary += "_"
     return [*dict.fromkeys([ordinary, *namespaces])]
 

@@ -1321,3 +1321,29 @@ def test_a_wildcard_that_leaves_out_one_namespace_breaks_requirements_in_others(
     ended = change.review(*asked)
     assert ended.status == 1, ended
     assert f"error: {namespace}/b: may publish {namespace}/x" in ended.out
+
+
+_DENIED = publish("/left/*") + publish("x").replace("ALLOW", "DENY")
+
+
+@pytest.mark.parametrize(
+    ("requirement", "before", "after"),
+    [
+        ('[[only]]\npublish = ["x"]\nenclaves = ["/a"]\n', _DENIED, publish("/left/*")),
+        (
+            '[[not_both]]\nfirst = {publish = ["x"]}\nsecond = {publish = ["y"]}\n',
+            publish("/left/x"),
+            publish("/left/x", "y"),
+        ),
+    ],
+)
+def test_names_that_do_not_move_break_requirements_together_with_names_that_do(
+    change: Change, requirement: str, before: str, after: str
+) -> None:
+    """In the namespace / and in most others, the change breaks nothing."""
+    text = {"/a": publish("x"), "/b": before, "/c": publish("y")}
+    change.base = change.commit({"robot.xml": policy_text(text), "robot.toml": requirement})
+    change.commit({"robot.xml": policy_text({**text, "/b": after})})
+    asked = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
+    ended = change.review(*asked)
+    assert ended.status == 1 and "error: /left/b: may publish /left/" in ended.out, ended
