@@ -1299,6 +1299,34 @@ def test_a_later_key_of_a_robot_is_certified_again_as_publishing_advises(publish
     assert [known.is_revoked(key) for key in keys] == [True, False]
 
 
+@pytest.mark.parametrize("way", ["sign the present policy", "renew"])
+def test_a_right_that_was_taken_away_after_the_backup_does_not_come_back_in_silence(
+    publisher: Home, way: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sros_tool.cli.common._clock", lambda: publisher.now)
+
+    def sign(*topics: str) -> None:
+        text = policy_text({"/{robot}/base": allow_publish(*topics)})
+        (publisher.folder / "policy.xml").write_text(text)
+        publisher.run("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+
+    sign("x", "cmd")
+    publisher.publish()
+    backup = copy_of(publisher.root, publisher.folder / "backup")
+    sign("x")
+    publisher.publish()
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    with pytest.raises(KeystoreError, match=r"rights of /r1/base, .* were taken away") as refused:
+        publisher.publish(restored=True)
+    assert f"`sros renew {publisher.root} /r1/base /r2/base /r5/base`" in refused.value.remedy
+    if way == "renew":
+        publisher.run("renew", "ks", "/r1/base", "/r2/base", "/r5/base")
+    else:
+        sign("x")
+    assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
+
+
 @pytest.mark.parametrize("steps", [(0, 1), (1, 3)])
 def test_a_restored_keystore_does_not_leave_a_later_stage_of_a_rotation(
     publisher: Home, steps: tuple[int, int]

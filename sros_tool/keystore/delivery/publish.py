@@ -24,6 +24,7 @@ from cryptography import x509
 from cryptography.x509.oid import ExtensionOID
 
 from sros_tool import __version__
+from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.files import remove_file, staged_file
 from sros_tool.fleet.robots import Fleet
@@ -64,6 +65,7 @@ from sros_tool.keystore.layout import (
     LIST_FILES,
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
+    PERMISSIONS_FILE,
     PUBLISHED,
     ca_certificate,
     enclave_folder,
@@ -82,6 +84,7 @@ from sros_tool.keystore.outcomes import changes_below
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.transaction import KeystoreLock
 from sros_tool.parallel import map_slices, tick
+from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     authority_key,
     authority_text,
@@ -91,6 +94,9 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.pki.crl import lists_as_revoked, read_list
+from sros_tool.policy.model import ALLOW, DENY
+from sros_tool.policy.rights import compare
+from sros_tool.translate import grant_rights
 from sros_tool.validity import iso
 from sros_tool.values import (
     DryRun,
@@ -732,6 +738,7 @@ class _Publication:
                 self._notes.append(self._not_shown_note())
             self._restore(forgotten, keyring)
             self._check_replaced_keys()
+            self._check_earlier_rights()
         if not (is_later and self._dry_run):  # a dry run has not revoked the enclaves again
             self._check_removed()
         if is_lost or restored:
@@ -1001,14 +1008,9 @@ class _Publication:
 
         The seal shows this even if the keystore has lost the identity CA of the release.
         """
-        last = {
-            release.robot: release
-            for release in sorted(self._sealed_releases(), key=lambda release: release.number)
-        }
         replaced = sorted(
             name
-            for release in last.values()
-            for name, files in release.enclaves().items()
+            for name, files in self._last_sealed_files()
             if self._has_earlier_key(name, files.get(CERTIFICATE_FILE, b""))
         )
         if replaced:
@@ -1024,6 +1026,52 @@ class _Publication:
                 f"--no-answer --renew`, and then run `sros renew {root} {names} --revoke-old`. "
                 "Then repeat this command, with --restored.",
             )
+
+    def _check_earlier_rights(self) -> None:
+        """Refuse to publish if the last release of an enclave lacks rights that the keystore gives.
+
+        The enclave's permissions in the keystore are older than those in the release.
+        """
+        regained = sorted(
+            name
+            for name, files in self._last_sealed_files()
+            if self._gives_earlier_rights(name, files.get(PERMISSIONS_FILE, b""))
+        )
+        if regained:
+            root, names = quote(str(self.keystore.root)), " ".join(map(quote, regained))
+            raise KeystoreError(
+                f"'{self._folder}' cannot be published yet: after the backup, rights of "
+                f"{first_few(regained, _MOST_NAMES)} were taken away, which the keystore's "
+                "permissions still give",
+                "Robots refuse earlier permissions, but would accept the rights again as soon as "
+                "the permissions are renewed.",
+                "Sign the present policy again, with `sros generate_artifacts`. If the enclaves "
+                f"are to have these rights, run `sros renew {root} {names}`. Then repeat this "
+                "command, with --restored.",
+            )
+
+    def _gives_earlier_rights(self, name: str, sent: bytes) -> bool:
+        """Return whether an enclave's permissions are older than those sent, and give more."""
+        with suppress(SrosError):  # without permissions on one side, no right was taken away
+            own = self.keystore.enclave(name, now=self._now).grant
+            (later,) = parse_permissions(smime.parse(sent).text).grants
+            if own and own.validity.not_before < later.validity.not_before:
+                difference = compare(grant_rights(name, later), grant_rights(name, own))
+                given = (right.qualifier is ALLOW for right in difference.only_second)
+                no_longer_denied = (right.qualifier is DENY for right in difference.only_first)
+                return any(given) or any(no_longer_denied)
+        return False
+
+    def _last_sealed_files(self) -> Iterator[tuple[str, Mapping[str, bytes]]]:
+        """Yield the enclaves that the keystore has, with their files in the last sealed release."""
+        last = {
+            release.robot: release
+            for release in sorted(self._sealed_releases(), key=lambda release: release.number)
+        }
+        for release in last.values():
+            for name, files in release.enclaves().items():
+                if self.keystore.has_enclave(name):
+                    yield name, files
 
     def _has_earlier_key(self, name: str, sent: bytes) -> bool:
         """Return whether the keystore's key of an enclave is older than that of a certificate.
