@@ -10,6 +10,7 @@ import tarfile
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cryptography import x509
@@ -329,6 +330,24 @@ def test_a_restored_keystore_revokes_only_the_earlier_key_of_new_hardware(
     known = KnownKeys(OpenedKeystore(backup))
     keys = [certificate_entry(NOW, "certificate", each).key for each in (earlier, later)]
     assert [known.is_revoked(key) for key in keys] == [True, False]
+
+
+def test_a_restored_keystore_keeps_the_key_of_new_hardware_that_it_certified_again_first(
+    home: Path, tmp_path: Path
+) -> None:
+    """Changes from after the backup are repeated before the publishing folder shows them."""
+    backup = copy_of(home, tmp_path / "backup")
+    request = create_request(tmp_path / "new", "/base").file.read_bytes()
+    options: dict[str, Any] = {"renew": True, "replace_keys": True, "only_enclaves": ["/base"]}
+    certify_requests(home, request, now=NOW, **options)
+    renew(home, ["/base"], now=NOW, revoke_old=True)
+    later, crl = OpenedKeystore(home).certificate_of("/base"), home / "public/identity_ca.crl.pem"
+    certify_requests(backup, request, now=LATER, **options)
+    forgotten = LostRecords(OpenedKeystore(backup), LATER)
+    assert forgotten.add(crl.read_bytes()) and forgotten.add_certificate(later, REPORTED)
+    restore_revocations(backup, forgotten, now=LATER)
+    key = certificate_entry(NOW, "certificate", later).key
+    assert not KnownKeys(OpenedKeystore(backup)).is_revoked(key)
 
 
 def other_subject(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Container, Iterator, Mapping, Sequence
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -200,7 +200,8 @@ def restore_revocations(
             is_known = entry.serial in reasons or int(entry.serial or "0", 16) in known
             if (entry.enclave, entry.key) in replaced_keys and not is_known:
                 reasons[entry.serial], issued[entry.serial] = SUPERSEDED, entry
-        for entry in _vouched_since(change, forgotten_lists, issued):
+        later_keys = [of.key for serial, of in unknown.items() if serial not in reasons]
+        for entry in _vouched_since(change, forgotten_lists, issued, later_keys):
             reasons[entry.serial], issued[entry.serial] = SUPERSEDED, entry
             replaced_keys.add((entry.enclave, entry.key))
         _check_names(change, tuple(lost_revocations))
@@ -258,13 +259,17 @@ def _replaced_keys(
 
 
 def _vouched_since(
-    change: KeystoreChange, forgotten_lists: LostRecords, issued: Mapping[str, Entry]
+    change: KeystoreChange,
+    forgotten_lists: LostRecords,
+    issued: Mapping[str, Entry],
+    later_keys: Iterable[str],
 ) -> Iterator[Entry]:
     """Yield the certificates of other keys that enclaves with ``issued`` certificates got since.
 
     The keystore certified them after the date on which a lost list revoked an ``issued``
     certificate, whose key vouched for the first of them (`sros_tool.keystore.delivery.collect`).
-    Left out are keys in the keystore, and those that were certified before the keystore was lost.
+    Left out are keys in the keystore, and those that were certified before the keystore was lost,
+    such as ``later_keys``, which its ledger lacks.
     """
     dates = {f"{e.serial:x}": iso(e.date) for crl in forgotten_lists.lists for e in crl.revoked}
     since: dict[str, str] = {}
@@ -272,7 +277,7 @@ def _vouched_since(
         name = issued[serial].enclave
         since[name] = min(dates[serial], since.get(name, dates[serial]))
     shown = change.known.shown_after_restore(since)
-    others = {"", *(entry.key for entry in (*issued.values(), *shown))}
+    others = {"", *later_keys, *(entry.key for entry in (*issued.values(), *shown))}
     for name in since:
         with suppress(SrosError):  # the enclave does not exist, or a file of it is broken
             if has_key(change.keystore.folder(name)):
