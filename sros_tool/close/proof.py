@@ -78,8 +78,9 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
 
     If the enclave of the observer has expired, nothing but the files is examined.
     """
-    if OBSERVER in _expired_enclaves(robot, robot.export):
-        return [_proof_of_files(robot)]
+    expired = _expired_enclaves(robot, robot.export)
+    if OBSERVER in expired:
+        return [_proof_of_files(robot, expired)]
     expected = {process.enclave for process in state.observed.processes} | {*state.new}
     if not expected:
         return [Proof(_STARTED, False, "no process of the robot is known")]
@@ -104,16 +105,19 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
         options = " ".join(f"--without {name}" for name in present)
         talk = talk._replace(reason=f"{talk.reason}; if they may be away, add {options}")
     silence = _proof_of_silence(robot, nodes.compared(away), hears=talk.holds is not None)
-    return [proof, _proof_of_files(robot), *_proof_of_requirements(robot), talk, silence]
+    return [proof, _proof_of_files(robot, expired), *_proof_of_requirements(robot), talk, silence]
 
 
-def _proof_of_files(robot: LocalRobot) -> Proof:
-    """Ask `check` about the files that the processes use, such as a key that others read."""
+def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
+    """Ask `check` about the files that the processes use, such as a key that others read.
+
+    The enclaves ``expired`` of the export have expired.
+    """
     place = str(robot.export)
     status = robot.shell.check(place)
     holds = {0: True, 1: False}.get(status)
     reason = "sros check finds no error" if holds else "they are not checked"
-    if expired := _expired_enclaves(robot, robot.export):
+    if expired:
         holds, reason = False, _expired_text(robot, expired)
     elif holds is False:
         reason = f"{_errors_text(robot)}; then run `{robot.close_command}`, and restart the "

@@ -166,6 +166,14 @@ def test_expired_files_are_named_with_the_keystore_that_renews_them(
     ]
     assert f"{begin}renew them where the keystore is (`sros renew KEYSTORE --all" in told[2]
 
+    def check_and_renew(*_: str) -> int:
+        expired["export"] = []
+        return 0
+
+    robot.shell.check, robot.policy = check_and_renew, tmp_path / "policy.xml"
+    (said,) = proof.proofs_of(robot, state, 0)
+    assert said.holds is False, "nothing but the files was examined"
+
 
 def test_listeners_of_what_nobody_may_send_any_more_are_named(tmp_path: Path) -> None:
     """Twin: another enclave may send it; where a DENY refuses it, the DENY is what is new."""
