@@ -62,11 +62,11 @@ _NEAR_LINES = 3
 class Denial:
     """A denied DDS topic, and ``direction``: "publish", "subscribe", or "" if unknown.
 
-    ``by_rule``: a deny rule denies the topic, so that an allow rule would not help (None: unknown).
-        ``remote``: the permissions of a peer deny the topic.  ``enclave`` is "" if the log does not
-        name it.  ``process`` is the label of the process that printed the denial, or "", and
-        ``lines`` the numbers of its lines, from 1.  ``folder`` is the folder from which the process
-        loaded its enclave, or "".
+    ``by_rule`` says whether a deny rule denies the topic, so that an allow rule would not help
+    (None: unknown), ``remote`` whether the permissions of a peer deny it.  ``enclave`` is "" if the
+    log does not name it.  ``process`` is the label of the process that printed the denial, or "",
+    and ``lines`` the numbers of its lines, from 1.  ``folder`` is the folder from which the process
+    loaded its enclave, or "".
     """
 
     topic: str
