@@ -830,6 +830,9 @@ def test_a_process_that_cannot_read_the_key_restarts_nothing_and_ends_no_restart
     r1.systemctl, r1.user = [], r1.folder.stat().st_uid + 1
     r1.started = {"/r1/a": moment() - timedelta(hours=1)}
     assert r1.round().restart == ("/r1/a",) and not r1.systemctl
+    claimed, r1.started, r1.unseen = r1.started, {}, True
+    assert r1.round().restart == ("/r1/a",) and not r1.systemctl, "no files are new"
+    r1.started, r1.unseen = claimed, False
     r1.mode = 0o644  # of a key that the process itself has mounted over the robot's
     assert r1.round().restart == ("/r1/a",) and not r1.systemctl
     key = r1.folder / "enclaves/r1/a" / KEY_FILE
