@@ -31,7 +31,7 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.selection import revocation_of
 from sros_tool.policy.document import read_policy
 from sros_tool.runtime.environment import RMW_ZENOH, node_argument
-from sros_tool.runtime.processes import launch_verb
+from sros_tool.runtime.processes import SEVERAL_USERS, launch_verb
 from sros_tool.runtime.rmw import RMW, built_without_security, rmw_implementations
 from sros_tool.runtime.variables import ENCLAVE
 from sros_tool.values import FileChange
@@ -347,6 +347,12 @@ def _user_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[s
     """Yield the users of processes who cannot read their enclaves."""
     owner, export = robot.export.stat().st_uid, robot.export.absolute()
     for user in sorted({process.user for process in observed.processes}):
+        if user == SEVERAL_USERS:
+            yield (
+                "a process runs as several users, such as a set-user-ID program, and only one user "
+                "can read the enclaves: start it as one user"
+            )
+            continue
         barred = [path for path in export.parents if not _may_enter(user, path.stat())]
         if barred and user:
             yield f"user {user}, who runs processes, cannot enter '{barred[-1]}'"

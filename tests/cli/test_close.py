@@ -31,6 +31,7 @@ from sros_tool.keystore.layout import list_enclaves
 from sros_tool.policy.document import read_policy
 from sros_tool.runtime.environment import secured_environment
 from sros_tool.runtime.processes import (
+    SEVERAL_USERS,
     FileReader,
     Process,
     ProcessOrigin,
@@ -1226,10 +1227,11 @@ def test_root_reads_any_export(tmp_path: Path) -> None:
         os.chown(export, 1234, -1)
     shell = Shell(close._run, print, {}, lambda: datetime.now(UTC), UTC)
     robot = LocalRobot(tmp_path, 0, shell)
-    for user in (0, 4321):
+    for user, said in ((0, ""), (4321, "chown -R 4321 "), (SEVERAL_USERS, "start it as one user")):
         process = ClosedProcess("/a", 7, ("a",), "/", user, "", "program")
-        problems = preparation._user_problems(robot, ObservedProcesses(0, [process]))
-        assert any("chown -R " in problem for problem in problems) == bool(user)
+        problems = " ".join(preparation._user_problems(robot, ObservedProcesses(0, [process])))
+        assert said in problems and str(SEVERAL_USERS) not in problems
+        assert ("chown -R " in problems) is (user == 4321)
 
 
 @pytest.mark.parametrize(
