@@ -98,6 +98,12 @@ def _complete_scenario(
     help="A talker on rclpy sends default messages of this type, such as geometry_msgs/msg/Twist.",
 )
 @click.option(
+    "--for",
+    "duration",
+    metavar="DURATION",
+    help="Stop the talker, listener or router after DURATION, such as 10s.  [default: at Ctrl-C]",
+)
+@click.option(
     "--domain",
     type=int,
     default=80,
@@ -150,6 +156,7 @@ def demo(
     accept_open: tuple[str, ...],
     topic: str | None,
     message_type: str | None,
+    duration: str | None,
     domain: int,
     template: str,
     network: str,
@@ -168,13 +175,13 @@ def demo(
     it takes about 30 s on Cyclone DDS and 60 s on rclpy. On Zenoh (--backend zenoh), all scenarios
     run, in about 25 s.
 
-    With talker, listener or router, run only this node until Ctrl-C, with the current environment
-    variables, so that you can see who hears whom. The node runs on Cyclone DDS, rclpy, or Zenoh,
-    which also needs a router. The node says at once whether it is secured. In an enclave, it needs
-    only the right for its topic, whatever its nodes are called. A listener reads
+    With talker, listener or router, run only this node until Ctrl-C (or --for DURATION), with the
+    current environment variables, so that you can see who hears whom. The node runs on Cyclone DDS,
+    rclpy, or Zenoh, which also needs a router. The node says at once whether it is secured. In an
+    enclave, it needs only the right for its topic, whatever its nodes are called. A listener reads
     std_msgs/msg/String, and counts the messages of any other type that the topic has; a talker
     reports if no node can read its type, and sends another type with --type. Of the options, only
-    --backend, --topic and --type apply.
+    --backend, --topic, --type and --for apply.
 
     Example:
       $ sros demo --topic /camera/image
@@ -202,9 +209,11 @@ def demo(
     row. With --keystore, the exit status is 2 if an attack that has to fail could not be tried.
     """
     if role is not None:
-        _run_by_hand(ctx, role, backend, topic, message_type)
+        _run_by_hand(ctx, role, backend, topic, message_type, duration)
     if message_type is not None:
         raise UsageError("--type is for `sros demo talker`", "", "Leave it out.")
+    if duration is not None:
+        raise UsageError("--for is for a talker, listener or router", "", "Leave it out.")
     from sros_tool.demo.program import DemoOptions, run_demo
     from sros_tool.demo.result import demo_table
     from sros_tool.demo.scenarios import choose_scenarios
@@ -251,16 +260,22 @@ def demo(
 
 
 def _run_by_hand(
-    ctx: click.Context, role: str, backend: str, topic: str | None, message_type: str | None
+    ctx: click.Context,
+    role: str,
+    backend: str,
+    topic: str | None,
+    message_type: str | None,
+    duration: str | None,
 ) -> NoReturn:
     """Run a node until it is stopped, and end with its exit status."""
     from sros_tool.demo.backend import RCLPY, HandNode, backend_by_hand, run_by_hand
     from sros_tool.demo.nodes import STRING
     from sros_tool.demo.scenarios.model import DEFAULT_TOPIC, Role, check_topic
+    from sros_tool.validity import parse_duration
 
     for parameter in ctx.command.params:
         chosen = ctx.get_parameter_source(parameter.name or "")
-        parameters = ("role", "backend", "topic", "message_type")
+        parameters = ("role", "backend", "topic", "message_type", "duration")
         takes = parameter.name in parameters or not parameter.expose_value
         if not takes and chosen is not ParameterSource.DEFAULT:
             option = parameter.opts[0]
@@ -269,7 +284,7 @@ def _run_by_hand(
         backend = RCLPY if message_type else backend_by_hand(Role(role), os.environ)
     asked = check_topic(DEFAULT_TOPIC if topic is None else topic)
     node = HandNode(Role(role), backend, asked, STRING if message_type is None else message_type)
-    sys.exit(run_by_hand(node, echo))
+    sys.exit(run_by_hand(node, echo, None if duration is None else parse_duration(duration)))
 
 
 def _list(backend: str, as_json: bool) -> None:

@@ -16,6 +16,7 @@ import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -402,8 +403,10 @@ def _types_not_heard(node: HandNode, environment: Mapping[str, str]) -> str:
     return f"secured nodes on {rmw} and this node do not hear each other; {rmw} {but}"
 
 
-def run_by_hand(node: HandNode, say: Callable[[str], None]) -> int:
-    """Run a node until it is stopped by a signal; return its exit status.
+def run_by_hand(
+    node: HandNode, say: Callable[[str], None], duration: timedelta | None = None
+) -> int:
+    """Run a node for ``duration``, or until it is stopped by a signal; return its exit status.
 
     ``say`` gets lines about what is sent and heard, without line breaks at their ends.
 
@@ -434,8 +437,17 @@ def run_by_hand(node: HandNode, say: Callable[[str], None]) -> int:
         os.close(writing)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, stop)
+        if duration is not None:
+            timer = threading.Timer(duration.total_seconds(), stop)
+            timer.daemon = True
+            timer.start()
         with open(events, "rb", buffering=0) as pipe:
-            last = _tell(node, pipe.fileno(), say)
+            try:
+                last = _tell(node, pipe.fileno(), say)
+            except BaseException:  # such as nobody who reads the lines any more
+                end_within(_SECONDS_TO_STOP, process)
+                process.wait()
+                raise
         status = process.wait()
     if stopped.is_set():
         by_force = ", by force: it did not end by itself" * (status == -signal.SIGKILL)

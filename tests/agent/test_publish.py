@@ -1207,9 +1207,10 @@ def test_a_restored_keystore_never_brings_back_a_ca_that_was_replaced(
     assert (authorities() == later) is has_key
 
 
+@pytest.mark.parametrize("roles", [("--identity",), ("--identity", "--permissions")])
 @pytest.mark.parametrize("is_replaced", [True, False])
 def test_a_key_that_was_replaced_after_a_rotation_is_not_certified_again(
-    publisher: Home, is_replaced: bool
+    publisher: Home, is_replaced: bool, roles: tuple[str, ...]
 ) -> None:
     """The new certificate is from a CA that the keystore has lost, as is what that CA revoked."""
 

@@ -8,6 +8,8 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
+from datetime import timedelta
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock, Mock
@@ -15,7 +17,13 @@ from unittest.mock import MagicMock, Mock
 import pytest
 
 from sros_tool.demo import backend, ros_node
-from sros_tool.demo.backend import HandNode, backend_by_hand, end_within, security_of
+from sros_tool.demo.backend import (
+    HandNode,
+    backend_by_hand,
+    end_within,
+    run_by_hand,
+    security_of,
+)
 from sros_tool.demo.cyclone_node import CycloneNode
 from sros_tool.demo.nodes import ROLES, NodeOptions
 from sros_tool.demo.scenarios.model import Role
@@ -99,6 +107,33 @@ def test_a_node_that_handles_no_signal_is_stopped_in_time() -> None:
         assert process.stdout and process.stdout.readline()
         end_within(0.01, process)
         assert process.wait(10) == -signal.SIGKILL
+
+
+@pytest.mark.dds
+def test_a_listener_ends_after_its_time_and_without_a_reader(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    try:
+        load_cyclone()
+    except UnavailableError as error:
+        pytest.skip(str(error))
+    monkeypatch.setattr(backend, "_SILENCE", 0.1)
+    node = HandNode(Role.LISTENER, "cyclone", "/nobody_talks")
+
+    def say(line: str) -> None:
+        if line.startswith("heard nothing"):
+            raise BrokenPipeError
+
+    def played() -> list[str]:
+        lines: list[str] = []
+        assert run_by_hand(node, lines.append, timedelta(seconds=0.5)) == 0
+        with suppress(BrokenPipeError):
+            run_by_hand(node, say)
+            lines.append("goes on")
+        return lines[-1:]
+
+    assert apart(played) == ["stopped"]
+    assert "--for is for a talker" in sros("demo", "--for", "3s").err
 
 
 def test_a_node_by_hand_says_what_others_have_of_another_type(tmp_path: Path) -> None:

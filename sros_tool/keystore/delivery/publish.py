@@ -1010,7 +1010,7 @@ class _Publication:
         """
         replaced = sorted(
             name
-            for name, files in self._last_sealed_files()
+            for name, files in self._last_published_files()
             if self._has_earlier_key(name, files.get(CERTIFICATE_FILE, b""))
         )
         if replaced:
@@ -1034,7 +1034,7 @@ class _Publication:
         """
         regained = sorted(
             name
-            for name, files in self._last_sealed_files()
+            for name, files in self._last_published_files()
             if self._gives_earlier_rights(name, files.get(PERMISSIONS_FILE, b""))
         )
         if regained:
@@ -1062,13 +1062,19 @@ class _Publication:
                 return any(given) or any(no_longer_denied)
         return False
 
-    def _last_sealed_files(self) -> Iterator[tuple[str, Mapping[str, bytes]]]:
-        """Yield the enclaves that the keystore has, with their files in the last sealed release."""
-        last = {
-            release.robot: release
-            for release in sorted(self._sealed_releases(), key=lambda release: release.number)
-        }
-        for release in last.values():
+    def _last_published_files(self) -> Iterator[tuple[str, Mapping[str, bytes]]]:
+        """Yield the enclaves that the keystore has, with their files in the last release.
+
+        A release counts if a permissions CA of the keystore sealed it, or if metadata that the
+        keystore's keys signed names it: the keystore may have lost a later permissions CA.
+        """
+        named = []
+        for robot, published in self._there.items():
+            with suppress(SrosError):  # publishing refuses damaged archives elsewhere
+                if data := self._read(robot, published):
+                    named.append(read_release(data))
+        releases = sorted((*self._sealed_releases(), *named), key=lambda release: release.number)
+        for release in {release.robot: release for release in releases}.values():
             for name, files in release.enclaves().items():
                 if self.keystore.has_enclave(name):
                     yield name, files
