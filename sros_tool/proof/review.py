@@ -1086,8 +1086,8 @@ class _Review:
         if asked.namespaces or asked.fleet or not sources:
             self.is_compared_elsewhere = False
             return
-        both = sources()
-        namespaces = _namespaces_to_try(*both)
+        base, head = sources()
+        namespaces = _namespaces_to_try(base, head)
         if len(namespaces) > _MOST_NAMESPACES:
             self.is_compared_elsewhere = False
         left = {
@@ -1095,28 +1095,24 @@ class _Review:
             for at, here in enumerate(requirements)
             if here.is_relative and not _violations(here, system)
         }
+
+        def system_in(ns: str, source: AccessSource) -> System:
+            policy = policy_in_namespace(Policy(tuple(source.enclaves.values())), ns)
+            return policy_system(policy, self._circumstances(), self._template())
+
         for ns in namespaces[:_MOST_NAMESPACES]:
             moved = list(
                 chain.from_iterable(
                     read_requirements(path, namespaces=(ns,), remaps=asked.remaps) for path in files
                 )
             )
-            before, after = (
-                policy_system(
-                    policy_in_namespace(Policy(tuple(source.enclaves.values())), ns),
-                    self._circumstances(),
-                    self._template(),
-                )
-                for source in both
-            )
+            before, after = cache(partial(system_in, ns, base)), system_in(ns, head)
             for at in sorted(left):
-                known = {
-                    (finding.subject, finding.text) for finding in _violations(moved[at], before)
-                }
+                broken = _violations(moved[at], after)
+                known = _violations(moved[at], before()) if broken else ()
+                texts = {(finding.subject, finding.text) for finding in known}
                 broken = [
-                    finding
-                    for finding in _violations(moved[at], after)
-                    if (finding.subject, finding.text) not in known
+                    finding for finding in broken if (finding.subject, finding.text) not in texts
                 ]
                 if broken:
                     left.remove(at)
