@@ -418,7 +418,8 @@ def _unknown_process_problems(robot: LocalRobot, state: CloseState) -> Iterator[
         yield (
             f"sros knows no process of this machine for nodes of {enclaves}; if they run on "
             f"another machine: {close} {options}; if you do not know one of them, it may be a "
-            f"stranger: remove its enclave from '{robot.policy}'; otherwise {silent}"
+            f"stranger: remove its enclave from '{robot.policy}', and remove "
+            f"'{robot.requirements}', which sros then proposes again; otherwise {silent}"
         )
 
 
