@@ -30,7 +30,7 @@ _LONGEST = 100 * _SECONDS["y"]
 
 
 def time_of_file(seconds: float) -> datetime:
-    """Return a file's time in UTC; a time outside the years of `datetime` becomes its limit."""
+    """Return a file's time in UTC; if `datetime` has no such year, its last moment, or 1970."""
     try:
         return datetime.fromtimestamp(seconds, UTC)
     except (ValueError, OverflowError, OSError):

@@ -46,7 +46,8 @@ from sros_tool.runtime.variables import ENABLE, KEYSTORE
 
 _LONGEST_PATH = 200
 _RESTART_SECONDS = 120.0
-_ASK_SECONDS = 30.0
+_COMMAND_SECONDS = 30.0
+"""How long a command, such as systemctl, may take."""
 
 
 # ── processes ──────────────────────────────────────────────────────────────────────────────
@@ -298,7 +299,7 @@ class Systemd:
         """
         listing = self._run(
             "list-units", "--plain", "--no-legend", "--state=active", "sros@*.service",
-            seconds=_ASK_SECONDS,
+            seconds=_COMMAND_SECONDS,
         )  # fmt: skip
         return frozenset(line.split()[0] for line in listing.splitlines() if line.split())
 
@@ -386,7 +387,7 @@ def restart_units(
         try:
             allowed = subprocess.run(
                 settings.restart_if,
-                timeout=_ASK_SECONDS,
+                timeout=_COMMAND_SECONDS,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,

@@ -921,8 +921,8 @@ ENCLAVE_NAMES = FindingKind(
     "subject. So /robot can join with the (public) permissions of /robot/admin.",
     "Cyclone DDS 0.10.2 and 11.0.1 (access_control.c); reproduced: readers received data of such "
     "an enclave.",
-    "Choose names that do not consist of parts of another name, such as /robot_admin, or unique "
-    "subjects (template production).",
+    "Rename an enclave so that its path has a part that the other path lacks, such as "
+    "/robot_admin, or choose unique subjects (template production).",
     vendors=CYCLONE_DDS,
 )
 SEVERAL_PROFILES = FindingKind(

@@ -228,8 +228,9 @@ def _required_files(enclave: ProcessEnclave) -> Sequence[str]:
 def newer_files(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
     """Yield the names of the files that changed, or were removed, since a process started.
 
-    The key's file does not count: the certificate shows which key was loaded. If only the key's
-    file changed, its mode or place changed, or the key does not fit and no process starts with it.
+    The key's file does not count: the certificate shows which key was loaded. A change of the key's
+    file alone means that its mode or place changed, or that no process starts, because the key does
+    not fit the certificate.
     """
     files = enclave.files
     if process.is_zenoh:

@@ -360,7 +360,8 @@ class CloseState(NamedTuple):
     def pending_by_hand(self) -> Mapping[str, Sequence[ClosedProcess]]:
         """The commands to run by hand for the enclaves in ``pending``, with their processes.
 
-        Processes that only need the revocation list come last: a new key comes before.
+        Processes that only need the new revocation list come last, after those with a new key
+        or new rights.
         """
         by_hand = self.observed.commands_by_hand(self.folder.absolute())
         due = [

@@ -467,7 +467,8 @@ def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
             "portable.enclave-names",
             f"Cyclone DDS 0.10 mistakes {pairs_text(pairs)}, if the first enclave presents the "
             "(public) permissions of the second one, which contain all parts of its name. "
-            "Choose names that do not consist of parts of another name, such as /robot_admin.",
+            "Rename an enclave so that its path has a part that the other path lacks, such as "
+            "/robot_admin.",
         )
 
 

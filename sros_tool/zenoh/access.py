@@ -52,8 +52,9 @@ class Flow(StrEnum):
 class AccessRule(NamedTuple):
     """A rule that allows or denies messages in one direction, on keys in ``key_expressions``.
 
-    Only rules for graph tokens deny.  No process reads the key of a token as a wildcard, so for
-    tokens, Zenoh enforces a denial of a part of the allowed keys.
+    Only rules for graph tokens deny.  No process reads the key of a token as a wildcard, so a rule
+    for tokens can deny some of the keys that another rule allows.  For other messages, Zenoh would
+    not enforce this.
     """
 
     flow: Flow

@@ -229,3 +229,17 @@ def test_local_time_is_standard_time_in_summer_too(
         each.id for each in keystore_findings(OpenedKeystore(root), Circumstances(at, zone=zone))
     }
     assert ("enclave.permissions-local-time" in told) is found
+
+
+@pytest.mark.parametrize("unique", [True, False])
+def test_names_that_unique_subjects_tell_apart(tmp_path: Path, unique: bool) -> None:
+    """Also for the policy from which the keystore is made."""
+    policy = tmp_path / "p.xml"
+    policy.write_text(policy_text({"/bot/sensor": publish("x"), "/bot/front/sensor": publish("x")}))
+    template = "production" if unique else "development"
+    sros("create_keystore", tmp_path / "ks", "--template", template).ok()
+    sros("generate_artifacts", "-k", tmp_path / "ks", "-p", policy).ok()
+    ended = sros(
+        "check", tmp_path / "ks", "--policy", policy, "--include", "portable.enclave-names"
+    )
+    assert (ended.status, "p.xml:" in ended.out) == ((0, False) if unique else (1, True)), ended

@@ -160,7 +160,7 @@ def keystore_findings(
     all_findings += check_capitals(topics)
     all_findings += zenoh_files.check_network(keystore, only_enclaves)
     if at.policies:
-        from sros_tool.checks.policies import findings_in
+        from sros_tool.checks.policies import findings_in, is_mended_by
 
         parts = [
             replace(
@@ -173,7 +173,11 @@ def keystore_findings(
             else policy
             for policy in at.policies
         ]
-        all_findings += findings_in(parts, at.distribution, of_fleet=at.fleet is not None)
+        all_findings += (
+            finding
+            for finding in findings_in(parts, at.distribution, of_fleet=at.fleet is not None)
+            if not is_mended_by(opened.template, finding)
+        )
     real_root = os.path.realpath(root)
     located = (_with_real_file(finding, opened, real_root) for finding in all_findings)
     all_findings = with_causes(
