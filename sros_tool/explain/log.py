@@ -1171,7 +1171,8 @@ def _renaming_advice(nodes: Sequence[str], wrong: str, enclave: str) -> str:
         renamed = (
             f"; or, if this is {meant[0]} by another name, write this name in its profile, or "
             "merge the policy of its package with this name, into a policy without the node: "
-            f"`sros merge_policy POLICY OTHER {_merge_rules(meant[0], wrong)}`"
+            f"`sros merge_policy POLICY OTHER {_merge_rules(meant[0], wrong)}`, with the name that "
+            "OTHER has for the node before `:__node`"
         )
     return (
         f"{start}{renamed}; or, if {wrong} is a further node, give it a profile with "

@@ -940,7 +940,7 @@ def test_processes_that_show_no_id_are_to_be_named(robot: Robot) -> None:
     said = robot.close(status=1).out
     assert "; watch again while they run, or name its node in the command of each process" in said
     assert "for nodes of /left, /right; if they run on another machine" in said
-    assert "stranger: remove its enclave from 'robot/policy.xml'; otherwise they" in said
+    assert "from 'robot/policy.xml', and remove 'robot/requirements.toml', which sros then" in said
 
 
 @sometimes("nothing_is_closed_of_what_is_not_understood", 1 / 2)
