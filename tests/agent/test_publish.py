@@ -21,6 +21,7 @@ from tuf.api.metadata import Metadata, Root
 
 from sros_tool.agent.fetch import FetchProblem
 from sros_tool.cli.fleet import _published_lines
+from sros_tool.dds.permissions import Permissions, parse_permissions
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.folders import Folder
 from sros_tool.keystore import transaction
@@ -1300,7 +1301,7 @@ def test_a_later_key_of_a_robot_is_certified_again_as_publishing_advises(publish
     assert [known.is_revoked(key) for key in keys] == [True, False]
 
 
-@pytest.mark.parametrize("way", ["sign the present policy", "renew"])
+@pytest.mark.parametrize("way", ["sign the present policy", "renew", "several grants"])
 def test_a_right_that_was_taken_away_after_the_backup_does_not_come_back_in_silence(
     publisher: Home, way: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -1318,6 +1319,13 @@ def test_a_right_that_was_taken_away_after_the_backup_does_not_come_back_in_sile
     publisher.publish()
     shutil.rmtree(publisher.root)
     backup.rename(publisher.root)
+    if way == "several grants":  # as other tools write
+
+        def twice(data: bytes) -> Permissions:
+            read = parse_permissions(data)
+            return read._replace(grants=read.grants * 2)
+
+        monkeypatch.setattr(publishing, "parse_permissions", twice)
     with pytest.raises(KeystoreError, match=r"rights of /r1/base, .* were taken away") as refused:
         publisher.publish(restored=True)
     assert f"`sros renew {publisher.root} /r1/base /r2/base /r5/base`" in refused.value.remedy

@@ -95,7 +95,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.crl import lists_as_revoked, read_list
 from sros_tool.policy.model import ALLOW, DENY
-from sros_tool.policy.rights import compare
+from sros_tool.policy.rights import Right, compare
 from sros_tool.translate import grant_rights
 from sros_tool.validity import iso
 from sros_tool.values import (
@@ -737,8 +737,9 @@ class _Publication:
             else:
                 self._notes.append(self._not_shown_note())
             self._restore(forgotten, keyring)
-            self._check_replaced_keys()
-            self._check_earlier_rights()
+            last_files = [*self._last_published_files()]
+            self._check_replaced_keys(last_files)
+            self._check_earlier_rights(last_files)
         if not (is_later and self._dry_run):  # a dry run has not revoked the enclaves again
             self._check_removed()
         if is_lost or restored:
@@ -1003,14 +1004,14 @@ class _Publication:
                 )
         self._notes += revocation.notes
 
-    def _check_replaced_keys(self) -> None:
+    def _check_replaced_keys(self, last_files: Sequence[tuple[str, Mapping[str, bytes]]]) -> None:
         """Refuse to publish if the keystore has an earlier key of an enclave than its last release.
 
         The seal shows this even if the keystore has lost the identity CA of the release.
         """
         replaced = sorted(
             name
-            for name, files in self._last_published_files()
+            for name, files in last_files
             if self._has_earlier_key(name, files.get(CERTIFICATE_FILE, b""))
         )
         if replaced:
@@ -1027,14 +1028,14 @@ class _Publication:
                 "Then repeat this command, with --restored.",
             )
 
-    def _check_earlier_rights(self) -> None:
+    def _check_earlier_rights(self, last_files: Sequence[tuple[str, Mapping[str, bytes]]]) -> None:
         """Refuse to publish if the last release of an enclave lacks rights that the keystore gives.
 
         The enclave's permissions in the keystore are older than those in the release.
         """
         regained = sorted(
             name
-            for name, files in self._last_published_files()
+            for name, files in last_files
             if self._gives_earlier_rights(name, files.get(PERMISSIONS_FILE, b""))
         )
         if regained:
@@ -1054,9 +1055,10 @@ class _Publication:
         """Return whether an enclave's permissions are older than those sent, and give more."""
         with suppress(SrosError):  # without permissions on one side, no right was taken away
             own = self.keystore.enclave(name, now=self._now).grant
-            (later,) = parse_permissions(smime.parse(sent).text).grants
-            if own and own.validity.not_before < later.validity.not_before:
-                difference = compare(grant_rights(name, later), grant_rights(name, own))
+            later = parse_permissions(smime.parse(sent).text).grants
+            if own and any(own.validity.not_before < each.validity.not_before for each in later):
+                later_rights = frozenset[Right]().union(*(grant_rights(name, e) for e in later))
+                difference = compare(later_rights, grant_rights(name, own))
                 given = (right.qualifier is ALLOW for right in difference.only_second)
                 no_longer_denied = (right.qualifier is DENY for right in difference.only_first)
                 return any(given) or any(no_longer_denied)
