@@ -820,8 +820,11 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     elif publication and publication.accepted is None:
         yield f"it is not known until when robots accept what was published: `{publish}`"
     if status.stage != "complete":
-        behind = counted(len(status.unconfirmed), "robot")
-        yield f"CA rotation: {status.stage}; not confirmed by {behind} yet"
+        behind, robots = len(status.unconfirmed), sum(bool(each.enclaves) for each in status.robots)
+        every = "all " if robots > 1 else ""
+        confirmed = f"not confirmed by {counted(behind, 'robot')} yet"
+        confirmed = confirmed if behind else f"confirmed by {every}{counted(robots, 'robot')}"
+        yield f"CA rotation: {status.stage}; {confirmed}"
     yield from _list_facts(compared_fleet)
     yield from _expiry_facts(compared_fleet)
     if status.unassigned:

@@ -488,6 +488,8 @@ def test_a_rotation_goes_on_when_every_robot_has_confirmed_its_stage(field: Fiel
             said = field.run("fleet", "status", "ks", status=1).out
             assert "CA rotation: distribute; not confirmed by 1 robot yet" in said
             field.confirm("r2", restart=[])
+            said = field.run("fleet", "status", "ks", status=0).out
+            assert "CA rotation: distribute; confirmed by all 3 robots\n" in said
         assert field.states() == dict.fromkeys(ROBOTS, "current")
         assert {each["stage"] for each in field.status()["robots"].values()} == {now}
 
