@@ -131,7 +131,7 @@ def test_requirements_that_a_pull_request_drops_are_decided(origin: Origin, tmp_
     allowed = {"new_access": "allow", "dropped_requirements": "allow"}
     status, said, _ = run_action(origin, clone, **ALL, **allowed)
     assert status == 0, said
-    assert said.startswith("## Review: only what is allowed was found, but 2 things were left out")
+    assert said.startswith("## Review: only allowed changes were found, but 2 things were left out")
 
 
 @sometimes("the installation of the action")

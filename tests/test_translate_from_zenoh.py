@@ -230,7 +230,7 @@ def test_the_verb_says_and_writes_what_it_can(tmp_path: Path) -> None:
     assert ended.status == 1
     assert ended.out.startswith(
         "talker.json5: the configuration of a session (mode peer)\n"
-        "the process itself (talker), by rules that bind only itself\n"
+        "the process itself (talker), by rules that bind only this process\n"
         "  may publish /chatter\n"
         "  may publish /chatter/*\n"
     )
@@ -246,8 +246,8 @@ def test_the_verb_says_and_writes_what_it_can(tmp_path: Path) -> None:
     ("text", "words", "said"),
     [
         ("{", (), "Line 1: it ends too early"),
-        ("{}", ("-o", "x.xml"), "everybody who gets a connection: none is the name of an enclave"),
-        (rules(puts("demo/**")), ("-o", "x.xml"), "They let nobody publish"),
+        ("{}", ("-o", "x.xml"), "everybody who gets a connection, but no such name is the name"),
+        (rules(puts("demo/**")), ("-o", "x.xml"), "The rules let nobody publish"),
         ("{}", ("--mode", "peer"), "--from takes no keystore"),
     ],
 )

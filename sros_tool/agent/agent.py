@@ -113,10 +113,10 @@ _REPLACED_FOR = timedelta(days=30)
 _REPAIRED_FOR = timedelta(days=1)
 """How long the agent reports that it replaced files which differed from the release."""
 _BRING_KEY = (
-    " A release has no keys: bring the key as at the first delivery, with `sros "
-    "distribute_key KEYSTORE --robot {} DIR --force` in the keystore. If the keystore does not "
-    "have the key, because it was made on a robot: if this computer was replaced, switch it off; "
-    "otherwise make a new key, as for new hardware (docs/howto/one_robot.md)."
+    " A release has no keys: bring the key with `sros distribute_key KEYSTORE --robot {} DIR "
+    "--force` in the keystore. The keystore lacks a key that was made on a robot: switch this "
+    "computer off if it was replaced; otherwise make a new key, as for new hardware "
+    "(docs/howto/one_robot.md)."
 )
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _Answer = TypeVar("_Answer")
@@ -294,7 +294,7 @@ class _Round:
         where = f" '{os.fsdecode(error.filename)}'" if error.filename else ""
         text = f"The operating system refuses{where}: {error.strerror or error}."
         if error.errno in _FULL:
-            return f"{text} Make room on the disk of '{self._folder}'; the agent then goes on."
+            return f"{text} Make room on the disk of '{self._folder}'; the agent then continues."
         return text
 
     def _save(self) -> None:
@@ -305,9 +305,9 @@ class _Round:
         now = self._machine.now
         if proven_time and now + _TOLERANCE < proven_time:
             documents_made = (
-                "documents that this robot verified were made at"
+                "verified documents were made at"
                 if self._state.latest
-                else "its certificates are not valid before"
+                else "its certificates begin at"
             )
             self._problems.append(
                 f"The clock shows {iso(now)}, but {documents_made} {iso(proven_time)}: "
@@ -353,7 +353,8 @@ class _Round:
             self._problems.append(_sentence(error))
             if error.problem is FetchProblem.EXPIRED:
                 self._problems.append(
-                    f"By the clock of this robot it is {iso(self._machine.now)}; if that is wrong, "
+                    f"The clock of this robot shows {iso(self._machine.now)}; if the time is "
+                    "wrong, "
                     "set the clock."
                 )
             return Installation(), False
@@ -432,16 +433,18 @@ class _Round:
             unreleased = [name for name in here if _certificate_path(name) not in released]
             for name in (name for name in unreleased if name in newer):
                 self._problems.append(
-                    f"{name} is newer than release {accepted}, which does not have "
-                    "it. Publish it (`sros fleet publish KEYSTORE PUB`), or remove it here: "
-                    "the next release without it removes it, with its key."
+                    f"{name} is newer than release {accepted}, which lacks this enclave. Publish "
+                    "the "
+                    "enclave (`sros fleet publish KEYSTORE PUB`), or remove it here: the next "
+                    "release that lacks the enclave removes its files and its key."
                 )
             if older := [name for name in unreleased if name not in newer]:
                 self._problems.append(
                     f"Release {accepted} of {self._settings.robot} does not have "
                     f"{first_few(older, 3)}, which {'is' if len(older) == 1 else 'are'} here, "
-                    "perhaps from another robot: the next round that can fetch and install removes "
-                    "what is not in the release."
+                    "perhaps "
+                    "from another robot: the next round that can fetch and install removes "
+                    "everything that the release lacks."
                 )
 
     def _note_repaired(self, release: int, paths: Sequence[str]) -> None:
@@ -463,10 +466,10 @@ class _Round:
         self._state = replace(self._state, removed=recent)
         if recent:
             self._problems.append(
-                f"Until {iso(max(recent.values()))}, enclaves that the installed release did not "
-                f"have were here, and were removed: {first_few(sorted(recent), 3)}. If they are of "
-                "another robot, somebody may have copied their keys: `sros renew KEYSTORE ENCLAVE "
-                "--new-key --revoke-old`."
+                f"Until {iso(max(recent.values()))}, the agent removed enclaves that the installed "
+                f"release lacks: {first_few(sorted(recent), 3)}. If they belong to another robot, "
+                "somebody may have copied their keys: `sros renew KEYSTORE ENCLAVE --new-key "
+                "--revoke-old`."
             )
 
     def _note_closed_keys(self, exposed: Mapping[str, datetime], now: datetime) -> None:
@@ -489,10 +492,9 @@ class _Round:
         settings, state = self._settings, self._state
         if release.number == state.accepted and self._differs_from_accepted(release):
             self._problems.append(
-                f"The published release has the number {release.number} {OF_SAME_NUMBER}: "
-                "the keystore comes from a backup, or somebody else publishes. "
-                "Nothing was changed. Where the keystore is: `sros fleet publish KEYSTORE PUB "
-                "--restored`."
+                f"The published release has the number {release.number} {OF_SAME_NUMBER}: the "
+                "keystore comes from a backup, or somebody else publishes. Nothing was changed. On "
+                "the keystore machine, run `sros fleet publish KEYSTORE PUB --restored`."
             )
             return Installation()
         names = tuple({*release.enclaves(), *search_enclaves(self._folder)[0]})
@@ -526,7 +528,7 @@ class _Round:
             self._problems.append(f"{name} keeps its files: {why}.{remedy}")
         for name in installation.removed:
             self._problems.append(
-                f"{name} was removed: release {release.number} does not have it. Stop its "
+                f"{name} was removed: release {release.number} lacks this enclave. Stop its "
                 "processes."
             )
         self._attempt(lambda: write_seal(self._folder, release.seal))
@@ -1007,7 +1009,7 @@ def send(
     if not inbox.startswith(("https://", "http://")):
         _write_message(Path(inbox), robot, message)
         return
-    failure = f"the inbox {inbox} does not take the message"
+    failure = f"the inbox {inbox} does not accept the message"
     try:
         url = urlsplit(inbox)
         where = f"{url.path.rstrip('/')}/{quote(robot)}/{MESSAGE_FILE}"
@@ -1029,7 +1031,9 @@ def send(
     if not 200 <= reply.status < 300:
         kind = RefusedError if reply.status in REFUSALS else UnavailableError
         raise kind(
-            failure, f"It answers {reply.status} to PUT {where}.", "See the log of the server."
+            failure,
+            f"The server answers {reply.status} to PUT {where}.",
+            "See the log of the server.",
         )
 
 

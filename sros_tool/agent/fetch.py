@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from sros_tool.agent.transport import FolderTransport, HttpTransport
 
 OLD_COPY = (
-    "Look at what the server serves, and publish there again. Only if the keystore comes from a "
+    "Check the files on the server, and publish there again. Only if the keystore comes from a "
     "backup: `sros fleet publish KEYSTORE PUB --restored`."
 )
 """Remedy for a source that has less than this robot had."""
@@ -110,7 +110,7 @@ def pin_root(agent_folder: Path, data: bytes, *, now: datetime) -> str:
     try:
         root = Metadata[Root].from_bytes(data)
         if not isinstance(root.signed, Root):
-            raise RepositoryError("it is metadata of another kind")
+            raise RepositoryError("the file has metadata of another kind")
         root.signed.verify_delegate(Root.type, root.signed_bytes, root.signatures)
     except (RepositoryError, ValueError) as error:
         raise FetchError(
@@ -204,7 +204,7 @@ def _transport(
                 FetchProblem.UNREACHABLE,
                 "the certificates for TLS cannot be used",
                 _sentence(error),
-                "Look at the certificate, the key and the CAs in the agent's settings.",
+                "Check the certificate, the key and the CAs in the agent's settings.",
             ) from error
     if "://" in source:
         raise UsageError(
@@ -267,7 +267,7 @@ def _number(target: TargetFile | None, source: str, robot: str) -> int:
             FetchProblem.NOT_FOR_ROBOT,
             f"nothing is published for the robot {robot} in {source}",
             "It is not in the fleet, or all its enclaves were revoked.",
-            "Where the keystore is, run `sros fleet status KEYSTORE`.",
+            "On the keystore machine, run `sros fleet status KEYSTORE`.",
         )
     if target.length > OF_ONE_ROBOT.packed:
         raise FetchError(
@@ -318,15 +318,16 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
         return FetchError(
             FetchProblem.EXPIRED,
             f"{EXPIRED_METADATA[:1].lower()}{EXPIRED_METADATA[1:]}{source} has expired",
-            f"{why} The clock here shows {iso(now)}. Nothing is published any more, {source} has "
-            "an old copy, or somebody withholds the new files.",
-            f"Where the keystore is, run `sros fleet publish{needs}`; {_CLOCK}.",
+            f"{why} The clock here shows {iso(now)}. Either nothing is published any more, or "
+            f"{source} has an old copy of the files, or somebody withholds the new files.",
+            f"On the keystore machine, run `sros fleet publish{needs}`; {_CLOCK}.",
         )
     if isinstance(error, exceptions.BadVersionNumberError):
         return FetchError(
             FetchProblem.ROLLED_BACK,
             f"the files in {source} {OLDER_THAN_SEEN}",
-            f"{why} The server has an older copy than this robot had. Nothing was changed.",
+            f"{why} The server has older files than this robot received before. Nothing was "
+            "changed.",
             OLD_COPY,
         )
     if isinstance(error, exceptions.DownloadLengthMismatchError):

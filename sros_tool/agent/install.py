@@ -198,7 +198,7 @@ def _check_release(
     """Raise `KeystoreError` unless the release is sealed for this robot, usable and not older."""
     if release.robot != robot:
         raise KeystoreError(
-            f"the release is of robot {release.robot}, not of {robot}",
+            f"the release is for robot {release.robot}, not for {robot}",
             "Nothing was changed.",
             "Check whether this robot has the right name (`sros agent init --robot`).",
         )
@@ -213,7 +213,7 @@ def _check_release(
     if release.number < installed:
         raise KeystoreError(
             f"release {release.number} is older than release {installed}, {OLDER_THAN_INSTALLED}",
-            "The server has an older copy than this robot had. Nothing was changed.",
+            "The server has older files than this robot received before. Nothing was changed.",
             OLD_COPY,
         )
     if problem := seal_problem(release, trusted):
@@ -221,9 +221,11 @@ def _check_release(
             f"release {release.number} {OF_OTHER_CA}",
             f"{problem[:1].upper()}{problem[1:].rstrip('.')}. Nothing was changed.",
             "If this robot missed a stage of a CA rotation, bring its files: `sros distribute_key "
-            f"KEYSTORE --robot {robot} FOLDER --force`. If not, look whether the server has an old "
-            "copy, from before a rotation. Otherwise the release comes from another keystore, or "
-            "was changed: find out who can write to the publishing folder.",
+            f"KEYSTORE --robot {robot} FOLDER --force`. If not, check whether the server has an "
+            "old "
+            "copy from before a rotation. Otherwise the release comes from another keystore, or "
+            "was "
+            "changed: find out who can write to the publishing folder.",
         )
     with Folder(folder) as opened:
         usable = [name for name in present if _had_certificate(opened, name)]
@@ -278,10 +280,12 @@ def _check_lists(name: str, files: Mapping[str, bytes], present: Mapping[str, by
             f"The current list has the number {here.number}, the release has {has}: revoked "
             "enclaves would be trusted again. Either the server has an old copy, or the "
             "keystore comes from a backup. Nothing was changed.",
-            "Look at what the server serves, and publish there again. Only if the keystore "
-            "comes from a backup, first run `sros fleet collect KEYSTORE INBOX`, which takes "
-            "the list from the message of this robot; in a rotation, also `sros crl KEYSTORE "
-            f"--refresh --crl FILE`, with {IDENTITY_CA_FILE} of this robot as FILE.",
+            "Check the files on the server, and publish there again. Only if the keystore comes "
+            "from "
+            "a backup, first run `sros fleet collect KEYSTORE INBOX`, which takes the list from "
+            "the "
+            "message of this robot; in a rotation, also `sros crl KEYSTORE --refresh --crl FILE`, "
+            f"with {IDENTITY_CA_FILE} of this robot as FILE.",
         )
 
 
@@ -372,7 +376,8 @@ def _check_not_older(folder: Folder, place: str, sent: OpenedEnclave, now: datet
             raise KeystoreError(
                 f"the release goes back to the {role} CA {authority_text(retired[0])}, which a "
                 "later CA replaced on this robot",
-                "the keystore comes from a backup: replace the CA again where it is, with `sros "
+                "the keystore comes from a backup: replace the CA again in that keystore, with "
+                "`sros "
                 f"rotate_ca KEYSTORE{flag} --finish --allow-unconfirmed`, and publish",
             )
     same_authority = present.files.get(PERMISSIONS_CA_FILE) == sent.files.get(PERMISSIONS_CA_FILE)
@@ -391,8 +396,8 @@ def _check_not_older(folder: Folder, place: str, sent: OpenedEnclave, now: datet
     if same_authority and newer:
         raise KeystoreError(
             "it has newer files than the release",
-            f"{newer[0]}; if the keystore comes from a backup, run `sros renew KEYSTORE --all` "
-            "where it is, and publish",
+            f"{newer[0]}; if the keystore comes from a backup, run `sros renew KEYSTORE --all` in "
+            "that keystore, and publish",
         )
 
 

@@ -323,7 +323,9 @@ class Systemd:
                 stdin=subprocess.DEVNULL,
             )
         except subprocess.TimeoutExpired as error:
-            raise UnavailableError(failure, f"It did not end within {seconds:.0f} s.") from error
+            raise UnavailableError(
+                failure, f"The command did not end within {seconds:.0f} s."
+            ) from error
         except OSError as error:
             raise UnavailableError(failure, f"{error.strerror or error}.") from error
         if done.returncode:

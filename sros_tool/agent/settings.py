@@ -93,7 +93,8 @@ def check_owner(folder: Path) -> None:
         if why:
             raise KeystoreError(
                 f"others can change '{path}'",
-                f"{why[:1].upper()}{why[1:]}. They could choose what the agent trusts and runs.",
+                f"{why[:1].upper()}{why[1:]}. Such users could choose whom the agent trusts, and "
+                "which commands it runs.",
                 f"Remove their right to write: `chmod go-w {path}`.",
             )
 

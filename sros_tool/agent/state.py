@@ -183,8 +183,8 @@ def _outdated_sentences(folder: Path) -> Iterator[str]:
     with suppress(OSError):
         if (agent_folder(folder) / _STATE).stat().st_mtime == 0:
             yield (
-                f"The last round could not write to '{agent_folder(folder)}', so it is not known "
-                "what it did. Make room on the disk."
+                f"The last round could not write to '{agent_folder(folder)}', so its result is not "
+                "known. Make room on the disk."
             )
 
 

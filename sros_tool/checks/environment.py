@@ -134,9 +134,9 @@ OTHER_DISTRIBUTION = FindingKind(
     "`sros check` decided by the rules of the DDS that the keystore's distributions ship. Another "
     "distribution can allow or deny other accesses, without any message.",
     "sros: `distributions` in the settings of a keystore, `distribution` in its fleet file.",
-    "Source one of these distributions. Or check yours (`sros check KEYSTORE` with "
-    "`--upgrade-to`), and add it: `sros update_keystore KEYSTORE --set distributions=NAME,...`, or "
-    "`distribution` in the fleet file.",
+    "Source one of these distributions. Or check your distribution (`sros check KEYSTORE` with "
+    "`--upgrade-to`), and add it to the keystore: `sros update_keystore KEYSTORE --set "
+    "distributions=NAME,...`, or `distribution` in the fleet file.",
 )
 ENCLAVE_NOT_FOUND = FindingKind(
     "runtime.enclave-not-found",

@@ -422,7 +422,9 @@ def _misspelt_name_finding(
     if first.name == misspelt.name:
         kind = first.right.kind.removesuffix("s")
         article = "an" if kind == "action" else "a"
-        hint = f"{first.right.enclave} has it as {article} {kind} ({first.right.right}), unused"
+        hint = (
+            f"{first.right.enclave} has this name as {article} {kind} ({first.right.right}), unused"
+        )
         if misspelt.right.kind == "actions":
             place = RelatedPlace("", *_source_place(first.source))
             remedy = f"Write it at {place} {_as_action(other, first.written)}"
@@ -489,7 +491,7 @@ def _check_protection(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
 
 def _impossible_because(name: str) -> str:
     if len(name) > _LONGEST and not is_expression(name):
-        return f"it has {len(name)} characters, and a ROS name has at most {_LONGEST}"
+        return f"it has {len(name)} characters; a ROS name has at most {_LONGEST}"
     return "a part of it begins with a digit" if _DIGIT_FIRST.search(name) else ""
 
 
@@ -538,8 +540,8 @@ NO_TYPE_DESCRIPTION = FindingKind(
     ERROR,
     "a node that may not offer ~/get_type_description",
     "Nodes of ROS 2 Iron and later offer this service when they start, and exit if it is denied. "
-    "Nodes of earlier distributions, such as Humble, do not have it: if yours is one of them, "
-    "name it with --distro or in $ROS_DISTRO.",
+    "Nodes of earlier distributions, such as Humble, do not have it: for such a distribution, add "
+    "--distro, or set $ROS_DISTRO.",
     "ROS 2 Jazzy, rclcpp 28 and rclpy 7 (node type descriptions interface); Iron, rclcpp 21; "
     "REP-2016.",
     f'Allow <services reply="ALLOW"><service>~/get_type_description</service></services>. '

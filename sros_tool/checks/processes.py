@@ -105,7 +105,7 @@ PROCESS_EXPIRED = FindingKind(
     "runtime.process-expired",
     ERROR,
     "a process whose certificate, permissions or CA has expired",
-    "From now on, processes that start, and processes that discover this process, refuse it.",
+    "Processes that start or discover this process from now on refuse it.",
     "DDS-Security 1.1, 8.3.2.8 and 9.4.1.3.2.2; Fast DDS 2.14.5, Cyclone DDS 0.10.2 (they read "
     "the files when they start).",
     "Renew the enclave (`sros renew KEYSTORE ENCLAVE`), bring it here, and restart the process.",
@@ -144,7 +144,7 @@ PROCESS_KEY_READABLE = FindingKind(
 PROCESS_NOT_SEEN = FindingKind(
     "runtime.process-not-seen",
     WARNING,
-    "processes that could not be looked at",
+    "processes that sros could not examine",
     "Such processes may be nodes, even open or revoked ones. The other findings do not cover them.",
     "proc(5), ptrace(2) (PTRACE_MODE_READ_FSCREDS).",
     "Run the check as root, outside of containers: `sudo sros check runtime`.",
@@ -544,8 +544,8 @@ PROCESS_OTHER_FOLDER = FindingKind(
     "runtime.process-other-folder",
     WARNING,
     "a process that runs in an enclave from another folder",
-    "The process loaded a copy of the enclave's files. What is delivered here, such as a "
-    "revocation list, does not reach it, not even by a restart.",
+    "The process loaded a copy of the enclave's files. Files that are delivered here, such as a "
+    "revocation list, do not reach the process, not even after a restart.",
     "rcl 9 (rcl/src/rcl/security.c): ROS_SECURITY_KEYSTORE names the folder.",
     "Stop the process, start it from the folder that gets new files (`sros run KEYSTORE ENCLAVE -- "
     "COMMAND...`), and remove the copy.",
@@ -584,7 +584,7 @@ PROCESS_ELSEWHERE = FindingKind(
 CONTAINER_ALONE = FindingKind(
     "runtime.container-alone",
     NOTE,
-    "only the processes of this container were looked at",
+    "sros examined only the processes of this container",
     "sros runs in a PID namespace, from which the other processes of the machine cannot be seen.",
     "pid_namespaces(7).",
     "Run `sros check runtime` on the machine itself, too.",
@@ -1058,7 +1058,7 @@ def runtime_metrics(
         ),
         Metric(
             "sros_processes_not_seen",
-            "Number of processes that could not be looked at, which may be nodes.",
+            "Number of processes that sros could not examine, and that may be nodes.",
             (Sample(len(running.unseen) + bool(running.hidden)),),
         ),
         Metric(

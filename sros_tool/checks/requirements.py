@@ -27,18 +27,20 @@ UNNAMED = FindingKind(
     "requirement.unnamed",
     NOTE,
     "a requirement about a name that no right states",
-    "At most wildcards match the name. A misspelled name looks like this, and so does one that is "
-    "to stay unused.",
+    "At most a wildcard matches the name. Either the name is misspelled, or it is meant to stay "
+    "unused.",
     "The requirements file.",
-    "Compare the name with those of the robot; ignore this if it is to stay unused.",
+    "Compare the name with the robot's names; ignore this finding if the name is meant to stay "
+    "unused.",
     prominent=True,
 )
 DROPPED = FindingKind(
     "requirement.dropped",
     ERROR,
     "a requirement that was removed or weakened",
-    "The earlier requirements file was stricter: a policy can now allow what it forbade, without a "
-    "finding.",
+    "The earlier requirements file was stricter: a policy can now allow access that the "
+    "requirement "
+    "forbade, without a finding.",
     "The requirements file, and the one given as --requirements-before.",
     "Restore the requirement, or approve its removal in the review.",
 )
@@ -78,7 +80,8 @@ ROBOTS_LEFT_OUT = FindingKind(
     "requirement.robots-left-out",
     NOTE,
     "requirements were not checked for some robots of the fleet",
-    "The requirements are those of the namespaces that were named, and these robots have others.",
+    "The requirements were checked only in the named namespaces; these robots have other "
+    "namespaces.",
     "The fleet file.",
     "Name their namespaces, too, with --namespace, or ignore this if the requirements are not for "
     "these robots.",
@@ -88,10 +91,12 @@ REMAPPING_UNUSED = FindingKind(
     "requirement.remapping-unused",
     NOTE,
     "a remapping that changes no requirement",
-    "The policy has the new name, or such a node, but no requirement has the old name. An old name "
-    "that is misspelled looks like this, and then requirements on it say nothing of the new name.",
+    "The policy has the new name or node, but no requirement has the old name. If the old name is "
+    "misspelled here, the requirements about it are not applied to the new name.",
     "The requirements file.",
-    "Compare the old name with those in the requirements; ignore this if they do not name it.",
+    "Compare the old name with the names in the requirements; ignore this finding if no "
+    "requirement "
+    "should have the old name.",
     prominent=True,
 )
 NOT_ON_ZENOH = FindingKind(

@@ -17,8 +17,8 @@ DROPPED_DENIAL = FindingKind(
     "review.dropped-denial",
     ERROR,
     "a DENY that the change drops",
-    "It gives no access by itself, but other policies that are merged with this one may allow the "
-    "names now.",
+    "The dropped DENY gives no access by itself, but other policies that are merged with this one "
+    "may now allow the names.",
     "The policies of both commits.",
     "Restore the DENY, or let a reviewer allow it: `--new-access allow`.",
 )
@@ -26,7 +26,7 @@ NOT_REVIEWED = FindingKind(
     "review.file",
     ERROR,
     "a file of the change that the review does not cover",
-    "A policy, or a part of one, could give access that nobody reviewed.",
+    "The file may be a policy, or part of a policy, and give access that nobody reviewed.",
     "The files of both commits.",
     "Name the file with --policy, leave it out with --leave-out, or take it out of the change.",
 )
@@ -52,5 +52,5 @@ UNDECIDED = FindingKind(
     "a part of the review that could not be decided",
     "An undecided part counts as neither passed nor failed.",
     "The files of both commits.",
-    "Repair what the message names, and review again.",
+    "Correct the problem that the message names, and review again.",
 )

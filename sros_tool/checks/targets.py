@@ -112,7 +112,8 @@ def _policies_at(path: Path) -> list[Path]:
         if b"multipart/signed" in begin or b"<dds" in begin:
             raise DocumentError(
                 f"'{path}' is a DDS Security document without its enclave",
-                "Its signature and its subject are checked with the files of the enclave.",
+                "sros checks the signature and the subject of the document with the files of its "
+                "enclave.",
                 f"Name the folder of the enclave, or: `sros inspect {quote(str(path))}`.",
             )
     if policies := list(files_of_policies(path)):

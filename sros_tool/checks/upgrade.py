@@ -85,7 +85,8 @@ VULNERABILITIES = FindingKind(
     NOTE,
     "known vulnerabilities that the update fixes or brings",
     "sros compares the latest release that each of the two distributions ships; `sros check "
-    "runtime` looks at the libraries that processes have loaded.",
+    "runtime` "
+    "examines the libraries that processes have loaded.",
     "Advisories in the OSV format: those of sros, and of --advisories FILE.",
     "Take new vulnerabilities into account before the update. Against vulnerabilities that no "
     "release fixes, keep strangers out of the network.",
@@ -116,7 +117,7 @@ DISTRIBUTION_REFUSES = FindingKind(
     "an enclave that runs on one distribution of the keystore and not on another",
     "The settings of the keystore or its fleet name both distributions.",
     _ENGINE,
-    "Replace what is refused, or correct `distributions` in the settings of the keystore: `sros "
+    "Replace the refused file, or correct `distributions` in the settings of the keystore: `sros "
     "update_keystore KEYSTORE --set distributions=NAME,...`.",
 )
 

@@ -22,8 +22,8 @@ KNOWN_VULNERABILITIES = FindingKind(
     "runtime.known-vulnerabilities",
     WARNING,
     "a DDS with known vulnerabilities",
-    "With some of them, anyone on the network can crash a process with one packet, also on a "
-    "secured robot. The version is from the library that the process has loaded.",
+    "Through some vulnerabilities, anyone on the network can crash a process with one packet, even "
+    "on a secured robot. The version is from the library that the process has loaded.",
     "Advisories in the OSV format: those of sros, and of --advisories FILE.",
     "Upgrade the package of the library to a release with the fixes, and restart the processes. "
     "Against vulnerabilities that no release fixes, keep strangers out of the network.",
@@ -60,17 +60,18 @@ VERSION_UNKNOWN = FindingKind(
     prominent=True,
 )
 _UNSEEN_REMEDY = (
-    "Run `sudo sros check runtime` on the robot: it names the processes that root cannot look at, "
-    "and says why."
+    "Run `sudo sros check runtime` on the robot: it names the processes that even root cannot "
+    "examine, and the reason."
 )
 ROBOTS_UNKNOWN = FindingKind(
     "runtime.robots-dds-unknown",
     NOTE,
-    "robots whose DDS libraries are not known, or only some of them",
+    "robots with DDS libraries that are not known",
     "sros cannot tell which known vulnerabilities they have.",
     "The last confirmations of the robots.",
-    "If nothing was reported or seen, confirm again with this version of sros (`sros fleet report` "
-    f"on the robot), while the nodes run. If processes could not be looked at: {_UNSEEN_REMEDY}",
+    "If no library was reported or seen, confirm again with this version of sros (`sros fleet "
+    "report` on the robot), while the nodes run. If sros could not examine some processes: "
+    f"{_UNSEEN_REMEDY}",
     prominent=True,
 )
 NOTES_ON_LIBRARIES = (PACKAGE_VULNERABILITIES, VERSION_UNKNOWN, ROBOTS_UNKNOWN)
@@ -125,7 +126,7 @@ def robot_findings(
         yield ROBOTS_UNKNOWN.found("DDS of robots", "; ".join(parts), remedy=remedy)
 
 
-_UNSEEN = "some processes of {} could not be looked at"
+_UNSEEN = "some processes of {} could not be examined"
 _SEEN = {Seen.PROCESS: "loaded by processes of", Seen.INSTALLED: "installed, but not loaded, on"}
 
 
@@ -200,7 +201,10 @@ def vulnerability_metrics(
         Metric(
             "sros_dds_known_vulnerabilities",
             "Number of known vulnerabilities of a DDS that processes have loaded, without regard "
-            "to fixes of a package. If several releases are loaded: that of the most vulnerable.",
+            "to "
+            "fixes of a package. If several releases are loaded, the number for the most "
+            "vulnerable "
+            "release.",
             tuple(Sample(number, {"product": name}) for name, number in sorted(most.items())),
         ),
         Metric(
@@ -227,7 +231,7 @@ def _counted_vulnerabilities(advisories: Sequence[Advisory], version: str) -> st
     """Return a clause with the number of vulnerabilities, what they need, and what fixes them."""
     secured = sum("security" in advisory.needs for advisory in advisories)
     needs = (
-        [f"{len(advisories) - secured} concern all processes"] if secured < len(advisories) else []
+        [f"{len(advisories) - secured} affect all processes"] if secured < len(advisories) else []
     )
     needs += [f"{secured} only those with DDS Security"] if secured else []
     needs = ["only with DDS Security"] if secured == len(advisories) else needs

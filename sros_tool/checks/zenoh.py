@@ -76,8 +76,9 @@ DEFAULT_ALLOW = FindingKind(
     "zenoh.default-allow",
     ERROR,
     "access control that allows what no rule denies",
-    "A query or a put with a wildcard gets past a deny rule, and a process that matches two "
-    "subjects is denied only what both subjects deny.",
+    "A query or a put with a wildcard gets past a deny rule, and if a process matches two "
+    "subjects, "
+    "a name is denied only if both subjects deny it.",
     _TESTED,
     'Write "default_permission": "deny", and rules that allow.',
 )
@@ -85,8 +86,8 @@ NOTHING_ALLOWED = FindingKind(
     "zenoh.nothing-allowed",
     WARNING,
     "access control under which no message passes",
-    "No policy gives a subject a rule, and the default is to deny: sessions open, and Zenoh drops "
-    "everything without a log line.",
+    "The default is to deny, and no policy gives a subject a rule: sessions open, but Zenoh drops "
+    "every message without a log line.",
     _TESTED,
     _BY_SROS,
 )
@@ -104,9 +105,9 @@ SELF_LIMITING = FindingKind(
     "zenoh.self-limiting",
     ERROR,
     "a session whose rules bind only itself",
-    "No rule names another process: the rules say what this process may do, and only this process "
-    "itself obeys them. Any other process with a certificate of the CA publishes to it, and reads "
-    "from it.",
+    "No rule names another process: the rules state only the rights of this process, and no other "
+    "process enforces them. Any other process with a certificate of the CA publishes to it, and "
+    "reads from it.",
     "zenoh_security_tools writes such files; Zenoh 1.10.2, tested.",
     _BY_SROS,
 )
@@ -132,8 +133,9 @@ OVERLAPPING = FindingKind(
     "zenoh.overlapping-subjects",
     WARNING,
     "subjects that match the same process",
-    "Such a process has the rights of both subjects; up to Zenoh 1.5.1, the rights of one of them, "
-    "by chance.",
+    "Such a process has the rights of both subjects; up to Zenoh 1.5.1, by chance, the rights of "
+    "one "
+    "subject only.",
     "Zenoh 1.5.1 (issue 2137 of zenoh) and 1.10.2, tested.",
     "Use one subject for each name.",
 )
@@ -354,7 +356,7 @@ def _rule_findings(document: ConfigurationDocument) -> Iterator[Finding]:
         text = "default_permission is allow"
         yield _finding_at(document, DEFAULT_ALLOW, f"{_ACCESS}/default_permission", text)
     elif not any(rule.allows for s in access.subjects for rule in access.rules_of(s.id)):
-        text = "no policy gives a subject a rule that allows"
+        text = "no subject has a rule that allows anything"
         yield _finding_at(document, NOTHING_ALLOWED, f"{_ACCESS}/policies", text)
         return
     used = {rule.id for subject in access.subjects for rule in access.rules_of(subject.id)}

@@ -238,8 +238,8 @@ def _unit(text: str) -> Unit:
 )  # fmt: skip
 @click.option(
     "--restarted", is_flag=True,
-    help="With --once: all processes were restarted since the last round, even those that the "
-    "agent cannot see. This does not count for files that this round installs.",
+    help="With --once: all processes were restarted since the last round, even processes that the "
+        "agent cannot see. This does not count for files that this round installs.",
 )  # fmt: skip
 @json_option
 def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool) -> int:
@@ -323,8 +323,9 @@ def _round_lines(folder: Path, finished_round: Round, *, restarted: bool) -> Ite
     yield f"{release}: {', '.join(changes) or no_change}"
     if restarted and finished_round.unseen:
         yield (
-            "--restarted does not count for files that came in this round, after the restart: "
-            f"those of {first_few(finished_round.unseen, _MOST_SHOWN)}"
+            "--restarted does not count for files that came in this round after the restart: files "
+            "of "
+            f"{first_few(finished_round.unseen, _MOST_SHOWN)}"
         )
     yield from _due_lines(folder, finished_round.restart, finished_round.unseen)
     if finished_round.requests:
@@ -338,8 +339,8 @@ def _due_lines(folder: Path, due_enclaves: Sequence[str], unseen: Sequence[str])
     if unseen:
         yield (
             "sros cannot see all processes here; once the processes of "
-            f"{first_few(unseen, _MOST_SHOWN)} were restarted, or none of them runs, say so: `sros "
-            f"agent run {quote(str(folder))} --once --restarted`"
+            f"{first_few(unseen, _MOST_SHOWN)} were restarted, or if no such process runs, confirm "
+            f"this: `sros agent run {quote(str(folder))} --once --restarted`"
         )
 
 

@@ -76,8 +76,9 @@ if TYPE_CHECKING:
 @click.option(
     "--unjudged",
     is_flag=True,
-    help="Exit with 0 if nothing is denied, even if a part of the graph could not be judged, or "
-    "the graph kept changing.",
+    help="Exit with 0 if nothing is denied, even if sros could not judge a part of the graph, or "
+    "the "
+    "graph kept changing.",
 )
 @fleet_option("The robots that the placeholders of POLICY stand for.")
 @force_option
@@ -237,12 +238,14 @@ def audit(
 
 
 _UNSEEN = "nodes were not seen (--watch finds nodes that start later, --partial accepts this)"
-_UNJUDGED = "something was not judged, or the graph kept changing (--unjudged accepts this)"
-_TO_ALLOW = (
-    "to allow what is denied, add --patch missing.xml to this command: it writes missing rights "
-    "as a policy, and names the command that adds them"
+_UNJUDGED = (
+    "a part of the graph was not judged, or the graph kept changing (--unjudged accepts this)"
 )
-_NO_PATCH = "no patch was written: no added right would allow what is denied"
+_TO_ALLOW = (
+    "to allow the denied access, add --patch missing.xml: sros then writes the missing rights as a "
+    "policy, and names the command that adds them"
+)
+_NO_PATCH = "no patch was written: no additional right would allow the denied access"
 
 
 def _write_patch(audited: Audit, patch: Path | None, *, dry_run: bool) -> str:
@@ -299,4 +302,4 @@ def _show(
         verdict += f"; the ROS graph kept changing for {changing_seconds:.0f} s"
     echo(verdict, err=True)
     if any(denied_right.by_rule for denied_right in audited.denied):
-        echo("some rights are denied by a DENY, which no added right overrides", err=True)
+        echo("a DENY denies some rights; no additional right overrides a DENY", err=True)

@@ -172,10 +172,11 @@ def print_closed(root: Path, changes: Sequence[Change], *, keystore: Path | None
     if any(change.action == "adopt" for change in changes):
         echo(
             f"took over '{root}', which ros2/sros2 made: it has settings and a ledger from now on. "
-            "The existing certificates and permissions that its CA signed are trusted: nothing "
-            "shows whether somebody put back a file that had been replaced or withdrawn. Compare "
-            "the rights of each enclave with your policy: `sros diff_policy "
-            f"{quote(str(keystore or root))} POLICY_FILE`.",
+            "The existing certificates and permissions that its CA signed are trusted: sros cannot "
+            "see whether somebody put back a replaced or withdrawn file. Compare the rights of "
+            "each "
+            f"enclave with your policy: `sros diff_policy {quote(str(keystore or root))} "
+            "POLICY_FILE`.",
             err=True,
         )
     closed = [str(root / change.path) for change in changes if change.action == "close"]
@@ -236,5 +237,7 @@ def _print_restart(
         text += f"; of those on Zenoh: {shown_names(zenoh.restart) or 'none'}"
     if exported and (published := publish_command(root)):
         text += f"; robots that fetch: {published} first"
-    export_again = "; if they run from an export, export them again first" if exported else ""
+    export_again = (
+        "; if processes run from an export, export their enclaves again first" if exported else ""
+    )
     echo(text + export_again, err=True)

@@ -141,8 +141,8 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
     type=PATH,
     multiple=True,
     metavar="FILE",
-    help="An earlier version of the --requirements file: report requirements that were "
-    "dropped since.",
+    help="An earlier version of the --requirements file: report requirements that the current file "
+    "lacks.",
 )
 @click.option(
     "--namespace",
@@ -465,7 +465,7 @@ def _one_path(family: str, paths: tuple[Path, ...], option: str) -> Path:
         if not path.is_dir() or is_keystore(path):
             return path
     raise UsageError(
-        f"{option} takes one policy file or keystore", "", "Run the command once for each of them."
+        f"{option} takes one policy file or keystore", "", "Run the command once for each argument."
     )
 
 
@@ -486,7 +486,7 @@ def _not_one_system(option: str) -> UsageError:
     return UsageError(
         f"{option} takes one keystore, or the policies of one robot or fleet",
         "Several policies count as one.",
-        "Run the command once for each of them.",
+        "Run the command once for each argument.",
     )
 
 
@@ -1051,7 +1051,7 @@ def metrics(
     if fleet_file and not policies:
         raise UsageError("--fleet is for the placeholders of a policy: add --policy FILE")
     if advisories and not runtime:
-        raise UsageError("--advisories is for the DDS of processes: add --runtime")
+        raise UsageError("--advisories needs the DDS of processes: add --runtime")
     known = advisories_of(advisories)
     circumstances = _circumstances(None, None, policies, fleet_file, (root,))
     with progress("examining"):

@@ -70,8 +70,9 @@ def _run(words: Sequence[str], shows_output: bool) -> tuple[int, str, str]:
 @click.option(
     "--partial",
     is_flag=True,
-    help="Accept processes whose nodes sros does not know, nodes that no process here has, and "
-    "processes that could not be looked at.",
+    help="Accept processes whose nodes sros does not know, nodes that belong to no process here, "
+    "and "
+    "processes that sros could not examine.",
 )
 @click.option(
     "--without",
@@ -156,7 +157,7 @@ def close(
             raise UsageError(
                 f"there is no folder '{folder}' here",
                 f"This is '{Path.cwd()}'.",
-                "Name the folder of the closed robot, or go to where it is.",
+                "Name the folder of the closed robot, or change to the folder above it.",
             )
         name = shlex.quote(str(folder))
         raise UsageError(f"'{folder}' has no watched robot", "", f"Run `sros close {name}` first.")
@@ -193,13 +194,13 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
     policy = read_policy(robot.policy)
     if not closed.is_signed:
         return
-    echo(f"who may do what, except what every node needs (everything: {robot.page}):")
+    echo(f"rights, without those that every node needs (all rights: {robot.page}):")
     for line in access_lines(policy, robot.folder):
         echo(f"  {line}")
     for left_open in unguarded(OpenedKeystore(robot.keystore).governance):
         does = f"{left_open.direction} DDS topic {left_open.topic}"
         echo(f"  every enclave may {does}: the governance of the keystore leaves it open")
-    echo(f"how to restart each process with security (all of it: {robot.start}):")
+    echo(f"how to restart each process with security (all files: {robot.start}):")
     for process in closed.observed.processes:
         echo(f"  {_process_line(process, closed, policy)}")
     for why in dict.fromkeys(closed.outdated.values()):
@@ -213,7 +214,7 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
         echo(naming)
     if not_here := closed.observed.not_here:
         bring = f"sros distribute_key {shlex.quote(str(robot.keystore))} ENCLAVE FOLDER"
-        echo(f"not on this machine: {', '.join(not_here)} (to bring one there: {bring})")
+        echo(f"not on this machine: {', '.join(not_here)} (to bring an enclave there: {bring})")
     if outside := robot.processes.enclaves_outside(policy):
         echo(f"seen when sros watched, and not in the policy: {', '.join(outside)}")
     for right in closed.newly_denied[:_MOST_DENIED]:
@@ -222,8 +223,9 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
         echo(f"  and {counted(len(more), 'right')} more (--json has all)")
     if closed.newly_denied:
         echo(
-            "  if this is not intended, change the policy; if it is intended, the node may end "
-            "when it starts"
+            "  if this is a mistake, change the policy; otherwise, expect that the node may end "
+            "when "
+            "it starts"
         )
     if stays := len(closed.denied) - len(closed.newly_denied):
         rights = counted(stays, "right")
@@ -251,7 +253,7 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
         sign = signs.get(process.known_by, f"its {process.known_by}")
         state = f"process {process.pid}" + ("" if runs else f", known by {sign}")
     elif runs:
-        state = "runs by another command than the observed one, which sros keeps (to replace "
+        state = "runs by a new command; sros keeps the observed command (to replace "
         state += "it, watch the open robot again)"
     else:
         ended = process.enclave in closed.observed.ended
@@ -285,9 +287,10 @@ def _naming(closed: CloseState, policy: Policy) -> str:
         return ""
     folder = closed.folder
     return (
-        f"{enumerated(several)}: named after one of several nodes; to choose another name, "
-        f"replace the name in {folder / 'policy.xml'} and {folder / 'requirements.toml'} now; when "
-        "processes run closed, they have to be restarted for that"
+        f"{enumerated(several)}: named after one of several nodes; to choose another name, replace "
+        f"the name in {folder / 'policy.xml'} and {folder / 'requirements.toml'} now, because "
+        "closed "
+        "processes would need a restart"
     )
 
 
@@ -299,7 +302,9 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
     ask = f"sros close {folder} --proof"
     idle = closed.stopped if closed.secured else {*observed.ended}
     if stopped := sorted(idle.intersection(closed.pending)):
-        ask += "; what does not always run: " + " ".join(f"--without {name}" for name in stopped)
+        ask += "; for enclaves without a running process: " + " ".join(
+            f"--without {name}" for name in stopped
+        )
     for proof in closed.proofs:
         accept = " (--partial accepts this)" if proof.is_accepted_by_partial else ""
         echo(f"{_ANSWERS[proof.holds]}: {proof.claim}: {proof.reason}{accept}")
@@ -310,7 +315,7 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
         answer = f"next: sros close {folder}{' --apply' if apply else ''}"
     elif holds:
         is_asked = all(proof.holds for proof in closed.proofs)
-        exceptions = "" if is_asked else ", except for what was not checked"
+        exceptions = "" if is_asked else ", except for the claims that were not checked"
         if missing := [name for name in closed.without if name not in closed.secured]:
             exceptions += f", without a process of {', '.join(missing)}"
         following = "; next: have them renewed before then (docs/howto/close.md, Renewal without "
@@ -320,7 +325,9 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
         answer = f"the robot is closed{exceptions}{_until(closed)}{following}"
     elif closed.proofs:
         accept = _ACCEPT if closed.is_proved(partial=True) else ""
-        next_command = f"mend what the lines name, and ask again with sros close {folder} --proof, "
+        next_command = (
+            f"correct the problems above, and ask again with sros close {folder} --proof, "
+        )
         next_command += "or go back with --undo"
         answer = f"the robot is not proved closed; next: {accept}{next_command}"
     elif apply:
@@ -391,9 +398,9 @@ def _elsewhere(robot: LocalRobot, closed: CloseState) -> str:
     """Return which files other machines need; sros does not see whether they have them."""
     needed = ", ".join(f"{name} ({iso(of)})" for name, of in closed.needed_elsewhere.items())
     return needed and (
-        f"; on other machines, files from before these times have to be replaced, and the process "
-        f"restarted: {needed}: sros distribute_key {shlex.quote(str(robot.keystore))} ENCLAVE "
-        "FOLDER --force"
+        "; on other machines, replace files that are older than these times, and restart the "
+        f"process: {needed}: sros distribute_key {shlex.quote(str(robot.keystore))} ENCLAVE FOLDER "
+        "--force"
     )
 
 
@@ -427,4 +434,4 @@ def _started_together(processes: Sequence[ClosedProcess]) -> str:
 _MOST_DENIED = 4
 _ANSWERS = {True: "yes", False: "no", None: "not checked"}
 _NOT_CURRENT = "with earlier files or other settings"
-_ACCEPT = "accept with --partial what could not be checked, "
+_ACCEPT = "accept unchecked claims with --partial, "

@@ -64,8 +64,8 @@ _STREAM = Path("-")
 @click.option(
     "--keyless",
     is_flag=True,
-    help="Also export enclaves whose keys were made on their robots, without the keys. Keys that "
-    "are in KEYSTORE are exported as always.",
+    help="Also export enclaves whose keys were made on their robots, without the keys. Keys in "
+    "KEYSTORE are exported in any case.",
 )
 @dry_run_option
 @json_option
@@ -194,7 +194,7 @@ def _refuse_terminal() -> None:
     if sys.stdout is not None and sys.stdout.isatty():
         raise UsageError(
             "an archive would be written to this terminal",
-            "It is binary, and it may contain private keys.",
+            "The archive is binary, and may contain private keys.",
             "Use a pipe, such as `| ssh robot tar -xz -C /etc/robot`, or name a file.",
         )
 
@@ -407,7 +407,7 @@ def sign_request(
     work: Callable[..., SignedRequests] = certify_requests
     if no_answer:
         if output is not None or force:
-            raise UsageError("--no-answer makes no file: leave out -o and --force")
+            raise UsageError("--no-answer writes no file: leave out -o and --force")
     else:
         if output is None:
             streamed = request == _STREAM
@@ -557,8 +557,8 @@ def _imported_lines(imported_enclave: ImportedEnclave, *, pinned: bool) -> Itera
         yield f"  and {_ca_text(imported_enclave.permissions_ca)}"
     if imported_enclave.first and not pinned:
         yield (
-            "  compare both with the output of sign_request, or use --ca: otherwise they are "
-            "not verified"
+            "  compare both with the output of sign_request, or use --ca: import alone does not "
+            "verify them"
         )
 
 

@@ -296,7 +296,7 @@ def explain(
     root, rest = _split(arguments, keystore, verb=0 if who else 1)
     if logs and root and policy:
         raise UsageError(
-            "--log takes a keystore or a policy",
+            "--log takes either a keystore or a policy",
             "A process decides by the signed permissions of its keystore.",
             f"Leave --policy out; or name the policy alone: `sros explain {quote(str(policy))} "
             f"--log {quote(logs[0])}`.",
@@ -309,7 +309,7 @@ def explain(
         raise UsageError("--fleet goes with a policy only", "", "Leave it out.")
     if reach:
         if vendor not in (None, ZENOH):
-            text = "It follows the rights, which are the same for all DDS vendors."
+            text = "--reach follows rights, which are the same for all DDS vendors."
             raise UsageError("--reach takes only --vendor zenoh", text, "Leave it out.")
         stated = policy, fleet_file
         zenoh = bool(_reason_for_zenoh(vendor, opened))
@@ -420,7 +420,7 @@ def _notes_on_past(moment: datetime, keystore: OpenedKeystore | None) -> Iterato
     if keystore:
         with suppress(SrosError):
             changes = sum(entry.time > iso(moment) for entry in keystore.ledger.entries)
-    text = "the current files decide for that time: they do not show what was allowed then"
+    text = "the answer is by the current files, not by the files of that time"
     if changes:
         text += f"; {counted(changes, 'entry', 'entries')} of ledger.jsonl are from after that time"
     yield Note("explain.past", text)
@@ -577,7 +577,7 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
     yield f"{may} {answer.question}, on {answer.vendor.title} ({why}{documented})"
     yield _labeled_row("why", decision.clause)
     if answer.counts_key:
-        yield _labeled_row("key", "not here; the answer assumes that the process has the key")
+        yield _labeled_row("key", "missing here; the answer assumes that the process has the key")
     yield from (_labeled_row("and", str(problem)) for problem in answer.problems[1:])
     if len(answer.parts) > 1 and not answer.allowed:
         for part in answer.parts:
@@ -612,7 +612,7 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
         from sros_tool.keystore.layout import CERTIFICATE_FILE
 
         dropped = answer.vendor.traits.drops_expired and answer.until_file == CERTIFICATE_FILE
-        then = "; running nodes lose their peers then" if dropped else ""
+        then = "; then running nodes lose their peers" if dropped else ""
         yield _labeled_row("until", f"{iso(answer.until)}, when {answer.until_file} expires{then}")
     yield from _to_do_lines(answer)
 
@@ -768,7 +768,8 @@ def _link_lines(answer: ZenohAnswer) -> Iterator[str]:
     if more := links[_MOST_SHOWN:]:
         passing = sum(link.passes for link in more)
         yield _labeled_row(
-            "link", f"{len(more)} more: {passing} pass it, {len(more) - passing} drop it"
+            "link",
+            f"{len(more)} more links: {passing} pass the message, {len(more) - passing} drop it",
         )
 
 
@@ -880,8 +881,12 @@ def _policy_to_decide(
 
     patterns, robots = only
     if keystore:
-        text = "A keystore is asked about what it has signed."
-        raise UsageError("--who takes a keystore or a policy", text, "Leave one of them out.")
+        text = "In a keystore, the signed permissions decide, not a policy."
+        raise UsageError(
+            "--who takes either a keystore or a policy",
+            text,
+            "Leave out the keystore or the policy.",
+        )
     if chosen_vendor is None:
         text = "A policy has no Zenoh files; `sros zenoh KEYSTORE` writes them."
         raise UsageError("--who on Zenoh takes no policy", text, "Name the keystore.")
@@ -1012,7 +1017,7 @@ def _show_reach(
         raise UsageError("--reach takes an enclave, and no operation or name")
     if zenoh and policy:
         raise UsageError(
-            "--reach on Zenoh takes no --policy", "It uses the keystore's Zenoh files."
+            "--reach on Zenoh takes no --policy", "On Zenoh, the keystore's Zenoh files decide."
         )
     if zenoh:
         source = load_zenoh_rights(keystore or _keystore_of_environment())
@@ -1085,8 +1090,8 @@ def _show_log(
         echo(
             f"none of {counted(lines, 'line')} {clause}: {_text_without_findings(text)}"
             if lines
-            else "the log is empty: it says nothing about its node. `sros check runtime` on that "
-            "machine says how its processes run",
+            else "the log is empty: it shows nothing about its node. `sros check runtime` on the "
+            "node's machine shows how processes run",
             err=True,
         )
         if _ZENOH_TESTS in text:
@@ -1096,7 +1101,7 @@ def _show_log(
 
 _SILENT_ON_ZENOH = (
     "on Zenoh, a denied node logs nothing: start it and the router with RUST_LOG=zenoh=trace for "
-    "another log, or ask about each of its names: `sros explain KEYSTORE ENCLAVE "
+    "another log, or ask about each name of the node: `sros explain KEYSTORE ENCLAVE "
     "publish|subscribe|call|serve NAME --vendor zenoh`"
 )
 
@@ -1111,16 +1116,17 @@ def _text_without_findings(log: str) -> str:
     match = SECURITY_DIRECTORY.search(log)
     if match is None:
         return (
-            "no line says 'Found security directory': on DDS, its nodes ran open, or the log is "
-            "not complete. `sros check runtime` on that machine says how its processes run; "
+            "no line says 'Found security directory': on DDS, either the nodes ran open, or the "
+            "log "
+            "is incomplete. `sros check runtime` on the nodes' machine shows how processes run; "
             f"{_SILENT_ON_ZENOH}"
         )
     return (
         f"the log shows nothing that was refused to a node in '{match['folder']}'. If a file was "
         "missing and the strategy was not Enforce, it runs open: `sros check runtime` on its "
-        "machine shows that, and the clock. If it hears nothing, peers may refuse it silently: "
-        "explain their logs, and run `sros check FOLDER OTHER` (CAs, revocation list, governance, "
-        "domains); on Zenoh, only logs with RUST_LOG=zenoh=trace have denials"
+        "machine shows this, and the clock. If it hears nothing, peers may refuse it "
+        "silently: explain their logs, and run `sros check FOLDER OTHER` (CAs, revocation list, "
+        "governance, domains); on Zenoh, only logs with RUST_LOG=zenoh=trace have denials"
     )
 
 

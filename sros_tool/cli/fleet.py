@@ -120,8 +120,9 @@ def _inventory(root: Path, as_yaml: bool, as_list: bool) -> None:
 @click.option("--robot", metavar="NAME", required=True, help="The name of this robot.")
 @click.option(
     "--restarted", is_flag=True,
-    help="All processes were restarted since the files were brought, even those that sros "
-        "cannot see.",
+    help="All processes were restarted since the files were brought, even processes that sros "
+        "cannot "
+        "see.",
 )  # fmt: skip
 def _report(folder: Path, robot: str, restarted: bool) -> None:
     """On a robot, print a report of its enclaves' files and its DDS, for `fleet confirm`.
@@ -352,7 +353,10 @@ def _collect(
         deliver = publish_command(root) or (
             f"`sros distribute_key {where} --robot NAME FOLDER --force`"
         )
-        echo(f"robots have new files in the keystore; to bring them there: {deliver}", err=True)
+        echo(
+            f"the keystore has new files for robots; to bring them to the robots: {deliver}",
+            err=True,
+        )
     if problem:
         raise problem
     if collected.not_signed:
@@ -453,8 +457,9 @@ _VALIDITIES = {
 @click.option(
     "--new-folder",
     is_flag=True,
-    help="Publish to PUB although it lacks everything that the keystore published before: it is a "
-    "new folder, or replaces a lost folder.",
+    help="Publish to PUB although PUB lacks the files that the keystore published before, because "
+    "PUB "
+    "is a new folder, or replaces a lost folder.",
 )
 @dry_run_option
 @json_option
@@ -583,7 +588,7 @@ class ComparedFleet(NamedTuple):
 @click.option(
     "--max-age",
     metavar="DURATION",
-    help="Robots without a confirmation for longer than this are offline. [default: 1d for robots "
+    help="A robot is offline if its last confirmation is older than this. [default: 1d for robots "
     "that fetch]",
 )
 @click.option(
@@ -798,12 +803,12 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     publish = f"sros fleet publish {quote(str(status.keystore))} {quote(folder or 'PUB')}"
     root_end = publication.root_expires if publication else None
     publish += " --root-key FILE" if root_end and root_end <= compared_fleet.at else ""
-    restored = f"`{publish} --restored`; docs/howto/keystore_is_lost.md says what else"
+    restored = f"`{publish} --restored`; docs/howto/keystore_is_lost.md has the other steps"
     if status.edited:
         remedy = FLEET_REMEDY.replace("KEYSTORE", quote(str(status.keystore)))
         yield f"perhaps not all robots are shown: the fleet file {status.edited}. {remedy}"
     if status.clock:
-        yield f"{status.clock}: how old the confirmations are is not known. Set the clock"
+        yield f"{status.clock}: the age of the confirmations is not known. Set the clock"
     if status.older:
         yield f"the keystore is older than its robots: {status.older}. Publish with {restored}"
     elif any(robot.state == "later" for robot in status.robots):
@@ -813,12 +818,12 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         yield f"'{folder}' lacks {publication.lacks}, which robots fetch: `{publish}`{decide}"
     elif publication and publication.refused:
         why = publication.refused
-        yield f"what was published does not verify: {why}. `{publish}` says what to do"
+        yield f"the published files do not verify: {why}. Run `{publish}`, which prints the remedy"
     elif publication and publication.accepted is False and publication.expires:
         ago = elapsed(compared_fleet.at - publication.expires)
-        yield f"what was published expired {ago} ago, so robots get no new files: `{publish}`"
+        yield f"the published files expired {ago} ago, so robots get no new files: `{publish}`"
     elif publication and publication.accepted is None:
-        yield f"it is not known until when robots accept what was published: `{publish}`"
+        yield f"the expiry of the published files is not known: `{publish}`"
     if status.stage != "complete":
         behind, robots = len(status.unconfirmed), sum(bool(each.enclaves) for each in status.robots)
         every = "all " if robots > 1 else ""
@@ -829,7 +834,7 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     yield from _expiry_facts(compared_fleet)
     if status.unassigned:
         number = counted(status.unassigned, "enclave")
-        yield f"{number} of no robot: not covered by the confirmations of robots"
+        yield f"{number} belong to no robot, so no confirmation covers them"
 
 
 def _list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
@@ -843,7 +848,7 @@ def _list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
             robot.has_list and robot.crl_in_force is False for robot in status.robots
         ):
             have = "have" if waiting > 1 else "has"
-            text += f"; {waiting} more {have} it, but it is not known that all processes there "
+            text += f"; {waiting} more {have} the list, but perhaps not all processes there "
             text += "have loaded it and the current CAs"
         if (until := status.revoked_until) and until > compared_fleet.at:
             text += f"; robots need it until {until:%Y-%m-%d}, when "
@@ -875,10 +880,11 @@ def _remedies(status: FleetStatus, to_dos: Collection[str]) -> Mapping[str, str]
     )
     to_renew = [robot for robot in status.robots if robot.to_do == "renew"]
     known = {
-        "find out why": "see whether the robot is on, and which machine reports as this robot: it "
-        "may have a wrong name, or a copied disk. If it has files of another robot, it can act as "
-        f"that one until `sros renew {where} --robot OTHER --new-key --revoke-old`; then deliver "
-        "to both",
+        "find out why": "check whether the robot is on, and which machine reports as this robot: "
+        "that machine "
+        "may have a wrong name, or a copied disk. If it has files of another robot, it can act "
+        f"as that robot until `sros renew {where} --robot OTHER --new-key --revoke-old`; then "
+        "deliver to both",
         "deliver": by_hand,
         "publish": publish_command(root),
         "renew": f"`{renewal_command(root)}`, then {_bringing(root, to_renew)}",
@@ -943,7 +949,7 @@ def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         command = ""  # the keystore has renewed these files
     bring = f"{command}{_bringing(root, soon)}"
     if not command and all(robot.has_release for robot in soon):
-        bring = "new files are published; the column `to do` says what to do"
+        bring = "new files are published; see the column `to do`"
     yield f"{label}: {when} ({first}, {_KINDS.get(kind, kind)}){others}: {bring}"
 
 
@@ -1203,15 +1209,15 @@ def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
             f"release {robot.release or 'none'}; the published one is {robot.published or 'none'}"
         )
     elif robot.fetches and robot.pending and not has_the_rest:
-        other = f"its files are not those of the published release {robot.release}"
+        other = f"its files differ from the published release {robot.release}"
         yield other if robot.is_published else "not published yet"
     if robot.fetches and robot.lacks_key:
         names = first_few(robot.lacks_key, _MOST_GROUPS)
         yield f"lacks the key of {names}, which no release brings"
     elif robot.lacks_ca:
-        yield "does not trust the CA that seals releases, so fetching cannot help"
+        yield "does not trust the CA that seals releases: fetching does not change this"
     elif robot.is_locked_out(moment):
-        why = "have expired, were revoked, or are of an identity CA that was replaced"
+        why = "have expired, were revoked, or are of a replaced identity CA"
         yield f"all its certificates {why}: a web server with the current CA and list refuses it"
     seen = [name for name in robot.restart or () if (robot.running or {}).get(name) == "earlier"]
     if seen:
@@ -1251,12 +1257,13 @@ def _details(robot: RobotStatus) -> Iterator[str]:
         how = "loaded" if library.seen == "process" else "installed, not loaded"
         yield f"  {library.product} {version}, {how}: {library.path}"
     if robot.dds and robot.dds.unseen:
-        yield f"  {counted(robot.dds.unseen, 'process', 'processes')} could not be looked at"
+        yield f"  {counted(robot.dds.unseen, 'process', 'processes')} could not be examined"
     pending = robot.pending
     if robot.revoked and not robot.enclaves:
         yield (
-            f"  {counted(len(pending), 'file')} of its revoked enclaves: nothing is delivered to "
-            "it, and only whoever has the robot can remove them"
+            f"  {counted(len(pending), 'file')} of its revoked enclaves: no file is delivered to "
+            "this "
+            "robot, and only somebody at the robot can remove these files"
         )
         pending = ()
     for file in pending[:_MOST_LINES]:

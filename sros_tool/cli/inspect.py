@@ -186,9 +186,11 @@ def _show_history(keystore: OpenedKeystore, policy: Path | None, as_json: bool) 
         if policy:
             number = counted(len({item.entry.enclave for item in changes.entries}), "enclave")
             echo(
-                f"permissions of {number} were signed from '{policy}', as it is now; others can "
-                f"have the same rights from an earlier version: `sros diff_policy "
-                f"{quote(str(policy))} {quote(str(keystore.root))}` compares the rights",
+                f"permissions of {number} were signed from the current '{policy}'; permissions "
+                "from "
+                "an earlier version can have the same rights: `sros diff_policy "
+                f"{quote(str(policy))} "
+                f"{quote(str(keystore.root))}` compares the rights",
                 err=True,
             )
     no_entry = policy is not None and not changes.entries

@@ -164,7 +164,9 @@ def create_permission(
         if robot.name in robots and name not in chosen
     ]
     if left_out:
-        text = "left out, because the keystore lacks them, or has them as enclaves of no robot: "
+        text = (
+            "left out, because the keystore lacks them, or because they belong to no robot there: "
+        )
         text += f"{shown_names(left_out)}. `sros generate_artifacts --robot` creates them, too."
         result = replace(result, notes=(*result.notes, Note("enclave.left-out", text)))
     _show(result, as_json, [policy])
@@ -372,13 +374,17 @@ def _next_step_hints(result: Creation, as_json: bool) -> Iterator[str]:
         )
     elif len(result.created) > MAX_NAMES and not (as_json or result.dry_run):
         selection = "--robot NAME" if (result.root / FLEET).exists() else "ENCLAVE..."
-        yield f"to send them: `sros distribute_key {quote(str(result.root))} {selection} FOLDER`"
+        yield (
+            f"to export these enclaves: `sros distribute_key {quote(str(result.root))} {selection} "
+            "FOLDER`"
+        )
     if published and has_robot((*result.changed, *result.completed)):
         yield f"robots that fetch get the changed files by {published}"
     elif result.changed and not (as_json or result.dry_run):
         yield (
-            "running processes keep the earlier files: restart them, after a new export if they "
-            "use one"
+            "running processes keep the earlier files: restart them; first export again if they "
+            "use "
+            "an export"
         )
     if result.revoked:
         verb = "would revoke" if result.dry_run else "revoked"
@@ -849,7 +855,7 @@ def update_keystore(
     _show_update(update, undone, command, as_json)
     refused = bool(update.looser) and not allow_looser
     if refused:  # only in a dry run; else an error was raised
-        echo("this would be refused: it needs --allow-looser", err=True)
+        echo("this change would be refused: it needs --allow-looser", err=True)
     return 1 if refused else 0
 
 
@@ -953,9 +959,10 @@ def _replaced_lines(update: KeystoreUpdate) -> Iterator[str]:
         if update.left:
             ends = f"add --revoke-old to the stage {update.left[-1]}, or {ends}"
         yield (
-            "the replaced certificates and permissions, with the rights that they had, work until "
-            f"{iso(update.works_until)} for anyone who kept copies of them and of the key. To end "
-            f"this, {ends}."
+            "the replaced certificates and permissions, with their earlier rights, work until "
+            f"{iso(update.works_until)} for anyone who kept copies of these files and of the key. "
+            "To "
+            f"end this, {ends}."
         )
 
 

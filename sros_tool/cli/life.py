@@ -152,16 +152,18 @@ def _replaced_lines(result: Changed, *, has_new_keys: bool) -> Iterator[str]:
             "restored from a backup"
         )
         yield (
-            f"the {which} until {end}, when it or its last permissions expire, unless revoked: see "
-            f"--revoke-old{others * result.may_work_longer}"
+            f"the {which} until it or its last permissions expire at {end}, or until it is "
+            "revoked: "
+            f"see --revoke-old{others * result.may_work_longer}"
         )
     if result.outcomes and not result.restart:
         published = publish_command(result.root)
         deliver = f"publish ({published}) or export again" if published else "export again"
         yield (
-            "exports and running processes still have the earlier certificates and "
-            f"permissions: {deliver}, and restart the processes, before these expire, or all "
-            "together if some have expired"
+            "exports and running processes still have the earlier certificates and permissions: "
+            f"{deliver}, and restart the processes before these files expire; if some have "
+            "expired, "
+            "restart all processes together"
         )
     if has_new_keys and result.outcomes and publish_command(result.root):
         yield (
@@ -309,7 +311,7 @@ def crl(
         raise UsageError(
             f"'{root}' is an export, which has no CAs",
             "The revocation list is in the folder of each enclave.",
-            f"Look at it: `sros inspect {quote(str(root / 'enclaves'))}/ENCLAVE/crl.pem`.",
+            f"Show the list: `sros inspect {quote(str(root / 'enclaves'))}/ENCLAVE/crl.pem`.",
         )
     soon = any(revoked.expires_soon_from() < now() for revoked in lists)
     if as_json:
@@ -593,8 +595,8 @@ def _print_step(
     if same_key:
         echo("renewed the identity CA with the same key; certificates that it issued stay valid")
         echo(
-            f"All vendors: {ONE_BY_ONE} Certificates keep their expiry: `sros renew "
-            f"{step.root} --all-expiring 30d` renews those that expire soon.",
+            f"All vendors: {ONE_BY_ONE} Certificates keep their expiry: `sros renew {step.root} "
+            "--all-expiring 30d` renews certificates that expire soon.",
             err=True,
         )
         return

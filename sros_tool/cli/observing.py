@@ -69,7 +69,8 @@ def observing_options(enclave_help: str) -> Callable[[Decorated], Decorated]:
                 "--keystore",
                 type=PATH,
                 metavar="KEYSTORE",
-                help="The keystore of --enclave. [default: $ROS_SECURITY_KEYSTORE]",
+                help="The keystore that has the enclave of --enclave. [default: "
+                "$ROS_SECURITY_KEYSTORE]",
             ),
             click.option("--enclave", metavar="ENCLAVE", help=enclave_help),
             click.option(
@@ -245,7 +246,7 @@ def _observer_error(error: ObserverError, environment: dict[str, str]) -> SrosEr
         )
     name = environment.get(ENCLAVE) or os.environ.get(ENCLAVE) or "/"
     is_by_shell = ENABLE not in environment and os.environ.get(ENABLE) == "true"
-    by_shell = f", in which it runs because {ENABLE} is set" if is_by_shell else ""
+    by_shell = f", in which the observer runs because {ENABLE} is set" if is_by_shell else ""
     if line := endpoint_refusal(error_text):
         return SrosError(
             f"the enclave {name} does not permit an observer{by_shell}",
@@ -276,14 +277,14 @@ def why_no_node_was_observed(
     looked = f"Observed domain {merged.get(DOMAIN) or 0} for {seconds:.0f} s with {rmw}. "
     if enclave is not None:
         return looked + (
-            f"The observer ran secured, in enclave {enclave}: it does not see nodes that are "
-            "unsecured, have a certificate of another CA, or use another DDS."
+            f"The observer ran secured, in enclave {enclave}: the observer does not see nodes that "
+            "are unsecured, have a certificate of another CA, or use another DDS."
         )
     if secured := [*secured_by(merged, Path.cwd())]:
         return looked + (
             f"The observer does not see open nodes, because {' and '.join(secured)} in this shell: "
-            "unset it to observe an open robot, and give --keystore and --enclave for a secured "
-            "one."
+            "unset the variable to observe an open robot, or give --keystore and --enclave to "
+            "observe a secured robot."
         )
     if merged.get(KEYSTORE):
         return looked + (
@@ -568,7 +569,7 @@ def _show(plan: Draft, learned: Learned, *, written: bool) -> None:
         echo(f"{would}added {counted(len(plan.added), 'right')} to '{plan.path}'")
     else:
         known = "denied" if from_log else "observed"
-        echo(f"nothing to add: '{plan.path}' already covers everything that was {known}")
+        echo(f"nothing to add: '{plan.path}' already covers all rights that were {known}")
     if plan.before is not None or from_log:
         for right in plan.added:
             echo(f"  {right}")
@@ -624,7 +625,7 @@ def _propose(
     if plan.changes and not accept and not dry_run:
         raise SrosError(
             f"the rights were not written to '{file}'",
-            "They come from a log, and a process can print any line.",
+            "The rights come from a log, and a process can print any line.",
             "Check which process needs each right, and add --accept.",
         )
     return 0
@@ -643,8 +644,8 @@ def _log_text(log: Path) -> str:
     if str(log) != "-" and not log.exists():
         raise UsageError(
             f"the log '{log}' does not exist",
-            "--from-log takes all file names that follow it.",
-            "Correct the name; if it is the policy FILE, write it before --from-log.",
+            "--from-log takes all following file names.",
+            "Correct the name of the log; write the policy FILE before --from-log.",
         )
     return read_log(str(log))
 

@@ -213,7 +213,7 @@ def _check_includes(policy: Path, output: Path, document: bytes) -> None:
     if not is_same:
         raise PolicyError(
             f"the result cannot be written to '{output}'",
-            f"From there, its relative includes lead to other files than from '{policy}'.",
+            f"In that folder, the relative includes of '{policy}' would name other files.",
             f"Write it to the folder of '{policy}'.",
         )
 
@@ -567,7 +567,7 @@ def _ratio_text(ratio: float | None) -> str:
 def _use_lines(enclave: MinimizedEnclave) -> Iterator[str]:
     use, sizes = enclave.use, enclave.bytes
     if not use.observed_at_all:
-        yield f"{use.enclave}: allowed {use.allowed}, never observed, not changed"
+        yield f"{use.enclave}: {use.allowed} is allowed and was never observed; not changed"
     else:
         counts = f"allowed {use.allowed}, observed {use.observed}"
         yield f"{use.enclave}: {counts}: {_ratio_text(use.ratio)}"
@@ -783,7 +783,7 @@ def _convert(
                 "--with-node-rights`",
                 err=True,
             )
-        echo(f"look at the result with `sros check {quote(str(output))}`", err=True)
+        echo(f"check the result: `sros check {quote(str(output))}`", err=True)
     return 1 if converted.left_out else 0
 
 
@@ -872,7 +872,7 @@ def added_lines(base: AccessSource, head: AccessSource, growth: Growth) -> list[
     unrenamed = growth.without_renames(renamed)
     return [
         *(
-            f"{line}; they count as new, so that a reviewer has to allow them"
+            f"{line}; these accesses count as new, so that a reviewer has to allow them"
             for line in _renamed_lines(renamed, head.fleet)
         ),
         *_folded_gains(head, "+", unrenamed.added, growth),
@@ -968,7 +968,9 @@ def _reach_lines(head: AccessSource, reach: Sequence[NewReach]) -> list[str]:
     lines = list(folded(head.fleet, reached))
     more = len(lines) - _MOST_NEW_LINES
     if more > 0:
-        lines[_MOST_NEW_LINES:] = [f"+ and {more} more that can influence others (--json has all)"]
+        lines[_MOST_NEW_LINES:] = [
+            f"+ and {more} more enclaves that can influence others (--json has all)"
+        ]
     return lines
 
 
@@ -1026,7 +1028,7 @@ def access_summary(growth: Growth, dropped: Collection[DroppedDenial]) -> str:
         text = "1 enclave can influence another one"
         parts.append((text if pairs == 1 else f"{pairs} pairs of enclaves can influence") + " now")
     if growth.added and growth.reach_unknown:
-        parts.append(f"it is unknown whom enclaves can influence now: {growth.reach_unknown}")
+        parts.append(f"the influence of enclaves on others is unknown now: {growth.reach_unknown}")
     return "; ".join(parts) + rights_gone + (f"; {denials_gone}" if dropped else "") + basis
 
 

@@ -367,7 +367,7 @@ class _Outputs:
 
     def write_unfinished(self) -> None:
         """Write "could not be decided" first; it stays if the review is killed (time limit)."""
-        self._write_undecided("It was ended before its result.")
+        self._write_undecided("The review was ended before it had a result.")
 
     def write_error(self, error: SrosError) -> None:
         """Write the error that prevented a result."""
@@ -413,7 +413,7 @@ def _check_outside(file: Path, top: Path) -> None:
     if file.is_symlink() or (file.exists() and not stat.S_ISREG(file.stat().st_mode)):
         raise UsageError(
             f"'{file}' is not a regular file",
-            "sros does not write through links or to devices.",
+            "sros writes neither through links nor to devices.",
             "Name a new file.",
         )
 
@@ -480,7 +480,7 @@ def _sentences(result: Review, steps: Sequence[ReviewStep]) -> Iterator[tuple[Re
     for step in steps:
         sentence = _sentence(result, step)
         if isinstance(step.content, SrosError) and sentence in earlier:
-            sentence = "could not be decided, for the same reason"
+            sentence = "could not be decided, for the reason above"
         earlier += "\n".join((sentence, *map(result.with_shown_paths, _lines_to_read(step))))
         yield step, sentence
 
@@ -643,7 +643,7 @@ def _verdict(result: Review) -> str:
         if count
     ]
     if allowed := sum(step.allowed for step in result.steps):
-        words.append(f"{counted(allowed, 'step')} found something that is allowed")
+        words.append(f"{counted(allowed, 'step')} found only allowed changes")
     left_out = f"; but {'; '.join(result.left_out)}" if result.left_out else ""
     compared = f" compared with {result.base}" if result.base else ""
     return f"{result.head}{compared}: {' and '.join(words) or 'nothing found'}{left_out}"
@@ -654,7 +654,7 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
     from sros_tool.markdown import bounded_list, code, plain
 
     allowed = any(step.allowed for step in result.steps)
-    passed = "only what is allowed was found" if allowed else "nothing found"
+    passed = "only allowed changes were found" if allowed else "nothing found"
     verdict = (passed, "something found", "could not be decided")[result.status]
     lines = (
         f"{_SIGN_ALLOWED if step.allowed else _SIGNS[step.status]} {_TITLES[step.kind]}"

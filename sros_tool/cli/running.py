@@ -339,7 +339,7 @@ def run(
     if policy and rest and ctx.meta[_COMMAND]:
         raise UsageError(
             f"--policy and the enclave {rest[0]} exclude each other",
-            "The policy says in which enclave the node is.",
+            "With --policy, the policy names the enclave of the node.",
             "Leave one of them out.",
         )
     command = [*rest[0 if policy else 1 :], *ctx.meta[_COMMAND]]
@@ -349,7 +349,7 @@ def run(
     name = enclave_of_node(policy, command) if policy else rest[0] if rest else ""
     if (other := named_enclave(command)) and other != name:
         raise UsageError(
-            f"the command names the enclave {other}, and sros would run it in {name}",
+            f"the command names the enclave {other}, but sros would run the command in {name}",
             "ROS_SECURITY_ENCLAVE_OVERRIDE, which sros sets, overrides --enclave.",
             f"Leave `--enclave {shlex.quote(other)}` out, or name the same enclave: `sros run "
             f"{shlex.quote(str(root))} {shlex.quote(other)} -- COMMAND`.",
@@ -553,12 +553,13 @@ def units(
     if user is not None and Job.GUARD in jobs:
         raise UsageError(
             "--user is not for --job guard",
-            "Only root can look at the processes of all users.",
+            "Only root can examine the processes of all users.",
             "Write the units for guard with a separate command, without --user.",
         )
     if jobs and (rest[1:] or several) and target_dir is None:
         raise UsageError(
-            f"the node units are for the keystore {INSTALLED}, and the job units are for '{root}'",
+            f"the units of nodes are for the keystore {INSTALLED}, but the units of jobs are for "
+            f"'{root}'",
             "One folder of units is for one machine.",
             "Run two commands with two folders, or name the keystore with --target.",
         )

@@ -130,7 +130,9 @@ def _focus_completions(
 )
 @click.option("--graphviz", is_flag=True, help="Lay out the SVG with Graphviz.")
 @robot_option(
-    "Read this robot of a large keystore in full, even if it is the same as other robots."
+    "In a large keystore, read all permissions of this robot, even if the robot differs from "
+    "others "
+    "only in names."
 )
 @force_option
 @dry_run_option
@@ -188,7 +190,7 @@ def view(
     if hops and not focus:
         raise UsageError("--hops is for --focus only", "", "Add --focus NAME.")
     refuse_git_revision(
-        sources, "Check it out: `git worktree add old REVISION`, and name old/PATH."
+        sources, "Check the revision out: `git worktree add old REVISION`, and name old/PATH."
     )
     moment = now()
     written = _format("json" if as_json and not dry_run else form, output, graphviz)
@@ -266,7 +268,7 @@ def _format(form: str | None, output: Path | None, graphviz: bool) -> str:
     chosen = form or of_ending
     if output and of_ending in _FORMATS and chosen != of_ending:
         raise UsageError(
-            f"'{output}' would be {chosen}, and its name says {of_ending}",
+            f"'{output}' would be {chosen}, but its name says {of_ending}",
             "",
             f"Name it '{output.with_suffix(f'.{chosen}')}', or leave the format out.",
         )

@@ -95,8 +95,8 @@ _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer ne
     "--check",
     "only_check",
     is_flag=True,
-    help="Write nothing; say which files are missing or out of date, which enclaves have no file, "
-    "and why.",
+    help="Write nothing; report missing and outdated files, and enclaves without a file, with the "
+    "reasons.",
 )
 @click.option(
     "--from",
@@ -104,8 +104,8 @@ _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer ne
     type=PATH,
     metavar="FILE",
     help=(
-        "Show what an existing Zenoh configuration allows each subject, and where it is open to "
-        "everybody."
+        "Show the rights of each subject in an existing Zenoh configuration, and what the "
+        "configuration leaves open to everybody."
     ),
 )
 @output_option("With --from: write the allowed rights to FILE, as a policy.")
@@ -222,7 +222,7 @@ def _refuse_with_from(*options: object) -> None:
     if any(options):
         raise UsageError(
             "--from takes no keystore and no options of the network",
-            "It reads one configuration, and changes nothing.",
+            "--from reads one configuration, and changes no keystore.",
             "Leave them out.",
         )
 
@@ -265,7 +265,7 @@ def _with_router(network: ZenohNetwork, name: str, endpoint: str) -> ZenohNetwor
     folder = name.rpartition("/")[0]
     if name not in known and not folder:
         raise UsageError(
-            f"it is not known which enclaves connect to the router {name}",
+            f"the enclaves that connect to the router {name} are not known",
             "A router with an endpoint serves the enclaves in its folder, such as /r1/* for "
             "/r1/router, not the enclaves of all hosts.",
             "Name a router such as /r1/router, or state its enclaves in sros.toml, at "
@@ -368,15 +368,19 @@ def _configuration_lines(
     for rights in subjects:
         if not (rights.rights or rights.unsaid or rights.denied):
             continue
-        obeys = ", by rules that bind only itself" if rights.self_limiting else ""
+        obeys = ", by rules that bind only this process" if rights.self_limiting else ""
         yield f"{_subject_text(rights)}{obeys}"
         for right in VERBS:
             for stated in (stated for stated in rights.rights if stated.right == right):
                 domain = "" if stated.domain == "0" else f" (domain {stated.domain})"
-                lacks = f" (of no use without {', '.join(stated.lacks)})" if stated.lacks else ""
+                lacks = (
+                    (f" (without effect, because it lacks {', '.join(stated.lacks)})")
+                    if stated.lacks
+                    else ""
+                )
                 yield f"  may {VERBS[right]} {stated.name}{domain}{lacks}"
         yield from _key_lines("may also", rights.unsaid)
-        yield from _key_lines("is denied, if no wildcard is used,", rights.denied)
+        yield from _key_lines("is denied, except by wildcards,", rights.denied)
 
 
 def _key_lines(clause: str, pairs: Sequence[tuple[str, str]]) -> Iterator[str]:
@@ -405,10 +409,10 @@ def _why_no_policy(subjects: Sequence[RightsOfSubject]) -> str:
     """Return a sentence on the subjects that have rights but are not enclaves."""
     strangers = [_subject_text(rights) for rights in subjects if rights.rights]
     if not strangers:
-        return "They let nobody publish, subscribe, call or serve any ROS name."
+        return "The rules let nobody publish, subscribe, call or serve any ROS name."
     return (
-        f"They allow something to {first_few(strangers, _MOST_KEYS)}: none is the name of "
-        "an enclave, such as /talker, in cert_common_names."
+        f"The rules allow something to {first_few(strangers, _MOST_KEYS)}, but no such name is the "
+        "name of an enclave, such as /talker, in cert_common_names."
     )
 
 
@@ -425,8 +429,9 @@ def _untranslatable_notes(subjects: Sequence[RightsOfSubject]) -> Iterator[Note]
             keys = ", ".join(key for _, key in rights.unsaid[:_MOST_KEYS])
             yield Note(
                 "zenoh.unsaid",
-                f"{_subject_text(rights)}: the policy lacks {len(rights.unsaid)} rights that no "
-                f"ROS name states exactly: {keys}",
+                f"{_subject_text(rights)}: the policy lacks {len(rights.unsaid)} rights that "
+                "cannot "
+                f"be stated exactly by a ROS name: {keys}",
             )
     domains = sorted(
         {right.domain for rights in subjects for right in rights.rights} - {"0", "*"}, key=int

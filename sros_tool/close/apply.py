@@ -201,7 +201,7 @@ class _RemainingProcesses:
             under = f", under its old name {old_name}" if old_name else ""
             state = "does not run; "
             if labels := [other.label for other in unknown if _is_like(other, process, names)]:
-                state = f"runs open by another command ({labels[0]}); if that is another program, "
+                state = f"runs open by another command ({labels[0]}); if this is another program, "
             command = process.open_command(self._robot.domain)
             self._robot.shell.say(f"{process.enclave} {state}start it open{under}: {command}")
 
@@ -212,7 +212,9 @@ class _RemainingProcesses:
             guest = self._secured[enclave]
             remedy = f"restart process {guest.pid} open: {process_text(guest)}"
             if not self._running.may_use_files(guest):
-                remedy = f"it is {guest.label} of user {guest.user}, who cannot read its files"
+                remedy = (
+                    f"end {guest.label} of user {guest.user}, who cannot read the enclave's files"
+                )
             yield f"a process runs in the enclave {enclave}, too; {remedy}"
 
     def unknown_processes(self) -> Iterator[str]:
@@ -223,15 +225,16 @@ class _RemainingProcesses:
             if (enclave := process.enclave) and process.pid not in pids and not process.is_daemon:
                 why = f" ({enclave.problem})" if enclave.problem else ""
                 yield (
-                    f"{process.label} runs secured with the files of '{keystore_text(enclave)}'"
-                    f"{why}, which are not the files of this folder; open processes do not hear it"
+                    f"{process.label} runs secured with the files of "
+                    f"'{keystore_text(enclave)}'{why}, "
+                    "not of this folder; open processes do not hear this process"
                 )
         unseen_processes = running.processes.unseen
         for unseen in unseen_processes:
             if unseen.speaks:
-                yield f"{unseen.label} speaks ROS 2, and cannot be looked at: {unseen.why}"
+                yield f"{unseen.label} speaks ROS 2, and cannot be examined: {unseen.why}"
         if running.processes.hidden or any(not unseen.speaks for unseen in unseen_processes):
-            why = "some processes cannot be looked at"
+            why = "some processes cannot be examined"
             by_root = running.processes.by_root
             remedy = f". {ROOT_IS_NOT_ENOUGH}" if by_root else ": ask as root, to see all processes"
             self._robot.shell.say(f"{why}{remedy}")
@@ -260,7 +263,8 @@ def _drop_ins_of(robot: LocalRobot, observed: ObservedProcesses) -> list[Path]:
             raise SrosError(
                 f"'{path}' is not the drop-in of this folder",
                 "Its first line names another folder, or was changed. Nothing was changed.",
-                "Use the folder that it names, spelled as there, or remove the drop-in.",
+                "Use the folder that its first line names, spelled as there, or remove the "
+                "drop-in.",
             )
     return drop_ins
 
@@ -291,5 +295,5 @@ def _restart_units(
             raise SrosError(
                 f"`{shlex.join(command)}` ended with {status}",
                 "Secured and open processes do not hear each other.",
-                "Fix it and run --apply again, or go back with --undo.",
+                "Correct the failure and run --apply again, or go back with --undo.",
             )

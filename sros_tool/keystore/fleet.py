@@ -328,9 +328,11 @@ def _refuse_shared(fleet: Fleet) -> None:
                 raise KeystoreError(
                     f"the enclave {name} would belong to two robots, {owners[name]} and "
                     f"{robot.name}",
-                    f"The keystore has the paths {', '.join(fleet.enclaves[:_SHOWN])}, perhaps from"
-                    " an earlier policy. An export for one of the robots would have the key of the "
-                    "other.",
+                    "The keystore has enclaves with the paths "
+                    f"{', '.join(fleet.enclaves[:_SHOWN])}, "
+                    "perhaps from an earlier policy. An export for one of the robots would have "
+                    "the "
+                    "key of the other.",
                     "Give the robot another name or namespace in the fleet file.",
                 )
             owners[name] = robot.name

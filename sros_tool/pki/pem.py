@@ -220,7 +220,7 @@ def _kind_of_label(label: str) -> str:
 def _kind_of_message(text: bytes) -> str:
     """Return the kind of a MIME message, by its headers."""
     if text[:1].isspace():
-        return "a MIME message with an empty line before its headers, which ends them at once"
+        return "a MIME message with an empty line before its headers, so that it has no headers"
     head = text[:_MOST].lower()
     if b"enveloped-data" in head or b"encrypted-data" in head:
         return ENCRYPTED_MESSAGE

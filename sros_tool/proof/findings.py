@@ -250,7 +250,7 @@ def robots_left_out(system: System, namespaces: Sequence[str]) -> list[Finding]:
     others = sorted(robot.name for robot in robots if robot.namespace not in above)
     if not others:
         return []
-    text = f"in none of the namespaces that were named: {first_few(others, _SHOWN)}"
+    text = f"robots outside the named namespaces: {first_few(others, _SHOWN)}"
     return [ROBOTS_LEFT_OUT.found(system.file, text, system.file)]
 
 
@@ -517,5 +517,5 @@ def _not_crossing_finding(requirement: Requirement, kept_use: KeptUse) -> Findin
 
 def assumption_text(name: str) -> str:
     """Return a clause that says that the protection of a name is assumed, not stated."""
-    assumed = f"that of the template {DEFAULT_TEMPLATE} is assumed"
-    return f"the policy does not say how {name} is protected, and {assumed}"
+    assumed = f"sros assumes the template {DEFAULT_TEMPLATE}"
+    return f"the policy does not say how {name} is protected; {assumed}"

@@ -448,9 +448,7 @@ def _trusts(
                     f"its revocation list makes DDS refuse every enclave: {refusal}"
                 )
             if len(crl.revoked) < len(crl.list) or names_issuers(crl.list):
-                raise DocumentError(
-                    "its revocation list has entries that perhaps revoke no certificate"
-                )
+                raise DocumentError("its revocation list has entries that vendors may ignore")
             if lists.setdefault(key, crl.list.signature) != crl.list.signature:
                 raise DocumentError(
                     "it has several revocation lists of one CA, and DDS uses only one"

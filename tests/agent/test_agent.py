@@ -259,7 +259,7 @@ def test_a_server_that_refuses_one_certificate_of_the_robot(
     def send(*_words: object, client_certificate: ClientCertificate, **_more: object) -> None:
         sent.append(client_certificate.certificate)
         if len(sent) == 1:
-            raise RefusedError("the inbox does not take the message")
+            raise RefusedError("the inbox does not accept the message")
 
     monkeypatch.setattr("sros_tool.agent.agent.send", send)
     r1.settings = replace(r1.settings, source="https://home/pub", inbox="https://home/inbox")
@@ -303,10 +303,10 @@ def test_enclaves_that_the_release_does_not_have(home: Home, r1: Robot) -> None:
     r1.release = home.revoked
     done = r1.round()
     assert done.removed == ("/r1/since",) and not any("newer" in each for each in done.problems)
-    (problem,) = (each for each in r1.round().problems if "of another robot" in each)
-    assert "removed: /r1/damaged, /r2/x. If they" in problem, "for a day"
+    (problem,) = (each for each in r1.round().problems if "another robot, somebody" in each)
+    assert "lacks: /r1/damaged, /r2/x. If they" in problem, "for a day"
     late = r1.round(moment() + timedelta(days=1, minutes=1)).problems
-    assert not any("of another robot" in each for each in late)
+    assert not any("another robot, somebody" in each for each in late)
 
 
 def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None:
@@ -326,7 +326,7 @@ def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None
     shutil.copytree(r1.folder / "enclaves/r1/a", r1.folder / "enclaves/r1/b")
     (problem,) = (each for each in r1.round().problems if "/r1/b keeps its files" in each)
     assert bring in problem, "it has another key"
-    assert "made on a robot: if this computer was replaced, switch it off" in problem
+    assert "made on a robot: switch this computer off if it was replaced" in problem
     assert r1.message().release == 1
     assert has(r1.folder, home.first, ("/r1/a", "/r1/c"))
     assert any(changed in problem for problem in r1.message().problems or ()), "for a day"
@@ -552,7 +552,7 @@ def test_a_clock_before_the_first_certificates_is_said(r1: Robot) -> None:
     r1.release = None
     (problem,) = r1.round(moment() - timedelta(days=9)).problems
     assert problem.startswith("The clock shows") and problem.endswith("; set the clock.")
-    assert "its certificates are not valid before" in problem
+    assert "its certificates begin at" in problem
     assert r1.message().clock is RobotClock.BEHIND
     assert r1.round().problems == ()
 
@@ -597,7 +597,7 @@ def test_a_restart_is_due_until_the_processes_were_seen_with_the_new_files(
     assert done.restart == NAMES, "of /r1/c nothing is known"
     assert done.unseen == ("/r1/c",) == read_state(r1.folder).unseen
     said = sros("agent", "status", r1.folder).out
-    assert f"or none of them runs, say so: `sros agent run {r1.folder}" in said
+    assert f"or if no such process runs, confirm this: `sros agent run {r1.folder}" in said
     message = r1.message()
     assert message.restart == NAMES and message.running == {
         "/r1/a": RunningFiles.EARLIER,

@@ -66,7 +66,7 @@ def test_a_server_gets_the_message_of_the_robot(server: Inbox) -> None:
 def test_a_server_that_does_not_take_it_is_said(status: int, server: Inbox) -> None:
     """No redirect is followed, which could lead anywhere."""
     server.status = status
-    with pytest.raises(UnavailableError, match=f"It answers {status} to PUT"):
+    with pytest.raises(UnavailableError, match=f"The server answers {status} to PUT"):
         send(server.url, "r1", b"message")
     assert list(server.kept) == ["/inbox/r1/confirmation.p7s"]
 
@@ -90,7 +90,7 @@ def test_a_server_whose_answer_does_not_end_is_left(
     with socket.create_server(("127.0.0.1", 0)) as listening:
         thread = Thread(target=answer, daemon=True)
         thread.start()
-        with pytest.raises(UnavailableError, match="does not take the message"):
+        with pytest.raises(UnavailableError, match="does not accept the message"):
             send(f"http://127.0.0.1:{listening.getsockname()[1]}", "r1", b"message")
         ended.set()
         thread.join()
@@ -98,7 +98,7 @@ def test_a_server_whose_answer_does_not_end_is_left(
 
 @pytest.mark.parametrize("inbox", ["http://127.0.0.1:1/x", "http://[::1", "http://127.0.0.1:x/"])
 def test_a_server_that_is_not_there_is_said(inbox: str) -> None:
-    with pytest.raises(UnavailableError, match="does not take the message"):
+    with pytest.raises(UnavailableError, match="does not accept the message"):
         send(inbox, "r1", b"message")
 
 

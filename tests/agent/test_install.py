@@ -141,7 +141,7 @@ def test_units_and_containers_keep_their_view_through_many_installations(
 
 
 REFUSED: dict[str, tuple[Callable[[Home], Release], str]] = {
-    "another robot's": (lambda home: home.release(home.renewed.files, robot="r2"), "of robot r2"),
+    "another robot's": (lambda home: home.release(home.renewed.files, robot="r2"), "for robot r2"),
     "an older number": (lambda home: home.first, "older than release 2"),
     "another keystore's": (
         lambda home: Release("r1", 9, home.renewed.files, home.first.seal),

@@ -881,7 +881,7 @@ def test_a_forged_timestamp_is_refused_without_unpacking_everything(
     assert publication and "metadata that this keystore did not write" in publication.refused
     assert not publication.at(publisher.now).is_in_order and not read
     ended = sros("fleet", "status", "ks", cwd=publisher.folder)
-    assert "what was published does not verify" in ended.out and ended.status == 1
+    assert "the published files do not verify" in ended.out and ended.status == 1
     with pytest.raises(KeystoreError, match="more than 0 MiB, unpacked, of archives"):
         publisher.publish()
 

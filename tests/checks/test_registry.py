@@ -230,7 +230,7 @@ def test_what_could_not_be_looked_at_is_neither_nothing_nor_a_finding(
     monkeypatch.setattr(ProcessTable, "look", lambda *_: RunningProcesses(unseen=(unseen,)))
     ended = sros("check", "runtime")
     assert ended.status == 2
-    assert "process 9 (talker): warning: processes that could not be looked at" in ended.out
+    assert "process 9 (talker): warning: processes that sros could not examine" in ended.out
     assert "Run the check as root" in ended.out
     by_root = RunningProcesses(unseen=(unseen,), by_root=True)
     monkeypatch.setattr(ProcessTable, "look", lambda *_: by_root)

@@ -133,7 +133,7 @@ def test_a_keystore_from_before_a_revocation(keystore: Path, tmp_path: Path) -> 
     assert accepting()[0] == f"{nodes} revocation {of}"
     assert len([text for text in strangers(robot, late) if "accept" in text]) == 1, "by the later"
     said = sros("check", restored, robot).out
-    assert "before its next export, revoke again" in said
+    assert "before its next export, revoke the certificates on the other list" in said
     assert "first revoke them there again" in said and "distribute_key" in said
 
 
@@ -158,7 +158,7 @@ def test_protection_and_domains_that_keep_nodes_apart(keystore: Path, tmp_path: 
             ("--rule", "topic /scan data=NONE metadata=SIGN"),
             " on topic /scan: protection.topic /scan.",
         ),
-        (("--domain", "5"), ": the former are for domain 0, the latter for domain 5"),
+        (("--domain", "5"), ": the first side is for domain 0, the second for domain 5"),
         (("--set", "protection.join_access_control=false"), ""),  # does no harm; tested
         (("--domain", "0,5"), ""),
     ):

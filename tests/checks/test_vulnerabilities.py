@@ -82,7 +82,7 @@ def test_a_path_names_no_package_that_is_none() -> None:
 def test_installed_and_loaded_library_have_one_finding() -> None:
     library = MappedLibrary("Fast DDS", "2.14.5", "/opt/ros/jazzy/lib/libfastrtps.so.2.14.5")
     (finding,) = vulnerability_findings(running(library._replace(replaced=True)), [library])
-    assert finding.text.startswith("27 known vulnerabilities (15 concern all processes; ")
+    assert finding.text.startswith("27 known vulnerabilities (15 affect all processes; ")
     assert f"; loaded by process 7 (a), process 8 (b); in '{library.path}': CVE-" in finding.text
 
 

@@ -63,8 +63,8 @@ def test_an_audit_says_by_whose_rules_it_decides_and_which_nodes_ended(
 
 
 TO_ALLOW = (
-    "to allow what is denied, add --patch missing.xml to this command: it writes missing rights "
-    "as a policy, and names the command that adds them"
+    "to allow the denied access, add --patch missing.xml: sros then writes the missing rights as a "
+    "policy, and names the command that adds them"
 )
 
 
@@ -262,7 +262,7 @@ def test_a_denial_by_a_rule_is_not_patched(program: Program, tmp_path: Path) -> 
     ended = program(graph(LOUD), "robot.xml", *SHORT, "--patch", "add.xml")
     assert ended.status == 1
     assert "denies publish rt/x" in ended.out
-    assert "some rights are denied by a DENY" in ended.err
+    assert "a DENY denies some rights" in ended.err
     assert "no patch was written" in ended.err
     assert not (tmp_path / "add.xml").exists()
 

@@ -506,7 +506,9 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     assert "\nros2 launch --secured " in commands
     assert "except for /listener (not running); the files" in ended.err
     assert "; next: start them by the first commands in robot/start/commands.txt" in ended.err
-    assert ended.err.endswith("--proof; what does not always run: --without /listener\n")
+    assert ended.err.endswith(
+        "--proof; for enclaves without a running process: --without /listener\n"
+    )
     robot.absent = set()
     assert "start it with" in (said := robot.close("--apply", status=1).out)
     assert "process 4712" in said and "process 4711" not in said
@@ -528,7 +530,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     robot.absent = {"/talker"}
     robot.more += (replace(robot.more[0], pid=14, command=("/opt/c",)),)
     ended = robot.close()
-    kept = "runs by another command than the observed one, which sros keeps (to replace it, watch "
+    kept = "runs by a new command; sros keeps the observed command (to replace it, watch "
     assert (
         f"  /talker: {kept}" in ended.out and "sros remembers: cd /opt && /opt/b" not in ended.err
     )
@@ -561,7 +563,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     robot.spelled = "copy"
     robot.more = (robot.process("/talker", is_secured=True),)
     undone = robot.close("--undo", status=1)
-    secured = f"process 4711 (run) runs secured with the files of '{robot.folder}/copy', which are"
+    secured = f"process 4711 (run) runs secured with the files of '{robot.folder}/copy', not of"
     assert secured in undone.out
     robot.more = ()
     robot.unseen = (UnseenProcess(9, ("talker", "--ros-args"), "/proc hides it", speaks=True),)
@@ -573,16 +575,16 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     policy.write_text(policy.read_text().replace('node="listener"', 'node="hearer"'))
     undone = robot.close("--undo")
     assert undone.err.startswith(
-        "/listener runs open by another command (process 12 (run)); if that is another program, "
+        "/listener runs open by another command (process 12 (run)); if this is another program, "
         "start it open, under its old name /listener: cd /opt && /opt/run listener\n"
         "/talker does not run; start it open: cd /opt "
     )
-    assert "\nsome processes cannot be looked at: ask as root, to see all " in undone.err
+    assert "\nsome processes cannot be examined: ask as root, to see all " in undone.err
     assert "the robot is open: " in undone.err
     looked = replace(robot.look(None, datetime.now(UTC)), by_root=True)
     monkeypatch.setattr(ProcessTable, "look", lambda _table, _now: looked)
     undone = robot.close("--undo")
-    assert "\nsome processes cannot be looked at. Being root is not enough here: " in undone.err
+    assert "\nsome processes cannot be examined. Being root is not enough here: " in undone.err
 
 
 @sometimes("processes_that_started_after_the_watch", 1 / 2)
@@ -776,7 +778,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     named = f"process 4711 (run): the mode of '{key}' is 0644\n"
     assert f"no: every process was started in its enclave: {named}" in ended.out
     assert "no: the files are accepted: sros check finds 1 error, the first in rob" in ended.out
-    assert "next: mend what the lines name, and ask again with sros close robot --pr" in ended.err
+    assert "next: correct the problems above, and ask again with sros close robot --pr" in ended.err
     assert "`; then run `sros close robot`, and restart the processes: robot/export\n" in ended.out
     assert "no: the requirements hold: one is violated: robot/requirements.toml\n" in ended.out
     assert "/talker: may publish /chatter" in ended.err
@@ -815,7 +817,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         "not checked: every process was started in its enclave: processes: process 9 (?) may be a "
         "node, and cannot be looked at (/proc hides it) (--partial accepts this)\n"
     ) in ended.out
-    assert "closed, except for what was not checked" in ended.err
+    assert "closed, except for the claims that were not checked" in ended.err
 
 
 @pytest.mark.parametrize("after", some([False, True], 1))
@@ -1188,7 +1190,7 @@ def test_tools_that_ended_while_sros_watched(robot: Robot, monkeypatch: pytest.M
     assert f"# /look has ended: COMMAND is what starts it\n{run_it} /look -- COMMAND" in commands
     assert f"# /tool\ncd /opt && {run_it} /tool -- /opt/tool 'a b'\n" in commands
     applied = robot.close("--apply", status=1).err
-    assert applied.endswith("run: --without /job --without /look --without /tool\n")
+    assert applied.endswith("process: --without /job --without /look --without /tool\n")
     assert robot.restarts == ["daemon-reload", "try-restart job.service"]
 
 
@@ -1420,7 +1422,7 @@ def test_what_is_exported_without_the_enclaves_of_other_machines(
         close._show_end(robot, state_now._replace(problems=problems), apply=False, holds=False)
         said = capsys.readouterr()
         assert ("fix this first" in said.out) is bool(problems)
-        assert "restarted: /b (2027-01-15T08:00:00Z): sros distr" in said.err
+        assert "restart the process: /b (2027-01-15T08:00:00Z): sros distr" in said.err
 
 
 def test_a_requirement_that_lost_its_right_is_told_before_a_review_fails(tmp_path: Path) -> None:
@@ -1486,7 +1488,8 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     left = "robot/export/enclaves/listener"
     assert f"removed {left}: its enclave belongs to another machine\n" in ended.err
     assert (
-        "\nnot on this machine: /listener (to bring one there: sros distribute_key r" in ended.out
+        "\nnot on this machine: /listener (to bring an enclave there: sros distribute_key r"
+        in ended.out
     )
     assert not (robot.folder / left).exists() and "/listener: process" not in ended.out
     robot.by_hand = {"/talker"}
@@ -1540,8 +1543,8 @@ def test_an_enclave_that_gets_another_name_keeps_its_process(robot: Robot) -> No
     said = robot.close()
     policy = robot.folder / "robot/policy.xml"
     named = "\n/logger: named after one of several nodes; to choose another name, replace the name"
-    files = "in robot/policy.xml and robot/requirements.toml now; when"
-    assert f"{named} {files} processes run closed, they have" in said.out
+    files = "in robot/policy.xml and robot/requirements.toml now, because"
+    assert f"{named} {files} closed processes would" in said.out
     for file in (policy, robot.folder / "robot/requirements.toml"):
         file.write_text(file.read_text().replace('"/logger"', '"/mission"'))
     said = robot.close(status=1)

@@ -366,8 +366,8 @@ def test_an_assumed_template_is_said(folder: Path, keystore: Path, tmp_path: Pat
     said = sros(*asked, cwd=folder).ok().out
     assert "note: a protection that the policy does not state [requirement.assumed]" in said
     assert (
-        "topic /scan has to be encrypted: the policy does not say how /scan is protected, and that "
-        "of the template development is assumed\n"
+        "topic /scan has to be encrypted: the policy does not say how /scan is protected; sros "
+        "assumes the template development\n"
     ) in said
     assert sros(*asked, "--template", "production", cwd=folder).ok().out == ""
     weak = tmp_path / "weak.toml"
@@ -473,7 +473,7 @@ def test_a_robot_in_no_namespace_that_was_named_is_told(tmp_path: Path) -> None:
     (tmp_path / "r.toml").write_text('[[only]]\npublish = ["cmd_vel"]\nenclaves = ["/mux"]\n')
     asked = ("check", "p.xml", "--fleet", "fleet.toml", "--requirements", "r.toml")
     ended = sros(*asked, "--namespace", "/red", cwd=tmp_path)
-    assert "in none of the namespaces that were named: blue, reddish" in ended.out
+    assert "robots outside the named namespaces: blue, reddish" in ended.out
     every = ("/red/left", "/reddish", "/hall/blue")
     named = [word for namespace in every for word in ("--namespace", namespace)]
     assert "robots-left-out" not in sros(*asked, *named, cwd=tmp_path).out

@@ -713,7 +713,10 @@ def test_the_command_names_no_other_enclave(keystore: Path) -> None:
     for option in ("--enclave", "-e"):
         refused = sros("run", keystore, "/a", *command, option, "/other")
         assert (refused.status, marker.exists()) == (2, False)
-        assert "the command names the enclave /other, and sros would run it in /a" in refused.err
+        assert (
+            "the command names the enclave /other, but sros would run the command in /a"
+            in refused.err
+        )
 
 
 def test_permissions_that_fast_dds_takes_for_expired_here_start_nothing(tmp_path: Path) -> None:

@@ -521,11 +521,14 @@ def test_access_control_that_is_off_is_told(tmp_path: Path) -> None:
         (["--reach", "/a", "--at", "90d"], "--reach takes no --at"),
         (["--who", "publish", "/x", "--all-vendors"], "--who takes no --all-vendors"),
         (["--who", "publish", "/x", "--policy", "p.xml"], "p.xml' does not exist"),
-        (["ks", "--who", "publish", "/x", "--policy", "p.xml"], "takes a keystore or a policy"),
+        (
+            ["ks", "--who", "publish", "/x", "--policy", "p.xml"],
+            "takes either a keystore or a policy",
+        ),
         (["--who", "join", "--policy", "p.xml", "--vendor", "zenoh"], "on Zenoh takes no policy"),
         (["--who", "join", "--policy", "p.xml", "--robot", "r1"], "--robot takes a keystore"),
         (["--log", "-", "--policy", "p.xml"], "the log '-' cannot be read"),
-        ([".", "--log", "l", "--policy", "p.xml"], "--log takes a keystore or a policy"),
+        ([".", "--log", "l", "--policy", "p.xml"], "--log takes either a keystore or a policy"),
         ([".", "--log", "l", "--policy", "p.xml"], "`sros explain p.xml --log l`"),
         (["/a", "publish", "/x", "--infrastructure"], "goes with --reach only"),
         ([], "no keystore is named"),
@@ -1008,11 +1011,13 @@ def test_a_copy_without_keys_is_answered_as_if_they_were_there(whole: Path, tmp_
         key.unlink()
     said = explain(copy, ENCLAVE, "publish", "/chatter").ok()
     assert "note [explain.without-keys]: no enclave in" in said.err
-    assert "\n  key       not here; the answer assumes that the process has the key\n" in said.out
+    assert (
+        "\n  key       missing here; the answer assumes that the process has the key\n" in said.out
+    )
     assert answer(copy, ENCLAVE, "publish", "/chatter")["counts_key"]
     assert not answer(whole, ENCLAVE, "publish", "/chatter")["counts_key"]
     assert "no rule allows" in explain(copy, ENCLAVE, "publish", "/nothing").out
-    assert "nothing is wrong if this is a copy without keys" in sros("check", copy).out
+    assert "if this is a copy without keys, nothing is wrong" in sros("check", copy).out
     assert "key.pem: missing" in explain(copy, ENCLAVE, "join").out
     who = explain(copy, "--who", "publish", "/chatter")
     assert ENCLAVE in who.out and "explain.without-keys" in who.err

@@ -690,7 +690,10 @@ def test_the_verb_names_the_next_step(home: Home) -> None:
     assert "bring them" not in sros("fleet", "collect", "ks", "inbox", cwd=home.folder).err
     home.send("r1", now, crl=foreign_list(home) + crl)
     ended = sros("fleet", "collect", "ks", "inbox", cwd=home.folder)
-    assert "bring them there: `sros distribute_key ks --robot NAME FOLDER --force`" in ended.err
+    assert (
+        "bring them to the robots: `sros distribute_key ks --robot NAME FOLDER --force`"
+        in ended.err
+    )
 
 
 def foreign_list(home: Home) -> str:
@@ -1115,8 +1118,8 @@ def test_what_was_published_expires(home: Home) -> None:
     file = home.root / PUBLISHED
     recorded = json.loads(file.read_text())
     for until, said in (
-        (iso(datetime.now(UTC) - timedelta(days=3)), "what was published expired 3 d ago"),
-        (None, "it is not known until when robots accept what was published"),
+        (iso(datetime.now(UTC) - timedelta(days=3)), "the published files expired 3 d ago"),
+        (None, "the expiry of the published files is not known"),
     ):
         file.write_text(json.dumps({**recorded, "until": until}))
         ended = sros(*status, cwd=home.folder)

@@ -381,7 +381,9 @@ def test_a_robot_that_was_revoked(field: Field) -> None:
         ("certificate", "permissions", *SHARED), ("revoked", "remove")
     )
     lines = field.run("fleet", "status", "ks", "--robot", "r3").out.splitlines()
-    (line,) = (line for line in lines if "only whoever has the robot can remove them" in line)
+    (line,) = (
+        line for line in lines if "only somebody at the robot can remove these files" in line
+    )
     assert line.startswith("  5 files of its revoked enclaves")
     assert not any("remove enclaves/" in line for line in lines)
     field.deliver("r1", "r2")
@@ -544,7 +546,7 @@ def test_a_robot_that_missed_a_stage_gets_its_files_by_hand(field: Field) -> Non
     field.send("r2", release=1, problems=(refused,))
     assert to_do() == "deliver"
     said = field.run("fleet", "status", "ks", "--robot", "r2", status=1).out
-    assert "does not trust the CA that seals releases, so fetching cannot help" in said
+    assert "does not trust the CA that seals releases: fetching does not change this" in said
     for days in (1 / 24, 2):
         field.age("r2", timedelta(days=days))
         assert to_do() == "deliver"
@@ -584,7 +586,7 @@ def test_a_robot_that_was_off_during_a_rotation_has_missed_it(field: Field) -> N
     field.age("r2", timedelta(hours=1))
     assert shown() == ("earlier", "deliver")
     said = field.run("fleet", "status", "ks", "--robot", "r2", status=1).out
-    assert "are of an identity CA that was replaced: a web server with" in said
+    assert "are of a replaced identity CA: a web server with" in said
     field.deliver("r2")
     assert field.states()["r2"] == "current"
 
@@ -798,7 +800,7 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     field.send("r2", running={"/r2/base": RunningFiles.EARLIER, "/r9/base": RunningFiles.EARLIER})
     assert in_force() == [False, False, False], "r1 does not say which processes it has"
     said = field.run("fleet", "status", "ks", status=1).out
-    assert "on 0 of 3 robots; 2 more have it, but it is not known that all processes" in said
+    assert "on 0 of 3 robots; 2 more have the list, but perhaps not all processes" in said
     field.confirm("r1", restart=["/r1/removed"])
     assert in_force() == [False, False, False], "a process of an enclave that the robot had"
     assert field.states()["r1"] == "restart"
@@ -1305,7 +1307,7 @@ def test_a_robot_with_other_files_than_the_release_that_it_has(field: Field) -> 
     number = field.status()["robots"]["r1"]["published"]
     field.send("r1", release=number)
     rows = field.run("fleet", "status", "ks", status=1).out
-    assert f"its files are not those of the published release {number}" in rows
+    assert f"its files differ from the published release {number}" in rows
     assert field.status()["robots"]["r1"]["to_do"] == "find out why"
 
 
@@ -1393,7 +1395,7 @@ FOUND = frozenset({NOT_SEEN})
         ({**OLD, "path": "/usr/lib/libfastrtps.so.2.14.5"}, 0, [], "27 known vulnerabilities"),
         ({**OLD, "version": ""}, 0, [], "does not show its version, loaded by processes of r1"),
         (None, 0, [], "none seen on r1"),
-        (LIBRARY, 7, [], "some processes of r1 could not be looked at"),
+        (LIBRARY, 7, [], "some processes of r1 could not be examined"),
     ],
 )
 def test_the_dds_of_a_robot(
@@ -1496,7 +1498,7 @@ def test_metrics_and_the_page(field: Field) -> None:
     renamed = renamed.rename(field.root)
     field.confirm("r1", dds={"libraries": [OLD], "unseen": 0})
     page = field.run("fleet", "status", renamed, "--html", status=1).out
-    number = "Fast DDS 2.14.5: 27 known vulnerabilities (15 concern all processes; "
+    number = "Fast DDS 2.14.5: 27 known vulnerabilities (15 affect all processes; "
     summary = page.partition(f"<summary>{number}")[2].partition("</summary>")[0]
     fixed = "10 fixed in 2.14.6, 17 not fixed in any known release 2.x"
     assert summary.endswith(f"), {fixed}; loaded by processes of r1")

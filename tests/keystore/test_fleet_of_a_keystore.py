@@ -238,7 +238,9 @@ def test_many_enclaves_are_counted_with_the_next_step(tmp_path: Path) -> None:
     ended = sros("generate_artifacts", "-k", root, *words).ok()
     some = "/r0, /r1, /r10, /r11, /r12 and 16 more (-v lists all)"
     assert ended.out.endswith(f"\ncreated 21 enclaves: {some}\n")
-    assert f"to send them: `sros distribute_key {root} --robot NAME FOLDER`" in ended.err
+    assert (
+        f"to export these enclaves: `sros distribute_key {root} --robot NAME FOLDER`" in ended.err
+    )
     assert sros("renew", root, "--all").ok().out == f"renewed 21 enclaves: {some}\n"
     every = [f"renewed enclave {name}" for name in list_enclaves(root)]
     assert sros("renew", root, "--all", "-v").ok().out.splitlines() == every

@@ -117,7 +117,7 @@ def test_the_history_names_what_was_signed_from_a_policy(keystore: Path, tmp_pat
     words = [line.split() for line in found.out.splitlines()]
     assert [(line[1], line[3]) for line in words] == [("permissions", "/a"), ("permissions", "/b")]
     assert found.err.startswith(
-        f"permissions of 2 enclaves were signed from '{policy}', as it is now;"
+        f"permissions of 2 enclaves were signed from the current '{policy}';"
     )
     assert len(json.loads(sros(*listed, "--json").out)["entries"]) == 2
     policy.write_text(f"{policy.read_text()}<!-- changed -->")

@@ -487,7 +487,7 @@ def test_settings_of_zenoh_are_compared(sound: Path, path: str, value: object, s
         ),
         (a_list_next_to_the_one_that_counts, 2, "several revocation lists of one CA"),
         (a_list_that_does_not_begin_a_line, 1, "/mux again trusts anyone who has its key"),
-        (an_entry_that_undoes_another, 2, "has entries that perhaps revoke no"),
+        (an_entry_that_undoes_another, 2, "has entries that vendors may ignore"),
         (a_damaged_list, 2, "mux' cannot be compared: the revocation list crl.pem cannot be read"),
         (without_the_files_of_zenoh, 1, "+ less protection: Zenoh files present -> missing"),
         (a_name_without_an_enclave, 1, "+ /ghost publish topic /cmd_vel; with Zenoh"),

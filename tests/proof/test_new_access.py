@@ -380,7 +380,7 @@ def test_reach_that_is_not_followed_is_said(
     ended = sros(*words, cwd=tmp_path)
     assert ended.status == 1
     assert "can influence" not in ended.out
-    unknown = "unknown whom enclaves can influence now: there are more than 0 hops between enclaves"
+    unknown = "on others is unknown now: there are more than 0 hops between enclaves"
     assert unknown in ended.err
     assert unknown in sros(*words, "--format", "markdown", cwd=tmp_path).out
     assert json.loads(sros(*words, "--json", cwd=tmp_path).out)["reach_known"] is False

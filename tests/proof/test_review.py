@@ -222,7 +222,7 @@ def test_dropping_a_requirement_is_a_consent_of_its_own(change: Change) -> None:
         "[requirement.violated]",
     )
     assert failed.status == 1 and all(line in failed.out for line in lines), failed
-    assert "1 step failed and 1 step found something that is allowed" in failed.out
+    assert "1 step failed and 1 step found only allowed changes" in failed.out
     assert "\n  + /b publish topic /x  (robot.xml:6)" in failed.out
     allowed = change.review(*words, "--dropped-requirements", "allow", "--json").ok()
     steps = {step["step"]: step for step in json.loads(allowed.out)["steps"]}
@@ -381,7 +381,7 @@ def test_a_renamed_enclave_is_one_line_and_still_new_access(change: Change) -> N
         # Whom the enclave is influenced by is only new if other access is.
         reach = ["  + /a can influence /new/b: /a -publish /x-> /new/b"] * len(also)
         assert lines == [
-            f"{renamed}; they count as new, so that a reviewer has to allow them",
+            f"{renamed}; these accesses count as new, so that a reviewer has to allow them",
             *(*(f"  + {right}" for right in also), *reach),
             *(renamed, *(f"  + {right}".replace(" publish", " ALLOW publish") for right in also)),
         ]
@@ -409,12 +409,12 @@ def test_an_error_is_said_once(change: Change, tmp_path: Path) -> None:
     summary = tmp_path.with_name("summary.md")
     ended = change.review("--policy", "robot.xml", "--summary", str(summary))
     assert ended.status == 2 and ended.out.count("not well-formed") == 1
-    assert ended.out.count(": could not be decided, for the same reason\n") == 2
+    assert ended.out.count(": could not be decided, for the reason above\n") == 2
     assert summary.read_text().count("not well-formed") == 2  # in short, and as a finding
     (link := tmp_path.with_name("link.md")).symlink_to(summary)
     ended = change.review("--policy", "robot.xml", "--summary", str(link))
     assert (ended.status, link.is_symlink()) == (2, True)
-    assert "sros does not write through links or to devices" in ended.err
+    assert "sros writes neither through links nor to devices" in ended.err
 
 
 def test_a_common_part_that_ships_with_sros_needs_no_review(change: Change) -> None:

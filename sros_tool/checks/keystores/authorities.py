@@ -236,7 +236,7 @@ CA_KEY_FEW_ROUNDS = FindingKind(
 SETTINGS_MISSING = FindingKind(
     "keystore.settings-missing",
     WARNING,
-    "a keystore with a ledger of sros and without its settings",
+    "a keystore that has a ledger of sros but lacks its settings",
     "New enclaves then follow the defaults of ros2/sros2: without a policy they may do "
     "everything, for ten years.",
     "sros: sros.toml holds the settings of a keystore.",
@@ -247,7 +247,7 @@ SETTINGS_EDITED = FindingKind(
     "keystore.settings-edited",
     WARNING,
     "settings that were edited by hand and not applied",
-    "Files issued later may follow the edit, earlier files do not. Nobody was shown which "
+    "Files issued later may follow the edit, earlier files do not. sros has not shown which "
     "protection the edit weakens.",
     "sros: the ledger has the settings as sros wrote them.",
     edit_remedy("KEYSTORE"),
@@ -327,10 +327,10 @@ CLOCK_BEHIND = FindingKind(
     "keystore.clock-behind",
     WARNING,
     "a check for a moment before the last change of the keystore",
-    "If the clock of this machine is behind, what has expired counts as valid.",
+    "If the clock of this machine is behind, expired files count as valid.",
     "sros: ledger.jsonl has the time of each change.",
-    "Set the clock. If it is right, and was ahead at the last change, run `sros crl KEYSTORE "
-    "--refresh`, so that the last entry of the ledger is of today.",
+    "Set the clock. If the clock is right now but was ahead at the last change, run `sros crl "
+    "KEYSTORE --refresh`, so that the last entry of the ledger is of today.",
 )
 CRL_EXPIRES_SOON = FindingKind(
     "keystore.revocation-list-ends",
@@ -542,7 +542,7 @@ def _separation(keystore: CheckedKeystore) -> str:
     except SrosError:  # `sros rotate_ca` reports it
         return ""
     if stage is not RotationStage.NONE:
-        text = f"Go on with the rotation that is under way (stage {stage}): restart all processes, "
+        text = f"Continue the current rotation (stage {stage}): restart all processes, "
         text += "and run `sros rotate_ca KEYSTORE --next`."
         return text if len(files) > 1 else f"{text} Once it is complete: {ONE_AUTHORITY.remedy}"
     return "Run `sros rotate_ca KEYSTORE --permissions --next`." if len(files) > 1 else ""

@@ -341,8 +341,9 @@ def _validity_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iter
         text = f"{text}, and now it is {iso(now)}"
         remedy = is_early and (
             f"Wait: from {iso(window.not_before + _WEST)} on, they have begun in every time zone. "
-            "Until then, let the hosts run in UTC. Sign later ones with a not_before at least 12 "
-            "hours in the past, as sros does once the CA is that old."
+            "Until then, let the hosts run in UTC. Sign later permissions with a not_before at "
+            "least "
+            "12 hours in the past, as sros does once the CA is that old."
         )
         yield TIME_WINDOW.found(enclave.name, text, file, remedy=remedy or "", accepted=accepted)
 

@@ -81,8 +81,9 @@ def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
         lacks_key = (problem.file, problem.fault) == (KEY_FILE, Fault.FILE_MISSING)
         if lacks_key and not enclave.keystore.opened.has_keys:
             text += (
-                ", as all keys here: nothing is wrong if this is a copy without keys (`--exclude "
-                f"{kind.id}` leaves this out)"
+                ", like all keys here: if this is a copy without keys, nothing is wrong "
+                "(`--exclude "
+                f"{kind.id}` hides this finding)"
             )
         remedy = fault_remedy(enclave, problem.fault, problem.file)
         accepted = enclave.accepts_expiry if problem.fault in _EXPIRED else ""

@@ -63,8 +63,8 @@ OTHERS_WRITE = FindingKind(
     "keystore.others-write",
     ERROR,
     "a file or folder that other users can change",
-    "Whoever can replace CA certificates, links or documents decides whom a node trusts. Access "
-    "control lists are not looked at.",
+    "Whoever can replace CA certificates, links or documents decides whom a node trusts. sros does "
+    "not check access control lists.",
     "POSIX owners and modes; CWE-732.",
     "Run `chown` with the owner of the keystore, and `chmod g-w`, on the file or folder.",
 )
@@ -72,8 +72,8 @@ REPLACEABLE = FindingKind(
     "keystore.replaceable",
     ERROR,
     "a folder above the keystore that other users can change",
-    "These users can put another keystore there, and so decide whom a node trusts. Access control "
-    "lists are not looked at.",
+    "These users can put another keystore there, and so decide whom a node trusts. sros does not "
+    "check access control lists.",
     "POSIX owners and modes; CWE-732; rcl 9 checks neither.",
     "Run `chmod go-w` on the folder, or move the keystore to a folder that only its owner and root "
     "can change.",
@@ -100,9 +100,9 @@ LINK_DANGLING = FindingKind(
     "keystore.link-dangling",
     ERROR,
     "a broken link",
-    "The file that it points to is missing.",
+    "The target of the link is missing.",
     "rcl 9 (security.c) follows links.",
-    "Restore the file that it points to, or remove the link.",
+    "Restore the target of the link, or remove the link.",
 )
 LINK_ABSOLUTE = FindingKind(
     "keystore.link-absolute",
@@ -145,7 +145,7 @@ FOREIGN_STAGE = FindingKind(
 STRAY_KEY = FindingKind(
     "keystore.stray-key",
     WARNING,
-    "a private key where none belongs",
+    "a private key in the wrong place",
     (
         "The key is perhaps a copy from a backup. No verb of sros protects, renews or removes "
         "such a key."
@@ -156,11 +156,11 @@ STRAY_KEY = FindingKind(
 ARCHIVE = FindingKind(
     "keystore.archive",
     WARNING,
-    "an archive or a container of keys where none belongs",
+    "an archive or a container of keys in the wrong place",
     "The file may contain private keys: a backup of the keystore, for instance, contains its CA "
     "keys. sros does not open the file.",
     "ROS 2 keystore layout: private/ alone is for keys of CAs.",
-    "Look at what is in it, and move it to a safe place. If others had access to a CA key in it, "
+    "Look into the file, and move it to a safe place. If others had access to a CA key in it, "
     "replace the CA (`sros rotate_ca`).",
 )
 CA_KEY_ON_ROBOT = FindingKind(

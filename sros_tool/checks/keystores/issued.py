@@ -86,7 +86,8 @@ OLD_PERMISSIONS = FindingKind(
     "expire. Perhaps a backup was restored, or someone tries to get back a removed right.",
     "ros2/sros2 issue 275; sros: ledger.jsonl.",
     "Sign the intended permissions with `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`. "
-    "`sros renew` refuses to sign these again.",
+    "`sros "
+    "renew` refuses to sign the replaced permissions again.",
 )
 STALE = FindingKind(
     "enclave.stale-permissions",
@@ -152,7 +153,9 @@ UNKNOWN_AUTHORITY = FindingKind(
     ERROR,
     "a file of CAs with a CA that the keystore does not know",
     "Fast DDS trusts every CA in the file, Cyclone DDS only the first CA. Whoever has the key of "
-    "an identity CA can make any enclave, and with the key of a permissions CA give any rights.",
+    "an "
+    "identity CA can make any enclave; whoever has the key of a permissions CA can give any "
+    "rights.",
     "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; sros: ledger.jsonl has the CAs.",
     "Find out who added it, and restore the file from a backup.",
 )

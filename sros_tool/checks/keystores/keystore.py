@@ -365,9 +365,10 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: OpenedKeystore) -
         else "an enclave that the keystore never issued",
         f"{names_text(names)}: the ledger has neither the certificate nor the permissions; `ros2 "
         f"security create_enclave` leaves enclaves in this state. Found: {_kinds(chosen)}.",
-        f"If you made it, state its rights with `{command}`, which also issues the certificate "
-        "again. If nobody did, somebody else has the CA key: revoke the enclave, and replace the "
-        "CA (`sros rotate_ca`).",
+        f"If you made the enclave, state its rights with `{command}`, which also issues the "
+        "certificate again. If nobody of your team made it, somebody else has the CA key: revoke "
+        "the "
+        "enclave, and replace the CA (`sros rotate_ca`).",
     )
 
 

@@ -20,8 +20,9 @@ NO_ROS_NAME = FindingKind(
     WARNING,
     "names that no ROS topic, service or action has",
     "DDS names of ROS topics begin with rt/, those of services with rq/ and rr/. A rule with "
-    "another name matches nothing that a node does: what the rule should allow is denied, and what "
-    "it should deny may be allowed.",
+    "another "
+    "name matches no endpoint of a node: access that the rule should allow is denied, and access "
+    "that it should deny may be allowed.",
     _MAPPING,
     "Write the DDS name, such as rt/chatter, rq/addRequest and rr/addReply, or let sros write it: "
     "`sros create_permission KEYSTORE ENCLAVE POLICY_FILE`. The current name is right only for a "

@@ -62,7 +62,7 @@ PEERS_REVOKED = FindingKind(
 PEERS_ACCEPT = FindingKind(
     "keystore.peers-accept-revoked",
     WARNING,
-    "a revocation list that lacks what the list of another keystore or export revokes",
+    "a revocation list that lacks certificates on the list of another keystore or export",
     "A node with this list communicates with everybody whom only the other list revokes, such as "
     "the thief of a key.",
     "RFC 5280, 5.2.3; rmw_dds_common (crl.pem).",
@@ -70,9 +70,9 @@ PEERS_ACCEPT = FindingKind(
     "KEYSTORE ENCLAVE TARGET --force`, bring the files to the robot, and restart the processes.",
 )
 _REVOKE_AGAIN = (
-    "This keystore was perhaps restored from a backup: before its next export, revoke again what "
-    "the other list revokes, with `sros crl KEYSTORE --refresh --crl FILE`. FILE is the other "
-    "crl.pem."
+    "This keystore was perhaps restored from a backup: before its next export, revoke the "
+    "certificates on the other list again, with `sros crl KEYSTORE --refresh --crl FILE`. FILE is "
+    "the other crl.pem."
 )
 _REVOKE_FIRST = (
     "The keystore was perhaps restored from a backup: the export's own list revokes certificates "
@@ -446,7 +446,7 @@ def _incompatible_governance_findings(
                 DomainSet.of(*((d, d) for name in names for d in governed[name].joined()))
                 for names in (alike_names, incompatible_names)
             )
-            why = f"the former are for domain {own_domains}, the latter for domain {domains}"
+            why = f"the first side is for domain {own_domains}, the second for domain {domains}"
         text = (
             f"nodes of {names_text(alike_names)} do not communicate with "
             f"nodes of {names_text(incompatible_names)}{on}: {why}"

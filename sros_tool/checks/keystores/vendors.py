@@ -59,7 +59,7 @@ SOME_REFUSE = FindingKind(
     "portable.refused",
     WARNING,
     "an enclave that some DDS vendors refuse",
-    "A node runs in it with one RMW, and fails, or finds no peer, with another.",
+    "With one RMW, a node runs in the enclave; with another RMW, it fails or finds no peer.",
     _ENGINE,
     "Use an RMW of a vendor that accepts it, or replace the files that the other vendors "
     f"refuse. {_SEE}",
