@@ -94,7 +94,7 @@ def test_another_kind_is_meant(
     asking: str, offering: str, text: str, remedy: str, tmp_path: Path
 ) -> None:
     said = findings(tmp_path / "p.xml", asking + OTHER + offering)["policy.name-misspelt"]
-    assert f"; /a has it as {text}, unused" in said.text
+    assert f"; /a has this name as {text}, unused" in said.text
     right = "call" if "request" in asking else "execute"
     assert remedy.format(right) in said.remedy
     same = found(tmp_path / "p.xml", asking + offering)
