@@ -89,7 +89,6 @@ def loadable_environment(
             its private key.
     """
     from sros_tool.distributions import unknown_distribution
-    from sros_tool.keystore.issuing.tokens import pin_notes
     from sros_tool.keystore.known_keys import other_enclave
     from sros_tool.keystore.layout import (
         KEY_FILE,
@@ -98,7 +97,7 @@ def loadable_environment(
     from sros_tool.keystore.participant import JoinContext
     from sros_tool.keystore.selection import missing_enclave_error
     from sros_tool.names import check_enclave_name
-    from sros_tool.pki.token import MODULE_VARIABLE
+    from sros_tool.pki.token import MODULE_VARIABLE, pin_notes
     from sros_tool.runtime.environment import (
         REFUSING_ZENOH,
         RMW_ZENOH,

@@ -66,7 +66,6 @@ from sros_tool.keystore.confirmation import (
 )
 from sros_tool.keystore.delivery.archive import listed_digests
 from sros_tool.keystore.delivery.release import Release, sealed_robot
-from sros_tool.keystore.issuing.tokens import place_in
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
@@ -92,7 +91,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.crl import list_number, load_crls, newest_list, read_lists
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
-from sros_tool.pki.token import Secrets, open_enclave_key
+from sros_tool.pki.token import Secrets, open_enclave_key, place_in
 from sros_tool.runtime.processes import RunningProcesses, boot_id
 from sros_tool.validity import elapsed, iso, time_of_file
 from sros_tool.wording import counted, first_few

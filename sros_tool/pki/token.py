@@ -6,7 +6,7 @@ import importlib.util
 import os
 import secrets as random
 import stat
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from shlex import quote as shell_quote
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.utils import Prehashed, encode_dss_signature
 from cryptography.hazmat.primitives.serialization import load_der_public_key
 
-from sros_tool.errors import DocumentError, PkiError, UnavailableError, UsageError
+from sros_tool.errors import DocumentError, Note, PkiError, UnavailableError, UsageError
 from sros_tool.owners import file_of_root
 from sros_tool.xml import read_bytes
 
@@ -463,6 +463,28 @@ def parse_enclave_uri(uri: str, name: str) -> TokenUri:
     return parsed
 
 
+def token_places(uri: str, names: Sequence[str]) -> Mapping[str, TokenUri]:
+    """Map enclaves to the places of their keys: ``uri``, with the enclave's name as default label.
+
+    Raises:
+        UsageError: ``uri`` is not a PKCS#11 URI, or names one key for several enclaves.
+    """
+    if not is_token_uri(uri):
+        raise UsageError(
+            "--key has to be the URI of a key on a PKCS#11 token",
+            "Without --key, the key is made in a file.",
+            "Write --key 'pkcs11:token=NAME;object=LABEL', or leave --key out.",
+        )
+    places = {name: parse_enclave_uri(uri, name) for name in names}
+    if len({place.object for place in places.values()}) < len(places):
+        raise UsageError(
+            "one key is named for several enclaves",
+            "Two enclaves with one key are one identity: each can act as the other.",
+            "Leave object= out: then the label of each key is the name of its enclave.",
+        )
+    return places
+
+
 def token_file(parsed: TokenUri) -> bytes:
     """Return the content of a ``key.p11``: one line, which Fast DDS gives to OpenSSL.
 
@@ -521,6 +543,20 @@ def _attributes(parts: Sequence[str], known: Set[str]) -> dict[str, str]:
     return attributes
 
 
+def place_in(path: Path) -> TokenUri:
+    """Return the place on a token that the file ``key.p11`` at ``path`` names.
+
+    Raises:
+        SrosError: the file cannot be read, or names no key on a token.
+    """
+    try:
+        return read_token_file(read_bytes(path, "place of the key"))
+    except PkiError as error:
+        raise PkiError(
+            f"'{path}' does not name a key on a token", error.why, "Write it again."
+        ) from error
+
+
 # ── the file with a PIN ────────────────────────────────────────────────────────────────────
 
 _LONGEST_PIN = 256  # in bytes; CK_TOKEN_INFO of PKCS#11 says which lengths a token accepts
@@ -556,3 +592,21 @@ def pin_line_break(place: TokenUri) -> str:
         f"the file with the PIN, '{place.pin_source}', ends with a line break, which libp11 before "
         "0.4.17 takes for a part of the PIN, so that no node starts: write it with `printf %s PIN`"
     )
+
+
+def token_notes(key: TokenKey) -> Iterator[Note]:
+    """Yield notes on a token's key that may have been copied, and on the PIN file."""
+    place = key.place
+    if not key.never_left:
+        yield Note(
+            "token.key-can-be-copied",
+            f"the token {place.token!r} does not say that the key {place.object!r} was made on it "
+            "and never left it: there may be a copy, or one can be made.",
+        )
+    yield from pin_notes(place)
+
+
+def pin_notes(place: TokenUri) -> Iterator[Note]:
+    """Yield notes on a PIN file that Fast DDS cannot use, or that other users can read."""
+    for problem in filter(None, (pin_file_problem(place), pin_line_break(place))):
+        yield Note("token.pin-file", f"{problem}.")

@@ -27,7 +27,6 @@ from sros_tool.keystore.delivery.rollback import (
 from sros_tool.keystore.issuing.acceptance import refuse_stopping
 from sros_tool.keystore.issuing.authority import Authority
 from sros_tool.keystore.issuing.keyring import no_secrets
-from sros_tool.keystore.issuing.tokens import place_in, token_notes, token_places
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -91,7 +90,10 @@ from sros_tool.pki.token import (
     TokenUri,
     make_enclave_key,
     open_enclave_key,
+    place_in,
     token_file,
+    token_notes,
+    token_places,
 )
 from sros_tool.validity import iso
 from sros_tool.values import DryRun, FileChanges, Notes, Words

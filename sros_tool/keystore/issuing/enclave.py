@@ -9,7 +9,7 @@ share the work.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
@@ -29,11 +29,11 @@ from sros_tool.dds.permissions import (
 )
 from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError, check_meaning
 from sros_tool.files import policies_dir
-from sros_tool.keystore.issuing.authority import Authority
+from sros_tool.keystore.issuing.authority import Authorities, Authority
 from sros_tool.keystore.issuing.ca_service import CertificateRequest
 from sros_tool.keystore.issuing.keyring import Secrets, no_secrets
 from sros_tool.keystore.issuing.proof import prove
-from sros_tool.keystore.issuing.tokens import place_in
+from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL,
@@ -64,7 +64,15 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.pki.keys import PrivateKey, PublicKey, generate_key, key_pem, load_key
-from sros_tool.pki.token import TokenKey, open_enclave_key
+from sros_tool.pki.token import (
+    TokenKey,
+    TokenUri,
+    make_enclave_key,
+    open_enclave_key,
+    place_in,
+    planned_key,
+    token_file,
+)
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave, Policy
 from sros_tool.policy.rights import nodes_as_text, nodes_not_shown
@@ -75,6 +83,56 @@ from sros_tool.xml import read_bytes
 Result = TypeVar("Result")
 
 _NOTED_LOSS = 0.01
+
+
+# ── keys on tokens ─────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class EnclaveTokens:
+    """The ``places`` of new keys on tokens, by enclave, and the keys that must not be reused."""
+
+    places: Mapping[str, TokenUri]
+    secrets: Secrets
+    known: KnownKeys
+    authorities: Authorities
+    dry_run: bool = False
+
+    def key(self, name: str) -> TokenKey:
+        """Return the key at the enclave's place on the token, after creating it if it is missing.
+
+        Raises:
+            KeystoreError: the key was revoked, or belongs to another enclave or to a CA.
+            PkiError: the token cannot be used.
+        """
+        place = self.places[name]
+        if self.dry_run:
+            return planned_key(place)
+        key = make_enclave_key(place, self.secrets)
+        public, remedy = key.public_key(), "Name another object of the token."
+        for authority in (self.authorities.identity, self.authorities.permissions):
+            if authority.certificate.public_key() == public:
+                raise KeystoreError(
+                    f"the key for enclave {name} is the key of a CA",
+                    "Whoever has the robot could issue any identity, or sign any rights.",
+                    remedy,
+                )
+        self.known.refuse_revoked(public, f"enclave {name}", remedy)
+        self.known.refuse_shared_key(public, name, remedy)
+        return key
+
+    def check_present(self, name: str, root: Path) -> None:
+        """Raise `KeystoreError` if the key of an existing enclave is not at the chosen place."""
+        path = enclave_path(root, name) / KEY_URI_FILE
+        if not path.exists() or read_bytes(path, "place of the key") != token_file(
+            self.places[name]
+        ):
+            where = quote(str(root))
+            raise KeystoreError(
+                f"enclave {name} of keystore '{root}' already has another key",
+                "",
+                f"To replace it: `sros renew {where} {name} --key 'pkcs11:...' --revoke-old`.",
+            )
 
 
 # ── certificates and permissions to issue ──────────────────────────────────────────────────

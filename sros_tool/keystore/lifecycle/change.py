@@ -34,9 +34,8 @@ from sros_tool.keystore.fleet import (
 )
 from sros_tool.keystore.issuing.acceptance import refuse_stopping
 from sros_tool.keystore.issuing.authority import Authorities, Authority, load_authority
-from sros_tool.keystore.issuing.enclave import EnclaveWriter
+from sros_tool.keystore.issuing.enclave import EnclaveTokens, EnclaveWriter
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.issuing.tokens import EnclaveTokens
 from sros_tool.keystore.known_keys import KnownKeys, unknown_authorities
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,

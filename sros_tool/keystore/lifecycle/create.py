@@ -42,6 +42,7 @@ from sros_tool.keystore.fleet import (
 from sros_tool.keystore.issuing.acceptance import imported_notes
 from sros_tool.keystore.issuing.authority import create_authorities, write_copies
 from sros_tool.keystore.issuing.enclave import (
+    EnclaveTokens,
     EnclaveWriter,
     Issuance,
     NewIdentity,
@@ -51,7 +52,6 @@ from sros_tool.keystore.issuing.enclave import (
     present_files,
     stated_enclave,
 )
-from sros_tool.keystore.issuing.tokens import EnclaveTokens, place_in, token_notes, token_places
 from sros_tool.keystore.known_keys import revoked_serials
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -105,7 +105,14 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.pki.keys import generate_key, load_key
-from sros_tool.pki.token import TokenKey, TokenUri, open_enclave_key
+from sros_tool.pki.token import (
+    TokenKey,
+    TokenUri,
+    open_enclave_key,
+    place_in,
+    token_notes,
+    token_places,
+)
 from sros_tool.policy.model import Enclave, Level, Policy, StatedProtection, stated_protections
 from sros_tool.translate import governance_for
 from sros_tool.validity import Window, iso, parse_iso, window

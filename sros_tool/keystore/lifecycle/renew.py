@@ -20,11 +20,11 @@ from sros_tool.keystore.expiry import (
 from sros_tool.keystore.issuing.authority import Authorities
 from sros_tool.keystore.issuing.ca_service import CaServiceError
 from sros_tool.keystore.issuing.enclave import (
+    EnclaveTokens,
     EnclaveWriter,
     Issuance,
     NewIdentity,
 )
-from sros_tool.keystore.issuing.tokens import EnclaveTokens, token_notes, token_places
 from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path, has_key
 from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.replaced import Superseded, certificates_until, lacks_some
@@ -39,6 +39,7 @@ from sros_tool.pki.certificates import (
     other_issuer_text,
 )
 from sros_tool.pki.keys import PrivateKey, generate_key
+from sros_tool.pki.token import token_notes, token_places
 from sros_tool.validity import duration_text, iso
 from sros_tool.wording import first_few
 
