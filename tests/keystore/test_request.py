@@ -654,6 +654,33 @@ def test_no_more_is_unpacked_than_an_archive_states() -> None:
         unpack(archive, ArchiveLimits(packed=1000, unpacked=1000, members=1))
 
 
+def of_one_header(kind: bytes, data: bytes) -> bytes:
+    """Return an archive whose entry says more about the next one than its name."""
+    entry, _ = member("x", kind)
+    entry.size = len(data)
+    return rebuilt({}, (entry, data), member("y"))
+
+
+@pytest.mark.parametrize(
+    ("archive", "said"),
+    [
+        (of_one_header(tarfile.XHDTYPE, b"12 a=1234567\n" * 100), "a header of 1300 bytes"),
+        (of_one_header(tarfile.XGLTYPE, b"12 a=1234567\n"), "not a regular file"),
+        (of_one_header(tarfile.GNUTYPE_LONGNAME, b"y" * 1025), "a header of 1025 bytes"),
+        (of_one_header(tarfile.GNUTYPE_SPARSE, b"x"), "not a regular file"),
+        # The map of this sparse file ends early: whoever reads the map finds it damaged.
+        (
+            of_one_header(tarfile.XHDTYPE, b"22 GNU.sparse.major=1\n22 GNU.sparse.minor=0\n"),
+            "a sparse file",
+        ),
+    ],
+)
+def test_an_archive_makes_no_work_by_what_it_says_of_its_files(archive: bytes, said: str) -> None:
+    """An archive of 39 KB took 30 seconds and 1 GB, one of 260 KB two minutes and 7 GB."""
+    with pytest.raises(DocumentError, match=said):
+        unpack(archive)
+
+
 def sparse(files: Files) -> bytes:
     entry, data = member(f"{FOLDER}/crl.pem")
     entry.pax_headers = {
