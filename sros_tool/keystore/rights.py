@@ -430,6 +430,10 @@ def _document_rights(path: Path, kind: str, file: Path) -> RightsSource:
     )
 
 
+FOREIGN_GRANT = "rights.foreign-grant"
+"""The id of the note on permissions that have a grant for another enclave."""
+
+
 def _keystore_rights(
     keystore: OpenedKeystore, *, hidden: bool, only_enclaves: Sequence[str] | None = None
 ) -> RightsSource:
@@ -448,9 +452,10 @@ def _keystore_rights(
         rights |= granted
         enclaves.update(scope)
         if foreign := sorted(set(scope) - {name}):
-            text = f"{name}: its permissions are for {', '.join(foreign)}, and DDS refuses them."
+            verdict = "which can use them, too" if name in scope else "and DDS refuses them"
+            text = f"{name}: its permissions are for {', '.join(foreign)}, {verdict}."
             reader.sound = False
-            reader.notes.append(Note("rights.foreign-grant", text))
+            reader.notes.append(Note(FOREIGN_GRANT, text))
     return RightsSource(
         root,
         "keystore",

@@ -40,7 +40,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, deciding_enclave
 from sros_tool.keystore.protection import governance_with_stated
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.keystore.rights import load_rights, load_zenoh_rights
+from sros_tool.keystore.rights import FOREIGN_GRANT, load_rights, load_zenoh_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, Template, load_template
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.document import files_of_policies, join_policies, refuse_fallbacks
@@ -358,6 +358,15 @@ def _keystore_system(keystore: OpenedKeystore, at: Circumstances) -> System:
     root = keystore.root
     names = enclave_names(root, hidden=True)
     source = load_rights(keystore, hidden=True)
+    for note in source.notes:
+        if note.id == FOREIGN_GRANT:
+            raise KeystoreError(
+                f"the rights in keystore '{root}' are not known: {note.text.rstrip('.')}",
+                "Permissions are not secret: whoever has the key of an enclave can use all of them "
+                "that have a grant for it.",
+                "Sign permissions with one grant for each enclave, with create_permission or "
+                "generate_artifacts.",
+            )
     rights = frozenset(right for right in source.rights if right.qualifier is ALLOW)
     stated = _stated_topics(names, rights)
     loaded = {name: deciding_enclave(keystore, name, moment=at.now) for name in names}
