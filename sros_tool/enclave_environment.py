@@ -138,12 +138,9 @@ def loadable_environment(
     problems = state.problems_in_keystore if target else state.problems
     if problems:
         from sros_tool.explain.explanation import remedy
-        from sros_tool.keystore.layout import folder_of_closed_robot
 
         root = keystore.root
         remedies = [remedy(problem.fault, str(root), name, problem.file) for problem in problems]
-        if robot := folder_of_closed_robot(root):
-            remedies.append(f"`sros close {quote(str(robot))}` exports what is renewed.")
         raise KeystoreError(
             f"a process cannot run in enclave {name}",
             "; ".join(str(problem).rstrip(".") for problem in problems) + ".",

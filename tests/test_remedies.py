@@ -15,6 +15,8 @@ import sros_tool
 from sros_tool.cli.common import KEYSTORE_VARIABLE
 from sros_tool.cli.program import program
 from sros_tool.explain.log import explain_log
+from sros_tool.faults import Fault, remedy_in_original_keystore
+from sros_tool.keystore.layout import remedy_in_closed_robot
 from tests.explain.broken import make_keystore
 from tests.explain.test_log import LOGS
 from tests.support.harness import sros
@@ -124,3 +126,27 @@ def test_every_remedy_for_a_log_is_a_command(log: Path, keystore: Path) -> None:
     for found in explain_log(log.read_text(), lambda _: None, lambda _: pytest.fail("")):
         for command in re.findall("`(sros .+?)`", found.remedy):
             check_parses(command)
+
+
+def test_a_remedy_in_a_folder_of_close_names_close(tmp_path: Path) -> None:
+    """It also names the keystore there, unless that was brought to another machine."""
+    export, keystore = tmp_path / "export", tmp_path / "keystore"
+    for folder in (export, keystore / "private"):
+        folder.mkdir(parents=True)
+    for file in ("processes.json", "policy.xml", "keystore/private/key"):
+        (tmp_path / file).touch()
+    close = f"run `sros close {tmp_path}`"
+    in_export = Fault.FILE_MISSING.remedy_in_export("permissions.p7s")
+    renew = remedy_in_original_keystore("Renew it: `sros renew KEYSTORE ENCLAVE`.")
+    for remedy, said in (
+        (in_export.format(root="KEYSTORE", enclave="/a"), f"Run `sros close {tmp_path}`. Only if"),
+        (renew, f"Renew it: `sros renew {keystore} ENCLAVE`. Then {close}."),
+        ("export them again (`sros distribute_key K E TARGET --force`), or", f"{close}, or"),
+        ("Run `sros zenoh KEYSTORE`, export again, and", f"zenoh {keystore}`, {close}, and"),
+        ("from an export, export their enclaves again first", f"an export, {close} first"),
+    ):
+        for root in (export, keystore):
+            assert said in remedy_in_closed_robot(root, remedy)
+        assert remedy_in_closed_robot(tmp_path, remedy) == remedy
+    (keystore / "private/key").unlink()
+    assert remedy_in_closed_robot(export, renew) == renew

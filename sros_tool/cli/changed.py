@@ -227,6 +227,7 @@ def _print_restart(
     that exports are out of date.
     """
     from sros_tool.keystore.fleet import publish_command
+    from sros_tool.keystore.layout import remedy_in_closed_robot
 
     if not names:
         return
@@ -237,7 +238,5 @@ def _print_restart(
         text += f"; of those on Zenoh: {shown_names(zenoh.restart) or 'none'}"
     if exported and (published := publish_command(root)):
         text += f"; robots that fetch: {published} first"
-    export_again = (
-        "; if processes run from an export, export their enclaves again first" if exported else ""
-    )
-    echo(text + export_again, err=True)
+    text += "; if processes run from an export, export their enclaves again first" * exported
+    echo(remedy_in_closed_robot(root, text), err=True)

@@ -357,7 +357,7 @@ def _next_step_hints(result: Creation, as_json: bool) -> Iterator[str]:
     """Yield hints for standard error: how enclaves get to robots, and unchanged enclaves."""
     from sros_tool.fleet.robots import robot_of
     from sros_tool.keystore.fleet import load_fleet, publish_command
-    from sros_tool.keystore.layout import FLEET
+    from sros_tool.keystore.layout import FLEET, remedy_in_closed_robot
     from sros_tool.keystore.reader import OpenedKeystore
 
     published = "" if as_json or result.dry_run else publish_command(result.root)
@@ -381,10 +381,10 @@ def _next_step_hints(result: Creation, as_json: bool) -> Iterator[str]:
     if published and has_robot((*result.changed, *result.completed)):
         yield f"robots that fetch get the changed files by {published}"
     elif result.changed and not (as_json or result.dry_run):
-        yield (
+        yield remedy_in_closed_robot(
+            result.root,
             "running processes keep the earlier files: restart them; first export again if they "
-            "use "
-            "an export"
+            "use an export",
         )
     if result.revoked:
         verb = "would revoke" if result.dry_run else "revoked"

@@ -136,6 +136,7 @@ def renew(
 def _replaced_lines(result: Changed, *, has_new_keys: bool) -> Iterator[str]:
     """Yield until when replaced certificates still work, and where copies of them are."""
     from sros_tool.keystore.fleet import publish_command
+    from sros_tool.keystore.layout import remedy_in_closed_robot
     from sros_tool.validity import iso
 
     if not result.outcomes and not result.dry_run:
@@ -159,11 +160,11 @@ def _replaced_lines(result: Changed, *, has_new_keys: bool) -> Iterator[str]:
     if result.outcomes and not result.restart:
         published = publish_command(result.root)
         deliver = f"publish ({published}) or export again" if published else "export again"
-        yield (
+        yield remedy_in_closed_robot(
+            result.root,
             "exports and running processes still have the earlier certificates and permissions: "
             f"{deliver}, and restart the processes before these files expire; if some have "
-            "expired, "
-            "restart all processes together"
+            "expired, restart all processes together",
         )
     if has_new_keys and result.outcomes and publish_command(result.root):
         yield (

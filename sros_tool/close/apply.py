@@ -30,7 +30,7 @@ from sros_tool.files import remove_file
 from sros_tool.names import expand
 from sros_tool.policy.model import Policy
 from sros_tool.runtime.environment import node_argument
-from sros_tool.runtime.processes import Process, program_of
+from sros_tool.runtime.processes import Process, program_of, user_text
 from sros_tool.runtime.units import unit_changes, write_units
 from sros_tool.values import FileChange
 from sros_tool.wording import enumerated
@@ -212,9 +212,8 @@ class _RemainingProcesses:
             guest = self._secured[enclave]
             remedy = f"restart process {guest.pid} open: {process_text(guest)}"
             if not self._running.may_use_files(guest):
-                remedy = (
-                    f"end {guest.label} of user {guest.user}, who cannot read the enclave's files"
-                )
+                owner = f"not the owner of the enclave's files ({user_text(guest.user)})"
+                remedy = f"end {guest.label}, which runs as {owner}"
             yield f"a process runs in the enclave {enclave}, too; {remedy}"
 
     def unknown_processes(self) -> Iterator[str]:

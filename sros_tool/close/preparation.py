@@ -26,7 +26,13 @@ from sros_tool.close.watch import check_watchable, watch
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.files import replace_file
 from sros_tool.folders import Folder
-from sros_tool.keystore.layout import KEY_FILES, enclave_folder, enclave_path, list_enclaves
+from sros_tool.keystore.layout import (
+    KEY_FILES,
+    enclave_folder,
+    enclave_path,
+    how_to_learn_beside,
+    list_enclaves,
+)
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.selection import revocation_of
 from sros_tool.policy.document import read_policy
@@ -382,20 +388,21 @@ def _unknown_process_problems(robot: LocalRobot, state: CloseState) -> Iterator[
     silent = "they would not be heard any more (accept: --partial)"
     if observed.unknown:
         processes = first_few(observed.unknown, MOST_NAMES)
-        undo = f"go back by {close} --undo, and " if state.secured else ""
-        if state.secured and (idle := sorted(state.stopped)):
-            start = observed.command_of_new(robot.export.absolute(), "ENCLAVE")
-            undo = (
-                f"if such a process belongs in {first_few(idle, MOST_NAMES)}, stop it, and start "
-                f"it there: {start}; if not, {undo}"
-            )
         remap = "--ros-args -r __node:=NODE -r __ns:=NAMESPACE"
         advice = f", or name its node in the command of each process ({remap})"
         advice = advice if observed.elsewhere else ""
+        advice = f"watch again while they run{advice}: {close} --for 1m"
+        if state.secured:
+            advice = "stop what is not of the robot, such as your own `sros demo listener`; "
+            if idle := sorted(state.stopped):
+                start = observed.command_of_new(robot.export.absolute(), "ENCLAVE")
+                advice += f"stop what belongs in {first_few(idle, MOST_NAMES)}, and start it "
+                advice += f"there: {start}; "
+            learn = how_to_learn_beside(robot.folder, robot.domain)
+            advice += f"to give another process its own enclave, {learn}"
         yield (
             f"sros saw no node of {counted(len(observed.unknown), 'process', 'processes')}: "
-            f"{processes}; {undo}watch again while they run{advice}: {close} --for 1m; "
-            f"otherwise {silent}"
+            f"{processes}; {advice}; otherwise {silent}"
         )
     routers = [process for process in RunningRobot(robot).open_processes if process.is_router]
     if routers and not any(process.is_router for process in observed.processes):

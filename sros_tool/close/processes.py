@@ -50,7 +50,7 @@ class ClosedProcess(NamedTuple):
     folder: str
     """Its working directory."""
     user: int
-    """The id of the user who runs it."""
+    """The id of the user who runs it; 4294967295 if several users have a say in it."""
     unit: str
     """The systemd unit that starts it alone; empty for a process that is restarted by hand."""
     known_by: Annotated[

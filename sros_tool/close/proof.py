@@ -229,7 +229,8 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
         return Proof(SILENCE, None, f"{error}")
     if value["nodes"]:
         nodes = {f"{node['namespace'].rstrip('/')}/{node['name']}" for node in value["nodes"]}
-        return Proof(SILENCE, False, f"it sees {first_few(sorted(nodes), MOST_NAMES)}")
+        found = f"it sees {first_few(sorted(nodes), MOST_NAMES)}"
+        return Proof(SILENCE, False, f"{found}; stop what runs open, or start it in its enclave")
     if not hears:
         return Proof(SILENCE, None, "nor does the observer in its enclave see the robot now")
     seen = nodes_text(before.nodes)
@@ -349,12 +350,29 @@ def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection
             "not done": ["the ROS graph kept changing"] if status else [],
         }
         reasons = [
-            f"{why}: {first_few(names, MOST_NAMES)}" for why, names in differences.items() if names
+            f"{why}: {first_few(names, MOST_NAMES)}{_remedy(robot, why)}"
+            for why, names in differences.items()
+            if names
         ]
         if not reasons:
             renamed = _renamed_text(nodes, comparison.current, fails=False)
             return Proof(TALK, True, f"{comparison.summary()}{renamed}")
     return Proof(TALK, False, f"{reasons[0]}{_renamed_text(nodes, comparison.current, fails=True)}")
+
+
+def _remedy(robot: LocalRobot, difference: str) -> str:
+    """Return a clause on what to do about a kind of difference; "" if its names say it."""
+    policy, restart = f"'{robot.policy}'", f"run `{robot.close_command}`, and restart these nodes"
+    remedies = {
+        "denied": f"if a node needs this, add it to its profile in {policy}, and {restart}; if a "
+        "name was changed in the policy alone, start the node with this name, too",
+        "gone": f"if the node uses another name now, write that name into its profile in {policy} "
+        f"in place of this one, also into those of the nodes that it talks to, and {restart}; if "
+        f"not, start the node as before ({robot.commands_file})",
+        "left alone": f"give both sides one name, in {policy} and in their programs, and {restart}",
+        "refused": f"ask `sros check {shlex.quote(str(robot.export))}`",
+    }
+    return f"; {remedy}" if (remedy := remedies.get(difference)) else ""
 
 
 class _TalkComparison:
@@ -433,8 +451,8 @@ class _TalkComparison:
         expected = {*map(node_name, self._nodes.expected(self.current).nodes)}
         new = sorted({*map(node_name, with_profile)} - expected)
         if new:
-            text += f"; not compared: {first_few(new, MOST_NAMES)} (new; compared once "
-            text += f"{_watch_again(self._nodes)})"
+            text += f"; not compared: {first_few(new, MOST_NAMES)} (new: only nodes that sros saw "
+            text += "on the open robot are compared)"
         return text
 
 
@@ -475,16 +493,10 @@ def _renamed_text(nodes: ObservedNodes, current: Observation | None, *, fails: b
     if not_compared and not fails:
         text += (
             "; not compared, as the policy has no profile for them any more: "
-            f"{first_few(sorted(not_compared), MOST_NAMES)} (if they have new names, they are "
-            f"compared once {_watch_again(nodes)})"
+            f"{first_few(sorted(not_compared), MOST_NAMES)} (a renamed node is compared if its "
+            "enclave has no other new or renamed node)"
         )
     return text
-
-
-def _watch_again(nodes: ObservedNodes) -> str:
-    """Return a clause on how to watch nodes that have only run closed so far."""
-    close = nodes.robot.close_command
-    return f"the open robot was watched again: {close} --undo, {close} --for 1m"
 
 
 def _ended_since(running: RunningRobot) -> dict[str, str]:

@@ -19,6 +19,7 @@ from sros_tool.errors import SrosError, UnavailableError, UsageError
 from sros_tool.files import replace_file
 from sros_tool.folders import make_folders, remove_folders
 from sros_tool.keystore.layout import (
+    CLOSED_KEYSTORE,
     CLOSED_OBSERVER,
     CLOSED_POLICY,
     CLOSED_PROCESSES,
@@ -103,7 +104,7 @@ class LocalRobot:
         self.close_command = f"sros close {shlex.quote(str(folder))}"
         self.policy, self.observer = folder / CLOSED_POLICY, folder / "observer.xml"
         self.requirements = folder / REQUIREMENTS
-        self.keystore, self.export = folder / "keystore", folder / "export"
+        self.keystore, self.export = folder / CLOSED_KEYSTORE, folder / "export"
         self.start, self.page = folder / "start", folder / "rights.html"
         self.commands_file = self.start / "commands.txt"
         self.observation_file = folder / "observed.json"

@@ -36,6 +36,7 @@ from sros_tool.runtime.processes import (
     plain,
     process_origin,
     program_of,
+    user_text,
 )
 from sros_tool.runtime.variables import STRATEGY
 from sros_tool.validity import time_of_file
@@ -153,7 +154,7 @@ class RunningRobot:
     def _why_not_current(self, process: Process, enclave: ProcessEnclave) -> str:
         """Return why a process is not closed, as text before "the processes of X"; "" if it is."""
         if not self.may_use_files(process):
-            return f"user {process.user}, who cannot read the files, runs"
+            return f"others than the owner of the files ({user_text(process.user)}) run"
         if process.environment.get(STRATEGY) != "Enforce":
             return f"no {STRATEGY}=Enforce in"
         if not enclave.is_there:

@@ -59,8 +59,9 @@ def check_watchable(robot: LocalRobot) -> None:
         raise UsageError(
             f"the robot runs closed: {first_few(secured, MOST_NAMES)}",
             "Only an open robot can be watched.",
-            f"Go back by `{robot.close_command} --undo` and watch again, "
-            f"or add what is missing to '{robot.policy}' by hand.",
+            f"Leave the robot closed, and add what is missing to '{robot.policy}': `sros explain "
+            f"{shlex.quote(str(robot.export))} --log FILE` names the rights that a process lacked. "
+            f"Only to watch all of it again: `{robot.close_command} --undo`.",
         )
     nodes = [process for process in running.in_domain if not process.is_daemon]
     on_zenoh = [process for process in nodes if process.is_zenoh]

@@ -41,6 +41,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     is_original_keystore,
     is_own_copy,
+    remedy_in_closed_robot,
 )
 from sros_tool.keystore.participant import LoadedEnclave, plan_enclave
 from sros_tool.names import (
@@ -184,10 +185,12 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
         if fault:
             is_done_here = "`" not in text or fault is Fault.GOVERNANCE_DOMAIN
             where = root if is_done_here else "KEYSTORE"
-            return _filled_remedy(fault.remedy_in_export(file), where, enclave, file)
+            text = _filled_remedy(fault.remedy_in_export(file), where, enclave, file)
+            return remedy_in_closed_robot(keystore, text)
         if "`" not in text:
             return _filled_remedy(text, root, enclave, file)
-        return remedy_in_original_keystore(_filled_remedy(text, "KEYSTORE", enclave, file))
+        text = remedy_in_original_keystore(_filled_remedy(text, "KEYSTORE", enclave, file))
+        return remedy_in_closed_robot(keystore, text)
     if keystore and fault:
         wrong_issuer = fault is Fault.CERTIFICATE_ISSUER
         if wrong_issuer and is_own_copy(keystore, enclave, IDENTITY_CA_FILE):

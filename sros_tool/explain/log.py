@@ -40,7 +40,12 @@ from sros_tool.explain.explanation import (
 from sros_tool.faults import NEEDS_CA_KEYS, ORIGINAL_KEYSTORE, Fault, remedy_in_original_keystore
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.keystore.known_keys import enclaves_by_identity
-from sros_tool.keystore.layout import ROUTER_FILE, is_keystore, is_original_keystore
+from sros_tool.keystore.layout import (
+    ROUTER_FILE,
+    is_keystore,
+    is_original_keystore,
+    remedy_in_closed_robot,
+)
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.loading import leaves_open
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave
@@ -756,7 +761,7 @@ class _Examiner:
         own_name = enclave.name if enclave else hit.enclave.rstrip("/")
         own_name = "" if hit.meaning in (NO_ENCLAVE, RUNS_OPEN) else own_name
         if self._is_export and NEEDS_CA_KEYS.search(text):
-            text = self._for_export(text)
+            text = remedy_in_closed_robot(Path(self._root), self._for_export(text))
         else:
             text = _with_name(text, "KEYSTORE", self._root)
         return _with_name(text, "ENCLAVE", own_name).format(**hit.quoted)

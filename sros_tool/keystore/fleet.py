@@ -26,7 +26,7 @@ from sros_tool.fleet.robots import (
     size_problem,
     unrecorded_enclaves,
 )
-from sros_tool.keystore.layout import FLEET, FLEET_ROOT
+from sros_tool.keystore.layout import FLEET, FLEET_ROOT, remedy_in_closed_robot
 from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.policy.placeholders import has_placeholder
@@ -210,7 +210,8 @@ def deliver_first(root: Path) -> str:
     """Return a sentence on how to deliver new files to robots before restarting processes."""
     published = publish_command(root)
     before = f"Publish them first, for robots that fetch: {published}. " if published else ""
-    return f"{before}If processes run from an export, export the enclaves again first."
+    text = "If processes run from an export, export the enclaves again first."
+    return f"{before}{remedy_in_closed_robot(root, text)}"
 
 
 class EnclaveDomains(NamedTuple):

@@ -16,11 +16,13 @@ from shlex import quote
 from typing import NamedTuple, TypeAlias
 
 from sros_tool.errors import DocumentError, KeystoreError
-from sros_tool.faults import remedy_in_original_keystore
+from sros_tool.faults import ORIGINAL_KEYSTORE, remedy_in_original_keystore
 
 ENCLAVES, PUBLIC, PRIVATE = "enclaves", "public", "private"
 CLOSED_PROCESSES, CLOSED_POLICY = "processes.json", "policy.xml"
 """Files that `sros close` writes next to its keystore."""
+CLOSED_KEYSTORE = "keystore"
+"""The keystore in a folder of `sros close`, until it is brought to another machine."""
 CLOSED_OBSERVER = "/sros_observer"
 """The enclave with which `sros close` observes a closed robot; no policy of the robot has it."""
 SETTINGS = "sros.toml"
@@ -252,7 +254,29 @@ def remedy_in_keystore(root: Path, remedy: str) -> str:
     """
     if is_original_keystore(root):
         return re.sub(r"\bKEYSTORE\b", lambda _: quote(str(root)), remedy)
-    return remedy_in_original_keystore(remedy)
+    return remedy_in_closed_robot(root, remedy_in_original_keystore(remedy))
+
+
+_EXPORT_AGAIN = re.compile(
+    r"\b([Ee])xport (?:(?:(?:the|their|its|these) enclaves?|them) )?again"
+    rf"(?:(?: from the {ORIGINAL_KEYSTORE}:)? \(?`sros distribute_key [^`]+`\)?)?"
+)
+"""What remedies say of bringing changed files to an export."""
+
+
+def remedy_in_closed_robot(root: Path, remedy: str) -> str:
+    """Return a remedy for ``root``, with the verb that exports again in a folder of `sros close`.
+
+    Only if the CA keys are still in that folder; otherwise the remedy is returned as it is.
+    """
+    robot = folder_of_closed_robot(root)
+    if not (robot and is_original_keystore(robot / CLOSED_KEYSTORE)):
+        return remedy
+    close, keystore = f"un `sros close {quote(str(robot))}`", quote(str(robot / CLOSED_KEYSTORE))
+    remedy = _EXPORT_AGAIN.sub(lambda found: ("R" if found[1] == "E" else "r") + close, remedy)
+    for where in (f"In the {ORIGINAL_KEYSTORE}: ", f" KEYSTORE is the {ORIGINAL_KEYSTORE}."):
+        remedy = remedy.replace(where, "")
+    return re.sub(r"\bKEYSTORE\b", lambda _: keystore, remedy)
 
 
 def folder_of_closed_robot(root: Path) -> Path | None:
@@ -262,19 +286,33 @@ def folder_of_closed_robot(root: Path) -> Path | None:
     return folder if made else None
 
 
+def how_to_learn_beside(robot: Path, domain: int = 0) -> str:
+    """Return clauses on how to learn the rights of a process, while the other ones stay closed.
+
+    ``robot`` is a folder of `sros close`, and ``domain`` the ROS domain. Only open nodes are seen.
+    """
+    option = f" --domain {domain}" * bool(domain)
+    return (
+        f"let it run open next to the closed robot, and run `sros generate_policy "
+        f"{quote(str(robot / CLOSED_POLICY))} --enclave-per-node{option}`; read the rights that "
+        f"this adds, run `sros close {quote(str(robot))}`, and restart the process as that says"
+    )
+
+
 def how_to_add_domains(root: Path, domains: str) -> str:
     """Return advice on how to add a domain to a keystore or an export's keystore, as a clause.
 
     ``domains`` are all domains that the keystore should then have, such as "0,5".
     """
     robot = folder_of_closed_robot(root)
-    candidates = (root, robot / "keystore") if robot else (root,)
+    candidates = (root, robot / CLOSED_KEYSTORE) if robot else (root,)
     keystore = next(filter(is_original_keystore, candidates), None)
     command = f"sros update_keystore {quote(str(keystore or 'KEYSTORE'))} --domain {domains}"
     if keystore == root:
         return f"add the domain with `{command} --allow-looser`"
     where = "to its keystore" if keystore else "where its keystore is"
-    return f"add the domain {where}, with `{command} --allow-looser`, and export again"
+    text = f"add the domain {where}, with `{command} --allow-looser`, and export again"
+    return remedy_in_closed_robot(root, text)
 
 
 def is_enclave(folder: Path) -> bool:

@@ -31,6 +31,7 @@ from sros_tool.keystore.layout import (
     SETTINGS,
     enclaves_below,
     folder_of_closed_robot,
+    how_to_learn_beside,
 )
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.reader import OpenedKeystore
@@ -297,8 +298,7 @@ def missing_enclave_error(
             missing,
             why,
             f"If it is not a typo, write its rights into {policy}, and run `sros close {folder}`. "
-            f"To learn them: `sros close {folder} --undo`, start the robot open with this "
-            f"process, and `sros close {folder} --for 1m`.",
+            f"To learn them, {how_to_learn_beside(robot)}.",
         )
     if not keystore.is_original:
         where = f"`sros distribute_key KEYSTORE {quote(name)} {quote(str(root))}`"

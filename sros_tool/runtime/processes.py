@@ -713,6 +713,13 @@ _USERS = re.compile(rb"^Uid:\s+(\d+)\s+(\d+)\s+(\d+)\s+(\d+)", re.MULTILINE)
 SEVERAL_USERS = 0xFFFFFFFF
 """Stands for several users who may have a say in a process; no process has this id (setresuid(2)).
 """
+
+
+def user_text(user: int) -> str:
+    """Return the user who has a say in a process as text, such as ``user 1000``."""
+    return "several users at once" if user == SEVERAL_USERS else f"user {user}"
+
+
 _OWN_PID = re.compile(rb"^NSpid:(?:\s+\d+)*\s+(\d+)$", re.MULTILINE)
 """The process id in the innermost PID namespace, in /proc/PID/status."""
 

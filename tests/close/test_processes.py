@@ -21,6 +21,7 @@ from sros_tool.close.state import RunningRobot
 from sros_tool.policy.model import Policy
 from sros_tool.runtime.environment import NO_CONFIGURATION, RMW_ZENOH
 from sros_tool.runtime.processes import (
+    SEVERAL_USERS,
     LoadedFile,
     Process,
     ProcessEnclave,
@@ -216,7 +217,11 @@ def test_an_enclave_is_closed_only_if_all_its_processes_are(tmp_path: Path) -> N
         ((fresh, replace(old, user=4321)), None),
         ((fresh, old), "cert.pem changed, or got another mode, after the start of"),
         ((old, fresh), "cert.pem changed, or got another mode, after the start of"),
-        ((replace(fresh, user=4321),), "user 4321, who cannot read the files, runs"),
+        ((replace(fresh, user=4321),), "others than the owner of the files (user 4321) run"),
+        (
+            (replace(fresh, user=SEVERAL_USERS),),
+            "others than the owner of the files (several users at once) run",
+        ),
         (
             (replace(fresh, configuration=unread),),
             "the files are not in force ('/s.json5' cannot be read: odd) in",

@@ -63,6 +63,7 @@ from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
     KEY_FILE,
     enclave_path,
+    remedy_in_closed_robot,
     waits_for_answer,
 )
 from sros_tool.keystore.reader import OpenedKeystore, read_consistently
@@ -304,6 +305,7 @@ def _with_enclave_names(finding: Finding, keystore: CheckedKeystore) -> Finding:
         remedy = _SIGNS_POLICY.sub(r"\g<0> --fleet FLEET_FILE", remedy)
     if finding.subject.startswith("/") and "," not in finding.subject:
         remedy = re.sub(r"\bENCLAVE\b", lambda _: quote(finding.subject), remedy)
+    remedy = remedy_in_closed_robot(keystore.root, remedy)
     return finding if remedy == finding.remedy else finding._replace(own_remedy=remedy)
 
 

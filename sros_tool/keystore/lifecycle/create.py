@@ -72,6 +72,7 @@ from sros_tool.keystore.layout import (
     key_on_robot,
     keystore_around,
     refuse_earlier,
+    remedy_in_closed_robot,
     similar_keystores,
 )
 from sros_tool.keystore.ledger import RESTORED, certificate_entry, document_entry
@@ -733,13 +734,13 @@ def exports_note(keystore: OpenedKeystore, names: Sequence[str]) -> Note:
         )
         return Note("keystore.export-again", text)
     shown = quote(str(keystore.root))
-    text = "Robots have the former files: export the new ones (`sros distribute_key "
+    text = "Robots have the former files: export them again (`sros distribute_key "
     text += f"{shown} ENCLAVE TARGET --force`)"
     remote = [name for name in names if key_on_robot(keystore.folder(name))]
     if remote:
         text += f"; for {', '.join(remote)}, answer the request again (`sros sign_request "
         text += f"{shown} REQUEST --renew`)"
-    return Note("keystore.export-again", f"{text}.")
+    return Note("keystore.export-again", remedy_in_closed_robot(keystore.root, f"{text}."))
 
 
 _OF_KEY = {*KEY_FILES, REQUEST}
