@@ -87,3 +87,15 @@ def test_of_what_nobody_knows_the_end_stays(tmp_path: Path) -> None:
     for days in (110, 120, 130):
         refresh_crl(root, now=NOW + days * DAY)
     assert serial in listed(root)
+
+
+@pytest.mark.parametrize("ahead", [(110,), (110, 120), (110, 120, 130)])
+def test_a_clock_that_was_ahead_takes_no_revocation_away(
+    ahead: tuple[int, ...], tmp_path: Path
+) -> None:
+    root, serial = made(tmp_path / "ks")
+    for days in ahead:
+        refresh_crl(root, now=NOW + days * DAY)
+    revoke(root, ["/b"], now=NOW + 20 * DAY)
+    assert serial in listed(root)
+    assert len(listed(root)) == 2

@@ -198,18 +198,21 @@ def sign_list(
     return SignedList(document, end, entry)
 
 
-def _carried_over(old: RevocationList | None, expiries: Mapping[int, str]) -> list[Revoked]:
+def _carried_over(
+    old: RevocationList | None, expiries: Mapping[int, str], now: datetime
+) -> list[Revoked]:
     """Return the entries of the ``old`` list that the next list must repeat.
 
     These are the certificates that had not expired when the old list was issued.  By RFC 5280, 3.3,
-    an entry stays until it was on a list after the certificate's expiry.  ``expiries`` maps serial
-    numbers to expiries (ISO 8601, UTC); an entry without a known expiry is always repeated.
+    an entry stays until it was on a list after the certificate's expiry.  An old list that was
+    issued in the future, by a clock that was wrong, counts as issued ``now``.  ``expiries`` maps
+    serial numbers to expiries (ISO 8601, UTC); an entry without a known expiry is always repeated.
     """
     if old is None:
         return []
     # thisUpdate is up to BACKDATE before the time of signing, so some entries are repeated longer
     # than needed.
-    issued = iso(old.this_update)
+    issued = iso(min(old.this_update, now))
     return [entry for entry in old.revoked if expiries.get(entry.serial, issued) >= issued]
 
 
@@ -465,7 +468,7 @@ class RevocationListSigner:
         expiries: Mapping[int, str],
         least: int,
     ) -> SignedList:
-        kept = _carried_over(old, expiries)
+        kept = _carried_over(old, expiries, self._now)
         listed = {entry.serial for entry in kept}
         kept += [entry for entry in new_entries if entry.serial not in listed]
         if authority.service:
