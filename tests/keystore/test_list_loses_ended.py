@@ -12,6 +12,7 @@ import pytest
 from sros_tool.keystore.describe import HistoryStatus, history
 from sros_tool.keystore.layout import LEDGER, enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
+from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.reader import OpenedKeystore
@@ -99,3 +100,19 @@ def test_a_clock_that_was_ahead_takes_no_revocation_away(
     revoke(root, ["/b"], now=NOW + 20 * DAY)
     assert serial in listed(root)
     assert len(listed(root)) == 2
+
+
+@pytest.mark.parametrize("what", ["revoke", "renew"])
+def test_a_certificate_is_revoked_that_only_a_clock_ahead_takes_for_expired(
+    what: str, tmp_path: Path
+) -> None:
+    """The clock is right again later, and the certificate valid."""
+    root, _ = made(tmp_path / "ks")
+    serial = certificate(enclave_path(root, "/b") / "cert.pem").serial_number
+    renew(root, ["/b"], now=NOW + 20 * DAY)
+    ahead = NOW + 1500 * DAY
+    if what == "renew":
+        renew(root, ["/b"], revoke_old=True, now=ahead)
+    else:
+        revoke(root, ["/b"], now=ahead)
+    assert serial in listed(root)

@@ -445,7 +445,9 @@ def test_nothing_is_revoked_where_nothing_is_renewed(tmp_path: Path) -> None:
 
 
 def test_a_certificate_that_has_ended_needs_no_revocation(tmp_path: Path) -> None:
+    """The ledger, and not only the clock, says that it has ended."""
     root = made(tmp_path / "ks", "/a")
+    create_enclaves(root, ["/b"], now=NOW + timedelta(days=400))
     done = renew(root, ["/a"], now=NOW + timedelta(days=500), revoke_old=True)
     assert (done.revoked, revoked(root)) == (0, {})
 

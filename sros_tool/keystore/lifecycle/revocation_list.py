@@ -250,6 +250,8 @@ class RevocationListSigner:
         self._template = template
         self._keyring = keyring
         self._now = now
+        self._known_time = min(now, keystore.ledger_file.last_time() or now)
+        """A time that has passed even if the clock is ahead now, as of the last change."""
         self._last: Mapping[str, Entry] = {}
         self.remarks: list[Note] = []
         self.present = self._list_if_authentic(keystore.revocation_list)
@@ -286,9 +288,9 @@ class RevocationListSigner:
         ledger = self._keystore.ledger_with("what", "revocation").entries
         recorded = {int(e.serial, 16) for e in ledger if e.what == "revocation"}
         revocations = []
-        moment = iso(self._now)
+        moment = iso(self._known_time)
         present = last
-        # A certificate that has expired need not be revoked when it is replaced.
+        # A certificate that has certainly expired need not be revoked when it is replaced.
         if keep is not None:
             present = {name: entry for name, entry in last.items() if entry.not_after >= moment}
         for name, valid in self._still_valid(last, present, listed).items():
@@ -331,14 +333,14 @@ class RevocationListSigner:
     def _still_valid(
         self, names: Iterable[str], present: Mapping[str, Entry], listed_serials: Collection[int]
     ) -> dict[str, dict[int, Entry]]:
-        """Map each enclave to its certificates that have not expired, by serial number.
+        """Map each enclave to its certificates that may not have expired, by serial number.
 
         The certificates come from the ledger, from the folder ``revoked`` (which a new list after a
         lost one lacks), and from ``present``, because the ledger lacks certificates that ros2/sros2
         issued.  Serial numbers in ``listed_serials`` are not searched in the folder.
         """
         certificates: dict[str, dict[int, Entry]] = {name: {} for name in names}
-        moment = iso(self._now)
+        moment = iso(self._known_time)
         for entry in self._keystore.ledger_file.with_values("enclave", certificates).entries:
             expired = entry.not_after and entry.not_after < moment
             if (
@@ -352,7 +354,7 @@ class RevocationListSigner:
             self._keystore, self._recorded_as_moved(listed_serials)
         ):
             name = common_name_of(certificate.subject)
-            if name in certificates and validity_of(certificate).not_after >= self._now:
+            if name in certificates and validity_of(certificate).not_after >= self._known_time:
                 entry = certificate_entry(self._now, "certificate", certificate, name)
                 certificates[name][certificate.serial_number] = entry
         for name, entry in present.items():
