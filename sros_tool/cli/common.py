@@ -474,7 +474,7 @@ def complete_keystore_and_enclave(
     root = Path(given[0]) if given else Path(os.environ.get(KEYSTORE_VARIABLE, ""))
     if given or (os.environ.get(KEYSTORE_VARIABLE) and incomplete.startswith("/")):
         names = search_enclaves(root)[0] if is_keystore(root) else ()
-        return [*_completions(names, incomplete)]
+        return [*completions(names, incomplete)]
     return [CompletionItem(incomplete, type="dir")]
 
 
@@ -488,9 +488,13 @@ def keystore_arguments(metavar: str, **more: Any) -> Callable[[Decorated], Decor
     )
 
 
-def _completions(names: Iterable[str], incomplete: str) -> list[str]:
-    """Return the names that start with ``incomplete`` and that a shell can show on one line."""
-    return [name for name in names if name.startswith(incomplete) and visible_line(name) == name]
+def completions(names: Iterable[str], incomplete: str) -> list[str]:
+    """Return the names that start with ``incomplete`` and that a shell need not quote.
+
+    Bash puts a completion into the line as it is, and would then run a command in the name of a
+    folder or topic.
+    """
+    return [name for name in names if name.startswith(incomplete) and quote(name) == name]
 
 
 def complete_robot(ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
@@ -504,7 +508,7 @@ def complete_robot(ctx: click.Context, _parameter: click.Parameter, incomplete: 
     fleet = None
     with suppress(SrosError):
         fleet = load_fleet(OpenedKeystore(Path(keystore))) if keystore else None
-    return _completions(fleet.robots if fleet else (), incomplete)
+    return completions(fleet.robots if fleet else (), incomplete)
 
 
 def complete_file(
@@ -522,7 +526,7 @@ def complete_template(
     """Complete the names of templates."""
     from sros_tool.keystore.template import template_names
 
-    return _completions(template_names(), incomplete)
+    return completions(template_names(), incomplete)
 
 
 # ── output ──────────────────────────────────────────────────────────────────────────────

@@ -19,6 +19,7 @@ from sros_tool.cli.common import (
     all_distros_option,
     check_one_decider,
     complete_keystore_and_enclave,
+    completions,
     distro_option,
     domain_of,
     enclave_filter_options,
@@ -88,7 +89,7 @@ def _complete_arguments(
     if len(rest) == before + 1:
         root = Path(arguments[0]) if named else ctx.params.get("keystore")
         names = _names_in_rights(ctx.params.get("policy") or root, _KINDS.get(rest[-1], ""))
-        return [name for name in names if name.startswith(incomplete)]
+        return [*completions(names, incomplete)]
     if rest:
         return []
     if named or ctx.params.get("keystore"):
@@ -120,7 +121,7 @@ def _complete_enclave(
     named = ctx.params.get("keystore") or (arguments[0] if arguments else "")
     root = Path(named or os.environ.get(KEYSTORE_VARIABLE, ""))
     names = search_enclaves(root)[0] if is_keystore(root) else ()
-    return [name for name in names if name.startswith(incomplete)]
+    return [*completions(names, incomplete)]
 
 
 _IGNORED = {

@@ -18,6 +18,7 @@ from sros_tool.cli.common import (
     check_one_format,
     check_output,
     complete_template,
+    completions,
     dry_run_option,
     fleets_of,
     fleets_option,
@@ -65,7 +66,7 @@ def _focus_completions(
     except (SrosError, OSError):
         return []
     names = {right.enclave for right in rights} | {right.name for right in rights}
-    return [name for name in sorted(names) if name.startswith(incomplete)]
+    return [*completions(sorted(names), incomplete)]
 
 
 @verb("view", cls=_SeveralObserved)

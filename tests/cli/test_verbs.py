@@ -33,6 +33,7 @@ from tests.support.children import run, wait_for
 from tests.support.harness import (
     Running,
     check_whole,
+    copy_of,
     forked,
     policy_text,
     publish,
@@ -631,6 +632,19 @@ def test_completion_of_words(words: str, wanted: str, keystore: Path) -> None:
     }
     ended = forked(env=environment)
     assert ended.out.replace("plain,", "").split() == wanted.split(), ended
+
+
+@pytest.mark.parametrize("words", ["env {} /", "explain {} /"])
+def test_no_completion_is_a_command(words: str, keystore: Path) -> None:
+    """Bash would run it with the rest of the line."""
+    for name in ("$(reboot)", "`reboot`"):
+        copy_of(keystore / "enclaves/a", keystore / "enclaves" / name)
+    line = "sros " + words.replace("{}", str(keystore))
+    number = str(len(line.split(" ")) - 1)
+    environment = {"_SROS_COMPLETE": "bash_complete", "COMP_WORDS": line, "COMP_CWORD": number}
+    found = forked(env={**os.environ, **environment}).out
+    assert "plain,/a\n" in found
+    assert "reboot" not in found
 
 
 # ── env and run ────────────────────────────────────────────────────────────────────────────
