@@ -396,7 +396,7 @@ def test_what_is_left_out_is_said(learned: Learned) -> None:
 def test_a_second_run_changes_nothing(learned: Learned) -> None:
     ended = learned.ended["second"]
     assert ended.status == 0, ended.err
-    assert ended.out == "nothing to add: 'robot.xml' already covers everything that was observed\n"
+    assert ended.out == "nothing to add: 'robot.xml' already covers all rights that were observed\n"
     assert (learned.folder / "robot.xml").read_text() == EXPECTED
 
 
