@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from difflib import get_close_matches
 from functools import cache, cached_property
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from shlex import quote
 
@@ -1225,7 +1225,9 @@ SHARED_NAMESPACE = FindingKind(
     "Both robots publish and subscribe to the same names; and a wildcard in the outer namespace "
     "also matches the names in the inner namespace.",
     "rcl (puts the node's namespace before relative names); sros (placeholder {namespace}).",
-    "Give each robot a namespace of its own in the fleet file, or a ROS domain of its own.",
+    "Give each robot a namespace of its own in the fleet file, or a ROS domain of its own. "
+    "Computers of one robot may share its namespace: put them, and no other robot, into one group, "
+    "and let no node run on two of them.",
 )
 
 UNKNOWN_GROUP = FindingKind(
@@ -1349,8 +1351,11 @@ def policy_file_findings(
             continue
         read.append(known)
         yield from _include_findings(path)
-        if fleet and (shared := [*_shared_namespaces(fleet)]):
-            yield SHARED_NAMESPACE.found(str(path), first_few(shared, 3, "; "), str(path))
+    if fleet:
+        enclaves = [enclave for policy in read for enclave in policy.enclaves]
+        if shared := [*_shared_namespaces(fleet.with_enclaves(patterns), enclaves)]:
+            first = str(paths[0])
+            yield SHARED_NAMESPACE.found(first, first_few(shared, 3, "; "), first)
     groups = {group_of(parts_of(pattern)) for pattern in patterns}
     if fleet and len(read) == len(paths) and (text := _robots_in_unknown_groups(groups, fleet)):
         yield UNKNOWN_GROUP.found(str(paths[0]), text, str(paths[0]))
@@ -1375,14 +1380,22 @@ def _check_zenoh(enclaves: Iterable[Enclave]) -> Iterator[Finding]:
             )
 
 
-def _shared_namespaces(fleet: Fleet) -> Iterator[str]:
-    """Yield a clause for each namespace that several robots on one ROS domain share."""
+def _shared_namespaces(fleet: Fleet, enclaves: Iterable[Enclave]) -> Iterator[str]:
+    """Yield a clause for each namespace that several robots on one ROS domain share.
+
+    The computers of one robot may: a group has them and nobody else, and no node runs on two.
+    """
     robots = {
         namespace: [fleet.robots[name] for name in names]
         for namespace, names in fleet.by_namespace.items()
     }
+    groups = {*fleet.groups.values()}
+    shared = {*chain(*(names for names in fleet.by_namespace.values() if names in groups))}
+    twice = _robots_with_the_same_node(fleet, enclaves) if len(shared) > 1 else frozenset()
     for namespace, inside in robots.items():
-        if met := _robots_on_one_domain(inside):
+        names = fleet.by_namespace[namespace]
+        is_one_robot = names in groups and not twice & {*names}
+        if not is_one_robot and (met := _robots_on_one_domain(inside)):
             yield f"{met[0].name} and {met[1].name} have the namespace {namespace}"
         above = namespace
         while above := above.rpartition("/")[0]:  # a robot in / may contain the others
@@ -1392,6 +1405,18 @@ def _shared_namespaces(fleet: Fleet) -> Iterator[str]:
                     f"the namespace of {inner}, {namespace}, is inside {above}, the namespace of "
                     f"{outer}"
                 )
+
+
+def _robots_with_the_same_node(fleet: Fleet, enclaves: Iterable[Enclave]) -> frozenset[str]:
+    """Return the names of robots that have a node of another robot, by its full name."""
+    from sros_tool.fleet.robots import robot_of
+
+    robots_by_node: dict[str, set[str]] = defaultdict(set)
+    for enclave in enclaves:
+        if robot := robot_of(fleet, enclave.path):
+            for profile in enclave.all_profiles():
+                robots_by_node[expand("~", profile.ns, profile.node)].add(robot.name)
+    return frozenset(chain(*(names for names in robots_by_node.values() if len(names) > 1)))
 
 
 def _robots_in_unknown_groups(named: Collection[str], fleet: Fleet) -> str:

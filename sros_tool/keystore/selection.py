@@ -10,6 +10,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from fnmatch import fnmatchcase
 from functools import partial
+from itertools import islice
 from shlex import quote
 from typing import NamedTuple
 
@@ -100,7 +101,7 @@ def select_to_revoke(
     patterns: Sequence[str],
     robots: Sequence[str],
 ) -> tuple[tuple[str, ...], tuple[Note, ...]]:
-    """Return the enclaves to revoke, and notes on enclaves of ``robots`` that the fleet lacks.
+    """Return the enclaves to revoke, and notes on other enclaves that ``robots`` may have.
 
     This works like `select_enclaves`, except that a robot also has all enclaves in its folder, such
     as ``/r3/spare``.
@@ -120,7 +121,8 @@ def select_to_revoke(
     chosen |= dict.fromkeys(_robots_enclaves(keystore, robots, True, unrecorded))
     below = [name for enclaves in unrecorded.values() for name in enclaves.below]
     left = {name for enclaves in unrecorded.values() for name in enclaves.naming} - chosen.keys()
-    return tuple(chosen), tuple(_unrecorded_notes(keystore, sorted(below), sorted(left)))
+    notes = [*_unrecorded_notes(keystore, sorted(below), sorted(left))]
+    return tuple(chosen), (*notes, *(_other_computers_notes(keystore, fleet, robots, chosen)))
 
 
 def _revocation_by_name(keystore: OpenedKeystore, robots: Sequence[str]) -> str:
@@ -181,6 +183,32 @@ def _unrecorded_notes(
             "with the name of a robot that you revoke in the path. If the key was on that robot, "
             f"run `sros revoke {quote(str(keystore.root))} {arguments_for(keystore, left)}`.",
         )
+
+
+def _other_computers_notes(
+    keystore: OpenedKeystore,
+    fleet: Fleet | None,
+    robots: Sequence[str],
+    revoked: Collection[str],
+) -> Iterator[Note]:
+    """Yield a note on robots that share a namespace with ``robots``, and keep enclaves."""
+    asked = [fleet.robots[name] for name in robots if name in fleet.robots] if fleet else []
+    for namespace, domain in dict.fromkeys((robot.namespace, robot.domain) for robot in asked):
+        assert fleet
+        in_namespace = [fleet.robots[name] for name in fleet.by_namespace[namespace]]
+        valid = (
+            robot.name
+            for robot in in_namespace
+            if robot.domain == domain and {*enclaves_of_robot(keystore, fleet, robot)} - {*revoked}
+        )
+        if others := [*islice(valid, _SHOWN)]:
+            command = f"sros revoke {quote(str(keystore.root))} --robot {' --robot '.join(others)}"
+            yield Note(
+                "fleet.same-namespace",
+                f"Still valid: the enclaves of {', '.join(others)}, with the namespace "
+                f"{namespace}, too. If this is a computer of the same robot, and somebody may have "
+                f"its keys, run `{command}`.",
+            )
 
 
 def _names_text(names: list[str]) -> str:

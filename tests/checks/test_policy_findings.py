@@ -385,6 +385,35 @@ def test_robots_that_share_a_namespace(
     assert shared == ([text] if text else [])
 
 
+@pytest.mark.parametrize(
+    ("nodes", "groups", "is_found"),
+    [
+        (("base", "camera"), ("r1", "r1"), False),
+        (("base", "base"), ("r1", "r1"), True),  # rather a copied robot
+        (("base", "camera"), ("r1", "r2"), True),  # nobody says that they are of one robot
+    ],
+)
+def test_computers_of_one_robot_share_its_namespace(
+    nodes: tuple[str, str], groups: tuple[str, str], is_found: bool, tmp_path: Path
+) -> None:
+    fleet = Fleet.of(
+        [
+            Robot("a", "/r1", groups=(groups[0], "x")),
+            Robot("b", "/r1", groups=(groups[1], "y")),
+            Robot("c", "/r3", groups=("x",)),
+            Robot("d", "/r4", groups=("y",)),
+        ]
+    )
+    enclaves = [
+        enclave("", f"/{{robot:{group}}}", "{namespace}").replace('node="n"', f'node="{node}"')
+        for group, node in zip("xy", nodes, strict=True)
+    ]
+    file = tmp_path / "policy.xml"
+    file.write_text(policy(*enclaves))
+    found = {each.id for each in policy_file_findings(file, fleet=fleet)}
+    assert ("policy.shared-namespace" in found) == is_found
+
+
 def test_what_zenoh_cannot_express_is_found_where_zenoh_is_named(tmp_path: Path) -> None:
     text = policy(enclave(topics("publish", "/x*") + deny("publish", "/x*y*")))
     assert "policy.not-on-zenoh" not in ids(tmp_path, text)

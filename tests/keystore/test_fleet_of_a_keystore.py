@@ -186,6 +186,23 @@ def test_what_lies_below_a_robot_is_revoked_with_it(unknown: Path, tmp_path: Pat
     assert "1 enclave that the fleet does not record elsewhere" in said, said
 
 
+def test_the_other_computer_of_a_revoked_robot_is_named(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    robot = 'namespace = "/r1", domain = '
+    (tmp_path / "fleet.toml").write_text(
+        f"[robots]\na = {{{robot}1}}\nb = {{{robot}1}}\nelsewhere = {{{robot}2}}\n"
+    )
+    (tmp_path / "policy.xml").write_text(policy_text({"/{robot}": publish("x")}))
+    sros("create_keystore", root, "--domain", "1,2").ok()
+    words = ("-p", tmp_path / "policy.xml", "--fleet", tmp_path / "fleet.toml")
+    sros("generate_artifacts", "-k", root, *words).ok()
+    said = sros("revoke", root, "--robot", "a", "--dry-run").ok().err
+    assert "Still valid: the enclaves of b, with the namespace /r1" in said
+    assert f"`sros revoke {root} --robot b`" in said
+    for robots_words in (("--robot", "a", "--robot", "b"), ("--robot", "elsewhere")):
+        assert "Still valid" not in sros("revoke", root, *robots_words, "--dry-run").ok().err
+
+
 def test_what_is_left_below_a_robot_is_revoked_later(unknown: Path, tmp_path: Path) -> None:
     """Also when all enclaves that the fleet records are revoked already."""
     root = tmp_path / "ks"
