@@ -364,15 +364,19 @@ class Verb(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Refuse an option that is given twice and takes one value: click drops all but the last.
 
+        Nothing is refused next to ``--help``.
+
         Raises:
             UsageError: there is such an option.
         """
         if not ctx.resilient_parsing:  # as for completion
             _, _, given = self.make_parser(ctx).parse_args(list(args))
+            asks_for_help = any(option.is_eager for option in given)
             for option, times in Counter(given).items():
                 if (
                     isinstance(option, click.Option)
                     and times > 1
+                    and not asks_for_help
                     and not (option.multiple or option.is_flag or option.count)
                 ):
                     name = max(option.opts, key=len)

@@ -390,12 +390,15 @@ def likely_meaning(right: Right, used: Collection[Right], named: Iterable[Right]
     similar = _similar_names(right.name, names, right.kind == "services")
     meaning = f"perhaps the policy means {' or '.join(similar)}" if similar else ""
     if len(similar) == 1 and right.kind != "actions":
-        name, meant = right.name, similar[0]
-        meaning += (
-            f" (the node may lack a remapping, -r {name}:={meant}, or the policy, "
-            f"--remap {meant}:={name})"
-        )
+        meaning += f" ({remapping_clause(right.name, similar[0])})"
     return meaning
+
+
+def remapping_clause(name: str, meant: str) -> str:
+    """Return which remapping the node or the policy may lack, as a clause."""
+    return (
+        f"the node may lack a remapping, -r {name}:={meant}, or the policy, --remap {meant}:={name}"
+    )
 
 
 def meaning_of_other_kind(right: Right, named: Iterable[Right]) -> str:

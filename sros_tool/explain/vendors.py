@@ -34,7 +34,7 @@ from sros_tool.explain.asking import (
     question_meant,
     rights_naming,
 )
-from sros_tool.explain.explanation import explain, likely_names
+from sros_tool.explain.explanation import explain, likely_names, remapping_clause
 from sros_tool.faults import REFUSE_STRANGERS
 from sros_tool.keystore.layout import (
     SETTINGS,
@@ -53,7 +53,7 @@ from sros_tool.keystore.participant import (
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.names import is_expression
 from sros_tool.policy.model import OFFERING_RIGHT, PEER_RIGHT, Policy
-from sros_tool.policy.rights import Right, policy_rights
+from sros_tool.policy.rights import Right, is_of_every_node, policy_rights
 from sros_tool.values import shows
 from sros_tool.wording import first_few
 
@@ -343,12 +343,17 @@ def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[N
     if any((right.right, right.name) == (needed, question.name) for right in rights):
         return
     if names := likely_names(answer):
-        text = f"the enclave may {question.word} {' and '.join(names)}: perhaps that is meant."
-        yield Note("explain.likely-name", text)
-    elif question.right in OFFERING_RIGHT and asked_enclave.has_peers:
+        text = f"the enclave may {question.word} {' and '.join(names)}: perhaps that is meant"
+        if len(names) == 1 and question.type != "action":
+            text += f" ({remapping_clause(question.name, names[0])})"
+        yield Note("explain.likely-name", f"{text}.")
+    elif asked_enclave.has_peers and not is_of_every_node(question.name):
+        kind, does = ("not-used", "needs")
+        if question.right in OFFERING_RIGHT:
+            kind, does = ("not-offered", "offers")
         text = f"no enclave that was read may {needed} {question.name} by its name: perhaps nobody "
-        text += "offers it, and the node lacks a remapping, or a wildcard allows it."
-        yield Note("explain.not-offered", text)
+        text += f"{does} it, and the node lacks a remapping, or a wildcard allows it."
+        yield Note(f"explain.{kind}", text)
 
 
 def _note_on_fitting_permissions(evaluator: Evaluator, answer: Answer) -> Iterator[Note]:

@@ -546,7 +546,7 @@ def rights_without_counterpart(
         if (other := PEER_RIGHT[right.right]) in touched
         and right.qualifier is not DENY
         and touched[other].overlaps(right.name)
-        and (right.right in OFFERING_RIGHT or not _is_offered_by_every_node(right.name))
+        and (right.right in OFFERING_RIGHT or not is_of_every_node(right.name))
     ]
     if not asked:
         return []
@@ -568,7 +568,8 @@ def rights_without_counterpart(
     return sorted(right for right in asked if (PEER_RIGHT[right.right], right.name) in lost)
 
 
-def _is_offered_by_every_node(name: str) -> bool:
+def is_of_every_node(name: str) -> bool:
+    """Return whether every node offers a name: it publishes the topic, or serves the service."""
     return name in ("/rosout", "/parameter_events") or name.rpartition("/")[2] in NODE_SERVICES
 
 

@@ -368,6 +368,31 @@ def refuse_undo_of_others(robot: Robot) -> None:
     assert len(robot.restarts) == 2
 
 
+def renew_without_systemd(robot: Robot) -> None:
+    """Run the script for robots without systemd: it ends the processes with outdated files."""
+    page = (Path(__file__).parents[2] / "docs/howto/close.md").read_text()
+    script = page.partition("tests/cli/test_close.py runs these lines -->\n```sh\n")[2]
+    lines = script.partition("```")[0].replace("/opt/robot/stands-still", "true")
+    # The process of an enclave runs by another command than the known one.
+    closed = json.loads(robot.close("--json", "--dry-run").out)
+    assert closed["outdated"].keys() == PID.keys()
+    closed["processes"].append({**closed["processes"][0], "pid": 0})
+    (said := robot.folder / "said.json").write_text(json.dumps(closed))
+    functions = f"""
+        sros() {{ [ "$3" != --json ] && echo "sros $*" || cat {said}; }}
+        kill() {{ echo "kill $*"; }}
+        sleep() {{ :; }}
+    """
+    ran = subprocess.run(["sh", "-c", functions + lines], capture_output=True, text=True)
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert ran.stdout.splitlines() == [
+        "sros renew /opt/robot/keystore --all-expiring 30d",
+        *(f"kill {PID[process['enclave']]}" for process in closed["processes"][:2]),
+        "sros close /opt/robot --proof",
+    ]
+    said.unlink()
+
+
 def renew_without_hands(robot: Robot) -> None:
     """Run the two commands of the timer in docs/howto/close.md: renew; export, restart, prove."""
 
@@ -382,6 +407,7 @@ def renew_without_hands(robot: Robot) -> None:
         for name in ("keystore", "export")
     )
     assert keystore.read_bytes() != export.read_bytes()
+    renew_without_systemd(robot)
     said = robot.close("--apply")
     assert keystore.read_bytes() == export.read_bytes()
     assert robot.restarts[2:] == ["daemon-reload", "restart listener.service talker.service"]

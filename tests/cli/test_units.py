@@ -240,6 +240,7 @@ def test_an_option_for_one_value_is_refused_twice(made: Path, tmp_path: Path) ->
     ended = sros(*job, "--inbox", "b", "--publish", "q", tmp_path / "units")
     assert ended.status == 2 and "--inbox is given twice. It takes one value." in ended.err, ended
     assert not (tmp_path / "units").exists()
+    assert sros(*job, "--inbox", "b", "--help").ok().out.startswith("Usage: sros units ")
     sros(
         "units", made, "--job", "renew", "--job", "metrics", tmp_path / "u", "--json", "--json"
     ).ok()

@@ -725,9 +725,14 @@ def test_a_change_is_for_the_node_that_the_permissions_are_for(whole: Path) -> N
     own = f"{node.ns.rstrip('/')}/{node.node}/get_parameters"
     meant = explain(whole, ENCLAVE, "serve", "/elsewhere/get_parameters")
     assert f"note [explain.likely-name]: the enclave may serve {own}" in meant.err
-    assert "may publish /chatter: " in explain(whole, ENCLAVE, "publish", "/chater").err
+    near = explain(whole, ENCLAVE, "publish", "/chater").err
+    rules = "-r /chater:=/chatter, or the policy, --remap /chatter:=/chater)."
+    assert "may publish /chatter: " in near and rules in near
     assert "may publish /chatter: " in explain(whole, "--who", "publish", "/chater").err
-    assert "likely-name" not in explain(whole, ENCLAVE, "publish", "/nothing").err
+    assert "likely-name" not in found.err
+    unused = "[explain.not-used]: no enclave that was read may subscribe /nothing by its name"
+    assert unused in found.err and "the node lacks a remapping" in found.err
+    assert "not-used" not in explain(whole, ENCLAVE, "publish", "/rosout").err
 
 
 def test_a_key_that_stays_on_its_robot(keystore: Path, tmp_path: Path) -> None:
