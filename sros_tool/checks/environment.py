@@ -316,7 +316,7 @@ def _enclave_findings(
 
 
 def _governed_domains(keystore: OpenedKeystore) -> DomainSet | None:
-    """Return the ROS domains of a keystore's governance, or None if it cannot be read."""
+    """Return the ROS domains of a keystore's governance, or None if it is unreadable."""
     try:
         message = keystore.read(GOVERNANCE_P7S, "governance document")
         signed = keystore.files.signed(message)
@@ -470,11 +470,12 @@ _CYCLONE_SECURITY = rb"(?i)<(?:\w+:)?(?:dds)?security\b"
 _PROFILE_SECURITY = rb"dds\.sec\.|&#"
 """The properties that secure a participant of Fast DDS, or an escape that may hide them."""
 _NAMES_PROFILES = rb"_PROFILES_FILE|\\u"
-"""The variables that name profiles, in a file of variables, or an escape that may hide them."""
+"""Variables that name profiles, as text in a file of variables, or an escape that may hide them."""
 _PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 _DEFAULT_PROFILES = ("DEFAULT_FASTRTPS_PROFILES.xml", "DEFAULT_FASTDDS_PROFILES.xml")
 """The files that Fast DDS reads from its working directory (Fast DDS 2.14, ``XMLProfileManager``).
-Properties of security in a default profile are those of every participant of rmw_fastrtps."""
+Security properties in a default profile apply to every participant of rmw_fastrtps.
+"""
 
 
 def is_zenoh(environment: Mapping[str, str]) -> bool:
@@ -536,7 +537,7 @@ def _is_readable(path: Path) -> bool:
 def enforces_nothing(environment: Mapping[str, str], variable: str) -> str:
     """Return why a process of rmw_zenoh has no access control, as a clause, or "".
 
-    The result is also "" if the configuration file cannot be read: another finding reports that.
+    The result is also "" if the configuration file is unreadable, which another finding reports.
     ``variable`` is the environment variable that names the configuration file.
     """
     text = environment.get(variable, "")

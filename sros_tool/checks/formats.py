@@ -55,7 +55,7 @@ def folded_findings(
     """Merge single findings that differ only in one robot or one enclave.
 
     Yields the first finding of each group, with a text that names the robots or enclaves of the
-    others ("" if there are none).  Findings that share a cause, or that have a line or related
+    other findings ("" without others).  Findings that share a cause, or that have a line or related
     places, stay as they are.
     """
     similar_groups: dict[Hashable, list[tuple[tuple[Finding, ...], str]]] = {}
@@ -72,7 +72,7 @@ def folded_findings(
 
 
 def _key_without_enclave(group: tuple[Finding, ...]) -> Hashable:
-    """Return a key that findings share if they differ only in the enclave that they are about."""
+    """Return a key that is equal for findings which differ only in their enclave."""
     finding = group[0]
     enclave = finding.subject
     is_enclave = enclave.startswith("/") and enclave not in ("/", finding.file)
@@ -87,10 +87,10 @@ def _merge_robots(
 ) -> Iterator[tuple[tuple[Finding, ...], str]]:
     """Merge single findings that differ only in one robot.
 
-    Yields the first finding of each group, with a text that names the robots of the others ("" if
-    there are none).  A finding that names several robots is merged by the robot that gives the
+    Yields the first finding of each group, with a text that names the robots of the other findings
+    ("" without others).  A finding that names several robots is merged by the robot that gives the
     largest group; many merged findings that differ only in another robot are merged again. Findings
-    that share a cause stay as they are, and without ``fleet``, all findings do.
+    that share a cause are not merged. Without ``fleet``, nothing is merged.
     """
     read = []
     for group in groups:
@@ -114,10 +114,10 @@ _MOST_SIMILAR = 5  # more similar findings for different robots become one findi
 
 
 def _kinds(group: tuple[Finding, ...], fleet: Fleet) -> _Kinds:
-    """Map each robot that a finding names to two keys by which such findings are merged.
+    """Map each robot that a finding names to two keys by which findings are merged.
 
-    The first key is equal for findings that differ only in this robot; the second one also for
-    findings that differ in the other robots that they name.
+    The first key is equal for findings that differ only in this robot; the second key is also equal
+    for findings that differ in other robots.
     """
     first, *more = group
     named = () if more else named_robots(fleet, first.subject, first.text)
@@ -278,7 +278,7 @@ def _location(file: str, line: int | None, base: Path) -> dict[str, Any]:
 
 
 def _without_links(text: str) -> str:
-    """Escape embedded links (SARIF 2.1.0, 3.11.6), as others may have chosen a name in the text.
+    """Escape embedded links (SARIF 2.1.0, 3.11.6), because others may choose names in the text.
 
     Only text with the form of a link is escaped, because many viewers show the escapes.
     """
@@ -286,7 +286,7 @@ def _without_links(text: str) -> str:
 
 
 def _relative(file: str, base: Path) -> str:
-    """Return the path of ``file`` as seen from the folder ``base``, with "/" between its parts."""
+    """Return the path of ``file`` relative to the folder ``base``, with "/" between its parts."""
     path, start = (base / file).absolute(), base.absolute()
     common = start
     ups = 0

@@ -1,6 +1,6 @@
 """Findings and their kinds: a kind is data; a finding adds a place and a reason.
 
-It also knows all kinds, and selects the findings to report.
+The module also lists all kinds, and selects the findings to report.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from sros_tool.wording import counted, first_few
 
 
 class Severity(StrEnum):
-    """Severity of a finding, as the word that options and reports write.
+    """The severity of a finding, as the word in options and reports.
 
     Severities, and their words, compare by weight: ``Severity.ERROR > "warning"``.
     """
@@ -81,11 +81,11 @@ class FindingKind(NamedTuple):
     title: str
     """Clause that names the fault."""
     why: str
-    """Why it matters."""
+    """The reason that the fault matters."""
     source: str
     """Source of the rule, such as a section of a specification."""
     remedy: str
-    """What to do about it."""
+    """The steps that resolve the fault."""
     group: str = ""
     vendors: tuple[Vendor, ...] = ()
     """The DDS vendors that the kind concerns; null for all."""
@@ -114,7 +114,7 @@ class RelatedPlace(NamedTuple):
     """Another place in a file that a finding is about."""
 
     text: str
-    """What is at this place."""
+    """A description of this place."""
     file: str
     """Path of the file."""
     line: int | None = None
@@ -185,7 +185,7 @@ class Finding(NamedTuple):
 
     @property
     def remedy(self) -> str:
-        """What to do about it."""
+        """The steps that resolve the fault."""
         return self.own_remedy or self.kind.remedy
 
     @property
@@ -197,7 +197,7 @@ class Finding(NamedTuple):
 
 
 def group_by_cause(findings: Sequence[Finding]) -> Iterator[tuple[Finding, ...]]:
-    """Yield groups of findings: all that share a cause, or a single one without a cause."""
+    """Yield groups of findings that share a cause; findings without a cause are groups of one."""
     groups: dict[Cause, list[Finding]] = {}
     for finding in findings:
         if finding.cause:
@@ -322,10 +322,10 @@ def _finding_place(finding: Finding) -> tuple[str, int]:
 
 
 class ChosenFindings(NamedTuple):
-    """The findings to show, and those that are left out.
+    """The findings to show, and the findings that are left out.
 
-    ``accepted`` are left out because the keystore accepts the weakness; ``hidden`` is the
-    number of those left out because their severity is too low.
+    ``accepted`` are left out because the keystore accepts the weakness; ``hidden`` is the number of
+    findings left out because their severity is too low.
     """
 
     shown: tuple[Finding, ...]
@@ -333,7 +333,7 @@ class ChosenFindings(NamedTuple):
     hidden: int
 
     def numbers(self) -> dict[str, int]:
-        """Return the number of shown findings by severity, worst first."""
+        """The numbers of shown findings by severity, worst first."""
         severities = [finding.severity for finding in self.shown]
         return {str(level): severities.count(level) for level in (ERROR, WARNING, NOTE)}
 
@@ -426,7 +426,7 @@ def select_kinds(selection: FindingFilter) -> Sequence[FindingKind]:
 
 
 _DIFFERENCES = "portable.vendors-differ"
-"""The kind of finding about differences between vendors, which concerns several vendors."""
+"""Id of the kind of finding about differences between vendors, which has no single vendor."""
 
 
 def _matches(kind: FindingKind, pattern: str) -> bool:

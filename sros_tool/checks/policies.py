@@ -83,7 +83,7 @@ from sros_tool.xml import parse, read_bytes
 
 @dataclass(frozen=True, slots=True)
 class _Statement:
-    """One right in one line of a policy; ``written`` is the name as written there."""
+    """A right in one line of a policy; ``written`` is the name in that line, before expansion."""
 
     right: Right
     written: str
@@ -92,7 +92,7 @@ class _Statement:
 
     @property
     def allows(self) -> bool:
-        """Whether it is an ALLOW."""
+        """Whether the statement is an ALLOW."""
         return self.right.qualifier is ALLOW
 
     @property
@@ -377,7 +377,7 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
 def _differ_only_by_namespace(statement_a: _Statement, statement_b: _Statement) -> bool:
     """Return whether two names differ only by the namespace of a profile.
 
-    A name that is written with a namespace, or with ``~``, is longer on purpose.
+    If a policy writes the namespace or ``~`` itself, the difference is intended.
     """
     shorter, longer = sorted((statement_a, statement_b), key=lambda statement: len(statement.name))
     return longer.name.endswith(shorter.name) and not {*"/~"} & {*longer.written}
@@ -460,7 +460,7 @@ def _check_instances(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
 
 
 def _check_node_names(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
-    """Yield findings about nodes with nearly the name of their enclave, if no node has it."""
+    """Yield findings about nodes whose names are almost the name of their enclave."""
     for enclave in checked_policy.policy.enclaves:
         own = enclave.path.rpartition("/")[2]
         near = []
@@ -674,8 +674,7 @@ def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
 def _check_parameters_of_others(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about parameter services of nodes that the enclave does not have.
 
-    A wildcard is such a finding if it matches such a service of a node that only other enclaves
-    have.
+    A wildcard counts if it matches a parameter service of a node that only other enclaves have.
     """
     nodes: dict[str, set[str]] = defaultdict(set)
     enclave_by_node: dict[str, str] = {}
@@ -725,7 +724,7 @@ _NAME_THEM = "Name the {} of this enclave in place of the wildcard."
 class _Lacking:
     """A finding about a node without a right that every node needs.
 
-    ``included`` is the folder of the common parts that its profile includes, or "".
+    ``included`` is the folder of the common parts that the node's profile includes, or "".
     """
 
     finding: Finding
@@ -740,7 +739,7 @@ class _Lacking:
 
 
 def _common_folder(profile: Profile) -> str:
-    """Return the folder of the ``common/node.xml`` that a profile includes, or ""."""
+    """Return the folder of the ``common/node.xml`` that a profile includes, or "" without one."""
     next_to_it = Path(profile.source.file).parent / COMMON
     for group in profile.groups:
         for folder in Path(group.source.file).parents:
@@ -750,7 +749,7 @@ def _common_folder(profile: Profile) -> str:
 
 
 def _is_not_shipped(folder: str) -> bool:
-    """Return whether the ``node.xml`` in a folder, or one of its parts, is not the shipped one."""
+    """Return whether ``node.xml`` in a folder, or an included part, is not the shipped file."""
     shipped = policies_dir() / COMMON
     parts = (shipped / "node.xml", *(shipped / "node").iterdir())
     with suppress(OSError):
@@ -778,7 +777,7 @@ def _denied_at_start(lacking: Sequence[_Lacking]) -> str:
 
 
 def _different_common_part_cause(folder: str, lacking: Sequence[_Lacking]) -> Cause:
-    """Return the common cause of findings: the included common part is not the one of sros."""
+    """Return the common cause of findings: an included common part differs from the one of sros."""
     new, old = quote(folder), quote(f"{folder}.old")
     return Cause(
         f"the included '{folder}/node.xml' lacks rights that the file of this sros has",
@@ -977,7 +976,7 @@ def _check_root_enclave(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
 
 
 def within_root(rights: Collection[Right]) -> str:
-    """Return a clause that names the enclaves whose rights the enclave / has too; "" if none.
+    """Return a clause on the enclaves whose rights the enclave / also has; "" without any.
 
     Rights that every node needs do not count.
     """
@@ -1272,8 +1271,8 @@ def findings_in(
 ) -> Iterator[Finding]:
     """Yield all findings in the parsed policies of a robot, except the findings about includes.
 
-    The counterparts of names are looked for in all the policies together.  With ``of_fleet``, the
-    policies are for several robots, whose nodes may have the same names in different ROS domains.
+    A name may have its counterpart in any of the policies.  With ``of_fleet``, the policies are for
+    several robots, whose nodes may have the same names in different ROS domains.
     """
     checked = [_CheckedPolicy(policy, distribution) for policy in policies]
     for checked_policy in checked:
@@ -1301,7 +1300,7 @@ def _enclaves_of_two_policies(enclaves: Iterable[Enclave]) -> Iterator[Finding]:
 
 
 def _nodes_in_two_enclaves(enclaves: Iterable[Enclave]) -> Iterator[Finding]:
-    """Yield a finding for each node with a certain name that several enclaves have."""
+    """Yield a finding for each node without wildcards in its name that several enclaves have."""
     by_node: dict[str, dict[str, Source]] = defaultdict(dict)
     for enclave in enclaves:
         for profile in enclave.all_profiles():
@@ -1331,10 +1330,10 @@ def policy_file_findings(
 
     Args:
         paths: the files, which are of one robot or fleet.
-        distribution: the ROS 2 distribution of their nodes, such as ``humble``; "" is the latest.
-        fleet: the robots that their placeholders stand for.
+        distribution: the ROS 2 distribution of the nodes, such as ``humble``; "" is the latest.
+        fleet: the robots that placeholders in the policies stand for.
         policy: the policy in the only file, if it is parsed already.
-        on_zenoh: whether their nodes use Zenoh.
+        on_zenoh: whether the nodes use Zenoh.
     """
     read: list[Policy] = []
     patterns: list[str] = []
@@ -1423,9 +1422,9 @@ def _robots_in_unknown_groups(named: Collection[str], fleet: Fleet) -> str:
     """Return a clause on robots with a misspelled group or without a group; "" if there are none.
 
     ``named`` are the groups in the policies, with "" for enclaves of all robots.  Other groups may
-    belong to policies that were not named.  So a group counts only if no other robot has it, and
-    its name is similar to a group in the policies, other than in a number.  A robot without a group
-    counts if every enclave is for a group.
+    belong to policies that were not named.  So a group counts only if no other robot has the group,
+    and if the name differs from a group in the policies by a typing error, not only by a number.  A
+    robot without a group counts if every enclave is for a group.
     """
     for_all, groups = not named or "" in named, {*named} - {""}
     clauses = []
@@ -1441,7 +1440,7 @@ def _robots_in_unknown_groups(named: Collection[str], fleet: Fleet) -> str:
 
 
 def _robots_that_are_written_out(policies: Sequence[Policy], fleet: Fleet) -> Iterator[Finding]:
-    """Yield a finding for each enclave whose path has a robot's name without a placeholder."""
+    """Yield a finding for each enclave whose path has a robot's name in place of a placeholder."""
     from sros_tool.fleet.robots import robot_of
 
     for policy in policies:
@@ -1460,7 +1459,8 @@ def _robots_on_one_domain(
 ) -> tuple[Robot, Robot] | None:
     """Return two robots that may be in the same ROS domain, or None.
 
-    The first robot is from ``other_robots`` (None: from ``robots``), the second from ``robots``.
+    One robot is from ``robots``, the other one from ``other_robots``, or also from ``robots`` for
+    None.
     """
     robots_by_domain = {robot.domain: robot for robot in other_robots or ()}
     for robot in robots:
@@ -1531,7 +1531,7 @@ def _include_findings(path: Path) -> Iterator[Finding]:
 
 
 class _IncludeGraph:
-    """The includes of a policy file, and the files that they include in turn."""
+    """The includes of a policy file, and of the files that are included."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
@@ -1603,7 +1603,7 @@ class NearNames:
                 self._by_key[key].append(name)
 
     def similar_names(self, name: str) -> list[str]:
-        """Return the sorted names that look like a typing error of ``name``, except itself.
+        """Return the sorted names, other than ``name``, that look like a typing error of ``name``.
 
         Similar names differ in one part (between "/" and "_") by one letter that is added,
         removed, replaced or swapped with its neighbor; or only in capitals and separators.
@@ -1617,16 +1617,13 @@ class NearNames:
         )
 
     def same_name_elsewhere(self, name: str) -> list[str]:
-        """Return the sorted names that are ``name`` with a namespace more, or less, before it.
-
-        Names of one part, such as /scan, are left out: they may stand in several namespaces.
-        """
+        """Return the sorted names that are ``name`` with a namespace added in front, or removed."""
         shorter = (end for end in _name_ends(name) if end in self._names)
         longer = self._by_end.get(name, ()) if name.count("/") > 1 else ()
         return sorted({*shorter, *longer} - {name})
 
     def names_with_same_end(self, name: str) -> list[str]:
-        """Return the sorted names with the same last part as ``name``, except itself.
+        """Return the sorted names with the same last part as ``name``, without ``name`` itself.
 
         Empty if there are many: a last part that many names share says nothing.
         """
@@ -1677,7 +1674,7 @@ def _is_typed(a: str, b: str) -> bool:
 
 
 def _one_edit(a: str, b: str) -> bool:
-    """Return whether ``b`` is ``a`` with one letter typed wrong; ``b`` is at least as long."""
+    """Return whether one typing error turns ``a`` into ``b``; ``b`` is at least as long."""
     at = next((index for index, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), len(a))
     if len(a) < len(b):
         return a[at:] == b[at + 1 :]
@@ -1698,7 +1695,7 @@ def signed_findings(
 
     Args:
         policies: the policies.
-        enclaves: the enclaves whose permissions are to be signed; others are not checked.
+        enclaves: the enclaves whose permissions are to be signed; no other enclaves are checked.
         distribution: the ROS 2 distribution of the nodes; "" is the latest.
     """
     parts: list[Policy] = []

@@ -158,7 +158,7 @@ _NEW_AUTHORITY = Fault.CA_EXPIRED.remedy_in_export("").format(root="KEYSTORE")
 """Remedy for an expired CA, which can no longer renew anything."""
 _MOST_LEDGER = 64 * 1024 * 1024
 _MOST_LEDGERS = 2 * _MOST_LEDGER
-"""Highest number of bytes of the ledger of one process, and of those of all processes."""
+"""Maximum number of ledger bytes to read: of one process, and of all processes together."""
 _LOADED_BY_ZENOH = (IDENTITY_CA_FILE, CERTIFICATE_FILE, KEY_FILE)
 
 
@@ -209,14 +209,14 @@ def _file_findings(
 
 
 def _changed_text(process: Process, files: str) -> str:
-    """Return that files changed since a process started, or may have, as a clause."""
+    """Return a clause that files changed, or may have changed, since a process started."""
     if why := order_unknown(process):
         return f"{why}, so it is not known whether {files} changed after its start"
     return f"it started at {iso(process.started)}; {files} changed later"
 
 
 def order_unknown(process: Process) -> str:
-    """Return why times of files do not tell what changed since the start; "" if they do."""
+    """Return why times of files do not show changes since the start of a process; "" if they do."""
     advanced = process.clock_advanced
     return f"the clock was set forward by {elapsed(advanced)} while it ran" if advanced else ""
 
@@ -228,9 +228,9 @@ def _required_files(enclave: ProcessEnclave) -> Sequence[str]:
 def newer_files(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
     """Yield the names of the files that changed, or were removed, since a process started.
 
-    The key's file does not count: the certificate shows which key was loaded. A change of the key's
-    file alone means that its mode or place changed, or that no process starts, because the key does
-    not fit the certificate.
+    The key's file does not count, because the certificate shows which key was loaded. If only the
+    key's file changed, then either its mode or place changed, or no process can start, because the
+    key does not fit the certificate.
     """
     files = enclave.files
     if process.is_zenoh:
@@ -290,7 +290,7 @@ class _Loaded:
 def _loaded_files(
     enclave: ProcessEnclave, newer_files: Sequence[str], started: datetime, ledgers: _Ledgers
 ) -> _Loaded:
-    """Return the files that a process loaded; files that changed since are in the ledger."""
+    """Return the files that a process loaded; the ledger has files that changed since."""
     windows: dict[str, Window] = {}
     changed = {file.split()[0] for file in newer_files}
     certificate = next(iter(_certificates_in(enclave, CERTIFICATE_FILE)), None)
@@ -358,7 +358,8 @@ def _revocation_clause(enclave: ProcessEnclave, entries: Sequence[Entry], serial
 class _Ledgers:
     """The ledgers of the keystores that processes name, as far as they are read.
 
-    Any user can start processes that name a ledger of his own, so all of them together are bounded.
+    Any user can start processes that name a ledger of his own, so the bytes of all ledgers together
+    are limited.
     """
 
     def __init__(self) -> None:
@@ -692,7 +693,7 @@ def process_findings(
 
 
 def _network_and_domain(process: Process) -> tuple[str, str]:
-    """Return the network and the domain of a process; equal results mean neighbors."""
+    """Return the network and the ROS domain of a process, which neighbors share."""
     return process.network, process.environment.get(DOMAIN) or "0"
 
 
@@ -808,7 +809,7 @@ def _is_harmless_override(key: str, value: str) -> bool:
 
 
 def zenoh_findings(process: Process) -> Iterator[Finding]:
-    """Yield a finding if a Zenoh process may not enforce what the files of its enclave say."""
+    """Yield a finding if a Zenoh process may not enforce the files of its enclave."""
     if not process.is_zenoh:
         return
     configuration = process.configuration
@@ -911,8 +912,8 @@ def _other_keystore_findings(
 ) -> Iterator[Finding]:
     """Yield findings about DDS processes that trust another identity CA than their neighbors.
 
-    The right CA is the CA of most neighbors; in the network and domain of ``environment``, it is
-    the CA of this environment's enclave.
+    The expected CA is the CA of most neighbors; in the network and domain of ``environment``, the
+    expected CA is the one of the enclave in ``environment``.
     """
     own_domain = ("", environment.get(DOMAIN) or "0") if environment is not None else None
     own_keys = _authorities_here(environment) if environment is not None else frozenset()
@@ -944,7 +945,7 @@ def other_folder_findings(processes: Iterable[Process], folder: Path) -> Iterato
 
 
 def _has_other_files(enclave: ProcessEnclave, root: Path) -> bool:
-    """Return whether ``root`` has the enclave, too, with other files than the process loaded."""
+    """Return whether ``root`` also has the enclave, with other files than the process loaded."""
     with suppress(SrosError, OSError):
         place = enclave_path(root, check_enclave_name(f"/{enclave.name.strip('/')}"))
         if enclave.is_of(root) or not enclave.is_there or not (place / CERTIFICATE_FILE).exists():
@@ -1011,7 +1012,7 @@ def _different_security_findings(
 
 
 def _unseen_process_findings(running: RunningProcesses) -> Iterator[Finding]:
-    """Yield a finding for each node that could not be examined, and one with their count."""
+    """Yield a finding for each node that could not be examined, and a finding with their number."""
     remedy = ROOT_IS_NOT_ENOUGH if running.by_root else ""
     for process in running.unseen:
         if process.speaks:

@@ -119,7 +119,7 @@ def _clock_findings(state: RuntimeState) -> Iterator[Finding]:
 
 
 class ChangeKind(StrEnum):
-    """How a finding changed since the check before."""
+    """How a finding changed since the previous check."""
 
     NEW = "new"
     CHANGED = "changed"
@@ -133,9 +133,9 @@ class FindingChange:
     time: datetime
     """Time of the check that saw the change, in UTC."""
     change: ChangeKind
-    """Whether the finding is new, has another text, or is over."""
+    """Whether the finding is new, has a new text, or is resolved."""
     finding: Finding
-    """The finding that changed; if it is over, as it was last reported."""
+    """The finding that changed; of a resolved finding, its last form."""
 
     def __str__(self) -> str:
         """Return the change as one line of text."""

@@ -1,6 +1,7 @@
 """Kinds of findings about an update to another ROS 2 distribution; `sros_tool.proof` decides.
 
-They are also used for keystores that are for several distributions, if these decide differently.
+The kinds are also for keystores of several distributions, if these distributions decide
+differently.
 """
 
 from __future__ import annotations

@@ -99,8 +99,8 @@ def robot_findings(
 ) -> Iterator[Finding]:
     """Yield a finding for each DDS library of robots, and one on robots whose DDS is not known.
 
-    ``robots`` maps the names of robots to their DDS, None where they did not report it.  ``names``
-    returns names of robots as a text.
+    ``robots`` maps names of robots to the DDS that they reported, or to None.  ``names`` returns
+    names of robots as a text.
     """
     seen: dict[MappedLibrary, dict[Seen, list[str]]] = {}
     lacking: dict[str, list[str]] = {}
@@ -149,7 +149,7 @@ def _as_mapped(library: RobotLibrary) -> MappedLibrary:
 def _library_findings(
     users: Mapping[MappedLibrary, Sequence[str]], advisories: Sequence[Advisory] | None
 ) -> Iterator[Finding]:
-    """Yield one finding for each library; ``users`` maps it to clauses on where it is used."""
+    """Yield a finding for each library; ``users`` maps libraries to clauses on their users."""
     used = shipped_advisories() if advisories is None else advisories
     place_by_text: dict[str, str] = {}
     for library, clauses in users.items():
@@ -228,7 +228,7 @@ def _users(
 
 
 def _counted_vulnerabilities(advisories: Sequence[Advisory], version: str) -> str:
-    """Return a clause with the number of vulnerabilities, what they need, and what fixes them."""
+    """Return a clause with numbers of vulnerabilities: in all, by precondition, and by fix."""
     secured = sum("security" in advisory.needs for advisory in advisories)
     needs = (
         [f"{len(advisories) - secured} affect all processes"] if secured < len(advisories) else []
@@ -253,7 +253,7 @@ def _unclear(advisories: Sequence[Advisory]) -> str:
 
 
 def _remedy(kind: FindingKind, library: MappedLibrary) -> str:
-    """Return what to upgrade, with the package's name if the path shows it.
+    """Return the library to upgrade, with the package's name if the path shows it.
 
     "" stands for the remedy of the kind.
     """

@@ -235,7 +235,7 @@ _FEW = 3
 _MOST_PAIRS = 1000
 """Maximum number of pairs of subjects that are counted."""
 _COMPARISON = 20
-"""Cost of comparing two subjects, in the unit of `ComparisonLimit` (characters)."""
+"""Cost of comparing two subjects, in characters, the unit of `ComparisonLimit`."""
 
 
 def configuration_findings(path: Path) -> Iterator[Finding]:
@@ -541,7 +541,7 @@ class SubjectRights(NamedTuple):
     """A subject of access control."""
 
     id: str | None
-    """Its id; null without access control."""
+    """Id of the subject; null without access control."""
     names: Sequence[str] | None
     """The common names of the subject's certificates; null for everybody."""
     own: bool

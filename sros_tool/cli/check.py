@@ -569,7 +569,7 @@ def _circumstances(
 
 
 def _stated_differences(paths: Sequence[Path], circumstances: Circumstances) -> Iterator[Finding]:
-    """Yield findings if the distributions of a keystore decide differently."""
+    """Yield findings if the distributions that a keystore states decide differently."""
     from sros_tool.keystore.fleet import enclaves_of_several_distributions
     from sros_tool.keystore.layout import is_keystore
 
@@ -584,7 +584,7 @@ def _stated_differences(paths: Sequence[Path], circumstances: Circumstances) -> 
 
 
 def _nodes_of(distro: Distribution | None, *, all_distros: bool) -> str:
-    """Return the distribution of the nodes in policies; "" stands for the latest."""
+    """Return the distribution of the nodes in policies; "" stands for the latest one."""
     if all_distros:
         return ""
     return distro.given_name if distro else os.environ.get("ROS_DISTRO", "")
@@ -758,9 +758,9 @@ def _print_markdown(chosen_findings: ChosenFindings, fleet: Fleet | None) -> Non
 
 
 def _fleet_of(circumstances: Circumstances, paths: Sequence[Path]) -> Fleet | None:
-    """Return the fleet of --fleet with the enclaves of the policies, or else the keystore's fleet.
+    """Return the fleet of --fleet, with the enclaves of the policies, or else the keystore's fleet.
 
-    None if there is no fleet, or if it cannot be read.
+    Returns None if there is no fleet, or if the fleet cannot be read.
     """
     from sros_tool.keystore.fleet import load_fleet
 
@@ -943,9 +943,9 @@ def _report_sections(
 
 
 _SECONDS = 2.0
-"""Time between two looks at the processes."""
+"""Seconds between two looks at the processes."""
 _AGAIN = timedelta(minutes=1)
-"""Seconds after which unchanged processes are checked again, because files expire."""
+"""Time after which unchanged processes are checked again, because their files may have expired."""
 _ENDING = (signal.SIGINT, signal.SIGTERM)
 
 

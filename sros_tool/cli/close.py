@@ -274,9 +274,9 @@ def _node_names(policy: Policy, enclave: str) -> Sequence[str]:
 
 
 def _naming(closed: CloseState, policy: Policy) -> str:
-    """Return how to choose the name of an enclave that sros named after one of several nodes.
+    """Return how to rename an enclave that sros named after one of its nodes.
 
-    Returns "" when processes run closed: another name then means a restart.
+    Returns "" when processes already run closed: another name would then need a restart.
     """
     several = [
         process.enclave
@@ -378,7 +378,7 @@ def _show_undone(robot: LocalRobot, closed: CloseState) -> None:
 
 
 def _state(closed: CloseState, *, apply: bool) -> str:
-    """Return how far the processes run closed."""
+    """Return a clause on which processes run in their enclaves, and which do not."""
     if not closed.secured:
         not_closed = "nothing was closed" if apply else "nothing is closed yet"
         return "no process of the robot runs" if closed.stopped >= {*closed.pending} else not_closed
@@ -395,7 +395,7 @@ def _state(closed: CloseState, *, apply: bool) -> str:
 
 
 def _elsewhere(robot: LocalRobot, closed: CloseState) -> str:
-    """Return which files other machines need; sros does not see whether they have them."""
+    """Return which files other machines need; sros does not see whether the files are there."""
     needed = ", ".join(f"{name} ({iso(of)})" for name, of in closed.needed_elsewhere.items())
     return needed and (
         "; on other machines, replace files that are older than these times, and restart the "
@@ -405,7 +405,7 @@ def _elsewhere(robot: LocalRobot, closed: CloseState) -> str:
 
 
 def _until(closed: CloseState) -> str:
-    """Return until when the files of closed processes are valid."""
+    """Return a clause with the expiry of the closed processes' files, or "" if none runs closed."""
     if not (closed.secured and closed.valid_until):
         return ""
     from sros_tool.keystore.expiry import renewal_command

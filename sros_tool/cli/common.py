@@ -881,7 +881,7 @@ def _first_line(path: Path) -> str:
 
 
 def read_named(path: Path, kind: str, *, max_bytes: int = 16 * 1024 * 1024) -> bytes:
-    """Return the bytes of a file, or of standard input for "-"; ``kind`` describes it in errors.
+    """Return the bytes of a file, or of standard input for "-"; errors call the file ``kind``.
 
     At most one byte more than ``max_bytes`` (16 MiB) is read from standard input.
 
@@ -910,7 +910,7 @@ _WRITER_WITHIN = 5.0
 def _read_at_most(path: Path, count: int) -> bytes:
     """Return the first ``count`` bytes of a file, or of a pipe that somebody writes to.
 
-    Opening a pipe as usual would wait for a writer without end.
+    Opening a pipe as usual would wait for a writer forever.
 
     Raises:
         OSError: the file cannot be read, or is a pipe that nobody writes to.
@@ -1088,7 +1088,7 @@ class _Line:
     """A progress line on the terminal that a timer redraws.
 
     The timer is a signal: unlike a thread, it does not disturb the processes that are forked for
-    the work, and they do not inherit the timer.
+    the work, and forked processes do not inherit the timer.
     """
 
     def __init__(self, label: str, total: int, tally: Tally) -> None:
@@ -1145,7 +1145,7 @@ _lines: list[_Line] = []
 
 @contextmanager
 def progress(label: str, total: int = 0) -> Iterator[Callable[[str], None] | None]:
-    """Show ``label`` and the seconds on the terminal from the first second on, until the body ends.
+    """Show ``label`` and the elapsed seconds on the terminal while the body runs.
 
     Args:
         label: what is done, such as "signing".

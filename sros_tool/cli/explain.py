@@ -375,7 +375,7 @@ def explain(
 def _split(
     arguments: tuple[str, ...], keystore: Path | None, *, verb: int
 ) -> tuple[Path | None, tuple[str, ...]]:
-    """Split off the keystore (first argument, or the option); return it and the other arguments.
+    """Return the keystore (the first argument, or the option) and the other arguments.
 
     ``verb`` is the index of the operation (such as publish) in ``arguments`` without a keystore.
     """
@@ -462,7 +462,7 @@ def _keystore_of_environment() -> OpenedKeystore:
 
 
 def _note_unknown_distribution() -> None:
-    """Print a note if $ROS_DISTRO, which decides where nothing else does, is unknown."""
+    """Print a note if $ROS_DISTRO, which decides by default, names an unknown distribution."""
     from sros_tool.distributions import unknown_distribution
 
     print_notes(unknown_distribution(os.environ))
@@ -484,7 +484,7 @@ def _stated_distribution(keystore: OpenedKeystore | None, enclave: str) -> Distr
 def _policy_alone(
     keystore: OpenedKeystore | None, asked_enclave: AskedEnclave, policy: Path | None
 ) -> list[Note]:
-    """Return a note if the policy was explained although $ROS_SECURITY_KEYSTORE is set."""
+    """Return a note if a policy was explained without the keystore of $ROS_SECURITY_KEYSTORE."""
     from sros_tool.runtime.variables import KEYSTORE
 
     default = os.environ.get(KEYSTORE)
@@ -704,7 +704,7 @@ def _change_lines(answer: Answer) -> Iterator[str]:
 
 
 def _table_lines(compared: Comparison) -> Iterator[str]:
-    """Yield the question, one line for each answer, and who decides differently."""
+    """Yield the question, one line for each answer, and the vendors that decide differently."""
     yield f"may {compared.asked.enclave} {compared.asked.question}?"
     rows = [
         (answer.vendor.title, "", answer, " (as documented)" if answer.as_documented else "")
@@ -829,10 +829,10 @@ def _keystore_to_decide(
     *,
     stated: bool,
 ) -> tuple[Decider, _Where]:
-    """Return who decides on the enclaves of a keystore, and where these are.
+    """Return the decider for the enclaves of a keystore, and the keystore's fleet and domains.
 
-    ``chosen_vendor`` is the vendor that decides, None for Zenoh.  With ``stated``, the vendor of
-    the distribution that the keystore or its fleet states decides.
+    ``chosen_vendor`` is the DDS vendor that decides, None for Zenoh. With ``stated``, the deciding
+    vendor is the one of the distribution that the keystore or its fleet states.
     """
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.layout import is_original_keystore
@@ -876,7 +876,7 @@ def _policy_to_decide(
     asking: AskingContext,
     only: _Only,
 ) -> tuple[Decider, _Where]:
-    """Return who decides on the enclaves of a policy, and where these are."""
+    """Return the decider for the enclaves of a policy, and the policy's fleet and domains."""
     from sros_tool.explain.asking import fleet_of, policy_to_ask
     from sros_tool.explain.vendors import VendorOfPolicy
 

@@ -181,7 +181,7 @@ def _report(folder: Path, robot: str, restarted: bool) -> None:
 
 
 def _processes_here(folder: Path, names: Iterable[str], moment: datetime) -> EnclaveProcesses:
-    """Return what runs on this machine in the enclaves of a folder."""
+    """Return the processes of this machine that run in the enclaves ``names`` of a folder."""
     from sros_tool.agent.running import look_at_processes
 
     return look_at_processes(folder, names, now=moment, zone=local_zone(os.environ))
@@ -569,7 +569,7 @@ def _published_lines(published: PublishedFleet, moment: datetime) -> Iterator[st
 
 @shows(spread=("status",))
 class ComparedFleet(NamedTuple):
-    """The deployment status of a fleet at a moment, and what is known of its DDS."""
+    """The deployment status of a fleet at a moment, and known vulnerabilities of its DDS."""
 
     at: datetime
     """When the robots were compared with the keystore, in UTC."""
@@ -577,9 +577,11 @@ class ComparedFleet(NamedTuple):
     outdated_dds: Sequence[str]
     """Robots with a DDS that has known vulnerabilities which a later release of the same major
     version fixes, sorted by name; with ``--fail-on vulnerabilities``, the exit status is 1 if there
-    are any."""
+    are such robots.
+    """
     findings: Sequence[Finding]
-    """Findings on known vulnerabilities of the robots' DDS, as those of ``sros check runtime``."""
+    """Findings on known vulnerabilities of the robots' DDS, in the form of ``sros check runtime``.
+    """
 
 
 @fleet.command("status")
@@ -838,7 +840,7 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
 
 
 def _list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
-    """Yield on how many robots the revocation list is in force, if something is revoked."""
+    """Yield the number of robots on which the revocation list is in force, if there is one."""
     status = compared_fleet.status
     if numbers := _list_in_force(status):
         in_force, robots = numbers
@@ -857,9 +859,9 @@ def _list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
 
 
 def _list_in_force(status: FleetStatus) -> tuple[int, int] | None:
-    """Return on how many robots the revocation list is in force, and how many have to have it.
+    """Return two numbers of robots: where the revocation list is in force, and where it has to be.
 
-    None if nothing is revoked, or no robot has to have the list.
+    Returns None if nothing is revoked, or if no robot has to have the list.
     """
     robots = [robot for robot in status.robots if robot.crl_in_force is not None]
     if not (robots and status.is_any_revoked):
@@ -903,7 +905,7 @@ def _remedies(status: FleetStatus, to_dos: Collection[str]) -> Mapping[str, str]
 
 
 def _bringing(root: Path, robots: Sequence[RobotStatus]) -> str:
-    """Return how renewed files get to robots: by a publication, a delivery, or both."""
+    """Return how to bring renewed files to robots: by a publication, a delivery, or both."""
     from sros_tool.keystore.fleet import publish_command
 
     publish = publish_command(root)
@@ -914,7 +916,7 @@ def _bringing(root: Path, robots: Sequence[RobotStatus]) -> str:
 
 
 def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
-    """Yield when the first file on a robot expires, if that is soon, and what to do."""
+    """Yield the moment when the first file on a robot expires, if soon, and what to do then."""
     from datetime import timedelta
 
     from sros_tool.keystore.expiry import renewal_command
@@ -1005,7 +1007,7 @@ def _groups(compared_fleet: ComparedFleet, robots: Sequence[str]) -> list[_Group
 
 
 def _rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """Yield the head and the rows of a table, or nothing if no robot needs a row."""
+    """Yield the header and the rows of a table, or nothing if no robot needs a row."""
     groups = _groups(compared_fleet, robots)
     if not robots and all(group.state == "current" for group in groups):
         groups = [group for group in groups if group.what]
@@ -1021,7 +1023,7 @@ def _rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator[tupl
 def _page_rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str, ...]]:
     """Yield a row for each group of robots.
 
-    Its columns: state, names, earliest confirmation, earliest expiry of a file, what to do, and
+    The columns are: state, names, earliest confirmation, earliest expiry of a file, what to do, and
     why.
     """
     from sros_tool.validity import iso
@@ -1094,7 +1096,7 @@ def _natural_sort_key(name: str) -> list[tuple[int, str]]:
 
 
 def _is_next_number(before: str, name: str) -> bool:
-    """Return whether two names differ only in one number, by 1: a robot may have left a gap."""
+    """Return whether ``name`` is ``before`` with one number increased by 1."""
     pairs = zip(_natural_sort_key(before), _natural_sort_key(name), strict=False)
     differing = [(first, second) for first, second in pairs if first != second]
     return (

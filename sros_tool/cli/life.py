@@ -134,7 +134,7 @@ def renew(
 
 
 def _replaced_lines(result: Changed, *, has_new_keys: bool) -> Iterator[str]:
-    """Yield until when replaced certificates still work, and where copies of them are."""
+    """Yield until when replaced certificates work, and what exports and running processes need."""
     from sros_tool.keystore.fleet import publish_command
     from sros_tool.keystore.layout import remedy_in_closed_robot
     from sros_tool.validity import iso
@@ -343,7 +343,7 @@ def _read_given_list(path: Path | None) -> bytes:
 
 
 def _names(keystore: OpenedKeystore, lists: Sequence[RevocationList]) -> dict[str, str]:
-    """Map the serial numbers in ``lists`` to their enclaves, as the ledger has them."""
+    """Map the serial numbers in ``lists`` to enclaves, by the records of the ledger."""
     serials = {f"{entry.serial:x}" for crl in lists for entry in crl.revoked}
     ledger = keystore.ledger_file.with_values("serial", serials)
     return {entry.serial: entry.enclave for entry in ledger.entries if entry.serial}
@@ -612,7 +612,7 @@ def _print_step(
 
 
 def _unconfirmed_robots(keystore: OpenedKeystore) -> tuple[str, ...] | str:
-    """Return the robots that have not confirmed the stage of a rotation, or why that is unknown."""
+    """Return the robots that have not confirmed a stage of a rotation, or why these are unknown."""
     from sros_tool.keystore.lifecycle.rotate import robots_cut_off
     from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 
@@ -656,9 +656,9 @@ def _show_status(status: RotationStatus, unconfirmed: Sequence[str] | str, as_js
 
 
 def _new_keys(identity: str | None, permissions: str | None, encrypt: bool) -> Keyring:
-    """Return a keyring with the places for new keys, which only options give.
+    """Return a keyring for new CA keys, whose places only options name.
 
-    Places in environment variables are for the current keys.
+    Environment variables name the places of the current keys.
     """
     from dataclasses import replace
 

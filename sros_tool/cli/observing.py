@@ -135,8 +135,8 @@ def observe(
     """Observe the ROS graph; return the result and the RMW in use.
 
     ``watch`` is the value of --watch; None observes for ``spin_time`` seconds, or until the graph
-    stops changing.  While watching, ``report`` gets everything seen so far whenever it has grown;
-    ``at_end`` tells the user what happens at the end.
+    stops changing.  While watching, ``report`` gets all observations so far whenever there is a new
+    one; ``at_end`` tells the user what happens at the end.
     """
     from sros_tool.graph.observe import (
         SECURED,
@@ -179,7 +179,7 @@ def observe(
 
 
 def _enclaves_by_identity(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return the enclaves by the identities of their participants, if the observer is secured."""
+    """Map the identities of participants to enclaves; empty if the observer is not secured."""
     from sros_tool.keystore.known_keys import enclaves_by_identity
     from sros_tool.keystore.layout import is_keystore
     from sros_tool.keystore.reader import OpenedKeystore
@@ -504,7 +504,7 @@ def generate_policy(
 
 
 def _present_policy(file: Path | None) -> Policy | None:
-    """Return the policy in ``file``, or None without one.
+    """Return the policy in ``file``, or None without a file.
 
     Called before observing, so that a broken policy is reported at once.
     """

@@ -175,7 +175,8 @@ def merge_policy(
 
 _MOST_ADDED = 20
 _MOST_OF_ENCLAVE = 2
-"""Highest number of rights that a merge lists; if there are more, the number of each enclave."""
+"""Maximum number of rights that a merge lists for an enclave; of more rights, it shows the number.
+"""
 
 
 def _print_added(merged: Merged) -> None:
@@ -803,7 +804,7 @@ def _show_new_access(
     """Print the access that HEAD adds to BASE; return 1 if there is any, else 0.
 
     Raises:
-        SrosError: it cannot be decided.
+        SrosError: sros cannot decide whether HEAD adds access.
     """
     from sros_tool.proof.growth import ComparedSide, NewAccess, compare_access
     from sros_tool.proof.sources import load_side
@@ -830,7 +831,7 @@ def _show_new_access(
 
 
 class PlacedChange(NamedTuple):
-    """A change for which a review fails: its enclave or setting, a clause, its place in HEAD."""
+    """A change that makes a review fail: an enclave or setting, a clause, and a place in HEAD."""
 
     subject: str
     text: str
@@ -883,7 +884,7 @@ def added_lines(base: AccessSource, head: AccessSource, growth: Growth) -> list[
 
 
 def _new_node_lines(head: AccessSource, nodes: Iterable[NewNode]) -> Iterator[str]:
-    """Yield a line for each node that gets more rights in another enclave; see `folded`."""
+    """Yield a line for each node that gets more rights in another enclave; robots share lines."""
     from sros_tool.fleet.robots import folded
 
     return folded(head.fleet, ((node.enclave, f"+ {_new_node_text(node)}") for node in nodes))

@@ -142,7 +142,7 @@ _VERBOSE = click.Option(
 class VerbGroup(click.Group):
     """A group that, without arguments, prints its help on standard error and ends with status 2.
 
-    So does click from release 8.2 on; earlier releases end with 0.
+    From release 8.2 on, click does the same; earlier releases of click end with 0.
     """
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:

@@ -61,16 +61,16 @@ _TITLES = {
     "policy": "Policy",
     "rights": "Rights",
 }
-"""Titles of the kinds of steps, the most important first: a comment is cut at its end."""
+"""Kind of step → title, the most important first: code hosts cut a long comment at its end."""
 _ALLOWED_BY = {
     "requirements-before": "option --dropped-requirements allow",
     "signed": "review: whoever changes a policy seldom has the keys of the CAs",
 }
-"""Maps kinds of steps to what allows their findings; for other kinds, --new-access allow does."""
+"""Kind of step → the option that allows its findings; ``--new-access allow`` for other kinds."""
 
 
 class _Lines(_PathsType):
-    """Paths from the top of the repository, one on each line, as code hosts pass lists."""
+    """Paths relative to the top of the repository, one on each line, as code hosts pass lists."""
 
     name = "paths"
 
@@ -366,7 +366,7 @@ class _Outputs:
         self._write(_markdown(result, request), _findings(result, request))
 
     def write_unfinished(self) -> None:
-        """Write "could not be decided" first; it stays if the review is killed (time limit)."""
+        """Write "could not be decided", which stays if a time limit kills the review."""
         self._write_undecided("The review was ended before it had a result.")
 
     def write_error(self, error: SrosError) -> None:
@@ -475,7 +475,7 @@ def _sentence(result: Review, step: ReviewStep) -> str:
 
 
 def _sentences(result: Review, steps: Sequence[ReviewStep]) -> Iterator[tuple[ReviewStep, str]]:
-    """Yield each step with its result as a clause, which repeats no error of an earlier step."""
+    """Yield each step with its result as a clause, without errors that earlier steps reported."""
     earlier = ""
     for step in steps:
         sentence = _sentence(result, step)
@@ -486,9 +486,10 @@ def _sentences(result: Review, steps: Sequence[ReviewStep]) -> Iterator[tuple[Re
 
 
 def _findings(result: Review, request: ReviewRequest) -> list[Finding]:
-    """Return the findings of all steps; a step that fails has at least one that says why.
+    """Return the findings of all steps, with at least one finding for each step that fails.
 
-    Paths are relative to the top of the repository.  What is allowed is accepted.
+    Paths are relative to the top of the repository.  Findings that the request allows are marked as
+    accepted.
     """
     findings: dict[Finding, None] = {}
     for step in result.steps:
@@ -500,7 +501,7 @@ def _findings(result: Review, request: ReviewRequest) -> list[Finding]:
 
 
 def _step_findings(result: Review, step: ReviewStep, request: ReviewRequest) -> Iterator[Finding]:
-    """Yield what a step found, at a place in HEAD."""
+    """Yield the findings of a step, each at a place in HEAD."""
     from sros_tool.checks.kind import ChosenFindings
     from sros_tool.checks.review import (
         EXPIRY,
@@ -573,8 +574,10 @@ def _text(result: Review) -> list[str]:
 
 
 def _lines_to_read(step: ReviewStep) -> list[str]:
-    """Return what a reviewer has to read: new access and dropped requirements, even if they are
-    allowed; rights that lost their counterpart; findings.
+    """Return the lines that a reviewer has to read.
+
+    These are new access and dropped requirements, even if they are allowed; rights that lost their
+    counterpart; and findings.
     """
     from sros_tool.checks.formats import folded_findings
     from sros_tool.checks.kind import ChosenFindings
@@ -650,7 +653,7 @@ def _verdict(result: Review) -> str:
 
 
 def _markdown(result: Review, request: ReviewRequest) -> str:
-    """Return the review as Markdown: the steps in short, then each of them, the worst first."""
+    """Return the review as Markdown: a line for each step, then the details, the worst first."""
     from sros_tool.markdown import bounded_list, code, plain
 
     allowed = any(step.allowed for step in result.steps)

@@ -640,7 +640,7 @@ def _late_renewal_notes(keystore: OpenedKeystore) -> Iterator[Note]:
 
 
 def _validities(keystore: OpenedKeystore) -> Iterator[tuple[str, timedelta]]:
-    """Yield the validities that the settings choose, and the shortest one of files to be renewed.
+    """Yield the validities in the settings, and the shortest validity of files that need renewal.
 
     A CA service, or the expiry of a CA, can make a validity shorter than the settings choose.
     """

@@ -250,7 +250,7 @@ def _network(
 
 
 def _with_router(network: ZenohNetwork, name: str, endpoint: str) -> ZenohNetwork:
-    """Return a network with a router at an endpoint, or without it if there is no endpoint."""
+    """Return the network with a router at ``endpoint``; if that is empty, without the router."""
     from sros_tool.zenoh.configuration import ZenohRouter
 
     known = {router.name: router for router in network.routers}

@@ -93,7 +93,7 @@ class Backend:
 
     @property
     def on_zenoh(self) -> bool:
-        """Whether the nodes run on Zenoh instead of a DDS."""
+        """Whether the nodes run on Zenoh, and not on a DDS."""
         return self.name == ZENOH
 
     @property
@@ -112,15 +112,15 @@ class Backend:
 
     @property
     def seconds_until_forgotten(self) -> float:
-        """The seconds for which peers still know a secured node that has ended.
+        """Seconds for which peers still know a secured node that has ended.
 
-        Cyclone DDS 11 announces its end only unencrypted, which peers do not believe: they keep the
-        participant until its lease expires (tested).
+        Cyclone DDS 11 announces the end of a participant only unencrypted. Peers do not believe
+        that, and keep the participant until its lease expires (tested).
         """
         return 10.0 if self.dds.startswith("Cyclone DDS 11.") else 0.0
 
     def wire_name(self, topic: str, domain: int) -> str:
-        """Return the name of a ROS topic as it stands in packets."""
+        """Return the name of a ROS topic as packets have it."""
         return f"{domain}{topic}/" if self.on_zenoh else f"rt{topic}"
 
     @property
@@ -159,7 +159,8 @@ class Backend:
     ) -> Mapping[str, str]:
         """Return the environment variables that a node needs besides its security variables.
 
-        ``wire`` keeps its messages out of shared memory; ``denied`` makes it log why it is denied.
+        ``wire`` keeps messages out of shared memory; ``denied`` makes the node log why it is
+        denied.
         """
         if self.on_zenoh:
             return _modules()
@@ -265,8 +266,10 @@ def _why_not(stacks: Sequence[Stack]) -> str:
 
 
 _SIGNERS_CHECKED = ((2, 1, 4), (2, 6, 5), (2, 8, 2), (2, 9, 2))
-"""The first release of each older branch of Fast DDS that accepts only signers in the file of the
-permissions CA (CVE-2023-24010); all releases since 2.10 do.  Source: the tags of its repository."""
+"""First release of older branches of Fast DDS that accepts only signers in the permissions CA file.
+
+These releases, and all since 2.10, fix CVE-2023-24010. Source: tags of the repository.
+"""
 
 _ENCRYPTING = (ProtectionKind.ENCRYPT, ProtectionKind.ENCRYPT_WITH_ORIGIN_AUTHENTICATION)
 
@@ -274,7 +277,7 @@ _ENCRYPTING = (ProtectionKind.ENCRYPT, ProtectionKind.ENCRYPT_WITH_ORIGIN_AUTHEN
 def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Condition]:
     """Return the conditions that hold for a DDS topic with this backend and template.
 
-    On Zenoh nothing depends on the template.
+    On Zenoh, the conditions do not depend on the template.
     """
     if backend.on_zenoh:
         return frozenset()
@@ -311,12 +314,12 @@ _SILENCE = 5.0
 _LIBRARIES = {CYCLONE: "Cyclone DDS", RCLPY: "rclpy", ZENOH: "Zenoh"}
 _MODULES = {CYCLONE: "cyclone", RCLPY: "ros", ZENOH: "zenoh"}
 _LONGEST_LINE = 1 << 20
-"""Size limit of an event in bytes; a process that sends a longer one is ignored from then on."""
+"""Maximum size of an event in bytes; after a longer event, the reports of a process are ignored."""
 
 
 @dataclass(frozen=True)
 class HandNode:
-    """A node to run by hand; ``topic`` is an absolute ROS name, ``type`` the ROS type it sends."""
+    """A node to run by hand, with its absolute ROS topic and the ROS type of its messages."""
 
     role: Role
     backend: str
@@ -345,10 +348,9 @@ class HandNode:
 
 
 def security_of(node: HandNode, environment: Mapping[str, str]) -> str:
-    """Return one line that says what the node runs on, and whether it is secured.
+    """Return a line that names the library on which the node runs, and says whether it is secured.
 
-    Raises:
-        SrosError: The environment demands security, and the enclave cannot be loaded.
+    Raises: SrosError: The environment demands security, and the enclave cannot be loaded.
     """
     if node.backend == ZENOH:
         kind = "ROUTER" if node.role is Role.ROUTER else "SESSION"
@@ -366,10 +368,10 @@ def security_of(node: HandNode, environment: Mapping[str, str]) -> str:
 
 
 def backend_by_hand(role: Role, environment: Mapping[str, str]) -> str:
-    """Return the backend of a node by hand, if the user names none.
+    """Return the backend of a node run by hand, for a user who names no backend.
 
     Secured nodes of Fast DDS and of Cyclone DDS do not hear each other (tested: 2.14.5 and 0.10.2),
-    but open ones do.
+    but open nodes do.
     """
     if role is Role.ROUTER or environment.get(RMW) == "rmw_zenoh_cpp":
         return ZENOH
@@ -393,7 +395,7 @@ def _rmw_here(environment: Mapping[str, str]) -> str:
 
 
 def _types_not_heard(node: HandNode, environment: Mapping[str, str]) -> str:
-    """Return which nodes a secured node will not hear, judging by the ROS of this shell."""
+    """Return a clause on nodes that a secured node will not hear, by the ROS of this shell."""
     rmw = _rmw_here(environment)
     differs_in_vendor = node.backend == CYCLONE and vendor_of(rmw) not in (None, Vendor.CYCLONE)
     if not differs_in_vendor or environment.get(ENABLE) != "true":
@@ -406,7 +408,7 @@ def _types_not_heard(node: HandNode, environment: Mapping[str, str]) -> str:
 def run_by_hand(
     node: HandNode, say: Callable[[str], None], duration: timedelta | None = None
 ) -> int:
-    """Run a node for ``duration``, or until it is stopped by a signal; return its exit status.
+    """Run a node for ``duration``, or until a signal; return the exit status of the node.
 
     ``say`` gets lines about what is sent and heard, without line breaks at their ends.
 
@@ -462,7 +464,7 @@ def run_by_hand(
 
 
 def end_within(seconds: float, process: subprocess.Popen[bytes]) -> None:
-    """Ask a process to end, and kill it if it runs for ``seconds`` more.
+    """Ask a process to end, and kill it after ``seconds``.
 
     A node that waits in its library, such as for a router that is gone, handles no signal.
     """
@@ -473,7 +475,7 @@ def end_within(seconds: float, process: subprocess.Popen[bytes]) -> None:
 
 
 def _tell(node: HandNode, pipe: int, say: Callable[[str], None]) -> Event | None:
-    """Pass the node's reports to ``say`` until the node ends, and return the last one."""
+    """Pass the node's reports to ``say`` until the node ends, and return the last report."""
     data, seen, event = b"", "", None
     connected = node.backend != ZENOH
     while len(data) < _LONGEST_LINE:

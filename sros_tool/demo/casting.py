@@ -1,9 +1,9 @@
 """Choose enclaves of a keystore for the parts of a scenario, by their signed permissions.
 
 The files of all enclaves decide.  An enclave that has only the rights of a part is preferred,
-because it shows best whether more is denied.  The enclave with the widest permissions gets a part
-of its own, so that it is tried even among many enclaves with few rights.  Enclaves with faulty or
-revoked files play no part, and get a row of their own.
+because its row shows whether other rights are denied. The enclave with the widest permissions gets
+an extra part, so that it is tried even among many enclaves with few rights.  Enclaves with faulty
+or revoked files play no part, and get separate rows.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class CastMember(NamedTuple):
     nodes: tuple[str, ...] = ()
     """Names of the enclave's ROS nodes."""
     why: str = ""
-    """Why this enclave was chosen, or an empty string."""
+    """Reason for the choice of the enclave, or an empty string."""
 
 
 class UserKeystore(NamedTuple):
@@ -97,10 +97,10 @@ class UserKeystore(NamedTuple):
 
     ``topic`` is the attacked ROS topic, ``service`` the attacked ROS service ("": none). ``grants``
     has the grant of each enclave of the cast, ``why`` the reasons for the choice of some parts.
-    ``rows`` are for the enclaves with the widest permissions, and for those with faulty or revoked
-    files.  ``enclaves`` is the number of all enclaves, ``elsewhere`` the number of those whose key
-    is not in the keystore.  ``not_tried`` lists tests that a proof needs and that cannot run.
-    ``secrets`` returns the passphrases of its CA keys.
+    ``rows`` are for the enclaves with the widest permissions, and for enclaves with faulty or
+    revoked files. ``enclaves`` is the number of all enclaves, ``elsewhere`` the number of enclaves
+    whose key is not in the keystore.  ``not_tried`` lists tests that a proof needs and that cannot
+    run. ``secrets`` returns the passphrases of its CA keys.
     """
 
     root: Path
@@ -125,7 +125,7 @@ class UserKeystore(NamedTuple):
         shutil.copytree(self.root, target, symlinks=True, ignore=_copy_filter(self.root, folders))
 
     def keyring(self) -> Keyring:
-        """Return the keyring of the CA keys: in the keystore, or where its settings say."""
+        """Return a keyring for the CA keys, which are in the keystore or where its settings say."""
         inside = {role: self.root.absolute() / ca_key(role) for role in ROLES}
         places = {role: f"file:{path}" for role, path in inside.items() if path.exists()}
         return Keyring(self.secrets, places)
@@ -136,7 +136,7 @@ class UserKeystore(NamedTuple):
         return (self.service or SERVICE) if name == SERVICE else name
 
     def permitted_enclave(self, row: Row) -> str:
-        """Return the enclave that plays both the attacker and a permitted party of a row, or ""."""
+        """Return the enclave that is both attacker and permitted party of a row, or ""."""
         attackers, other_enclaves = (
             {
                 (party.role, self.cast.get(party.identity.enclave, ""))
@@ -183,7 +183,7 @@ class UserKeystore(NamedTuple):
 
 
 def open_user_keystore(root: Path, topic: str, scenario: Scenario, now: datetime) -> UserKeystore:
-    """Read a keystore, and choose enclaves for the ROS topic ``topic`` ("": any topic).
+    """Return a user's keystore, with enclaves chosen for the ROS topic ``topic`` ("": any topic).
 
     Raises:
         KeystoreError: ``root`` is not a keystore, or no two enclaves may talk to each other.
@@ -232,13 +232,13 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario, now: datetime
 class _Enclaves(NamedTuple):
     """The enclaves of a keystore, sorted by what their files allow the demo to do.
 
-    ``rights`` are the grants of sound enclaves.  ``faulty`` maps enclaves that the others do not
-    accept to their first fault; ``revoked`` maps revoked enclaves to whether their own list names
-    them.  ``unreadable`` have files that are not safe to read, such as an endless file of the
-    kernel. ``elsewhere`` are enclaves whose key is not in the keystore.  ``without_list`` are
-    enclaves without the newest revocation list of their keystore; ``other_governance`` have another
-    governance than the rest; ``other_domain`` are for other ROS domains than ``domain``, in which
-    the enclaves meet.
+    ``rights`` are the grants of sound enclaves.  ``faulty`` maps enclaves that other enclaves do
+    not accept to their first fault; ``revoked`` maps each revoked enclave to whether its own
+    revocation list names it. ``unreadable`` enclaves have files that are not safe to read, such as
+    an endless file of the kernel. ``elsewhere`` are enclaves whose key is not in the keystore.
+    ``without_list`` are enclaves without the newest revocation list of their keystore;
+    ``other_governance`` are enclaves with another governance than the rest; ``other_domain`` are
+    enclaves that may not join ``domain``, the ROS domain of the demo.
     """
 
     rights: Mapping[str, Grant]
@@ -279,7 +279,7 @@ class _Enclaves(NamedTuple):
 
 
 def _read_enclaves(keystore: OpenedKeystore, now: datetime, domain: int) -> _Enclaves:
-    """Read the files of all enclaves; ``domain`` is the domain in which the enclaves meet."""
+    """Read the files of all enclaves; ``domain`` is the ROS domain of the demo."""
     rights: dict[str, Grant] = {}
     faulty: dict[str, str] = {}
     revoked: dict[str, bool] = {}
@@ -358,8 +358,9 @@ def _best_cast(
 ) -> tuple[dict[str, str], str]:
     """Return the best enclaves for talker, listener and guest, and their DDS topic.
 
-    An enclave that may only publish, or only subscribe, is better than one that may do both.  The
-    best listener is an enclave in ``without_list``, which may not know which enclaves were revoked.
+    An enclave that may only publish, or only subscribe, is better than an enclave that may do both.
+    The best listener is an enclave in ``without_list``, which may not know which enclaves were
+    revoked.
     """
     best: tuple[int, dict[str, str], str] = (-1, {}, "")
     serving = _service_cast(rights)
@@ -409,8 +410,8 @@ def _best_first(
     """Return ``chosen`` sorted by how well an enclave shows the ``right`` to ``topic``.
 
     Enclaves that are not in ``other_enclaves`` come first, then those whose permissions name the
-    topic.  Last are enclaves with a rule that denies the other direction: Cyclone DDS 0.10 denies
-    both directions to them.
+    topic.  Last are enclaves with a rule that denies the other direction, because Cyclone DDS 0.10
+    then denies both directions.
     """
     return sorted(
         (name for name in rights if name in chosen),
@@ -425,7 +426,7 @@ def _best_first(
 def _service_cast(rights: Mapping[str, Grant]) -> dict[str, str]:
     """Return the cast of a server and a client of one service; empty if there is none.
 
-    A client that may not serve is preferred, and a client whose permissions name the service.
+    Clients that may not serve are preferred, and clients whose permissions name the service.
     """
     cast: dict[str, str] = {}
     best = -1
@@ -552,10 +553,10 @@ def allows(grant: Grant, verb: str, topic: str) -> bool:
 
 
 def _allowing(grant: Grant, verb: str, topic: str) -> str:
-    """Return the expression by which a grant allows ``verb`` on a DDS topic; "" if it denies.
+    """Return the expression by which a grant allows ``verb`` on a DDS topic; "" if denied.
 
-    As with the vendors, the first rule that names the topic decides; of several expressions in it,
-    the exact name is returned.  A topic that no rule names is denied.
+    As with the vendors, the first rule that names the topic decides; of several matching
+    expressions in this rule, the exact name is returned.  A topic that no rule names is denied.
     """
     for rule in grant.rules:
         fitting = [
@@ -577,7 +578,7 @@ def _is_denied(grant: Grant, topic: str) -> bool:
 
 
 def _expressions_of(grant: Grant, right: str, name: str) -> tuple[str, ...]:
-    """Return what `_allowing` returns for each DDS topic that a right on a ROS name needs."""
+    """Return the expressions that allow a right on a ROS name, for each DDS topic ("": denied)."""
     topics = dds_names(right, name)
     return (
         *(_allowing(grant, "publish", topic) for topic in topics.publish),
@@ -638,7 +639,7 @@ def is_node_allowed(grant: Grant, node: str) -> bool:
 
 
 def nodes_named(grant: Grant) -> Iterator[str]:
-    """Yield the absolute names of the nodes whose standard services a grant allows by name."""
+    """Yield the absolute names of nodes whose standard services a grant allows by exact name."""
     kind, service = _NODE_MARK
     for topic in _topics_to_publish(grant):
         if topic.startswith(kind) and topic.endswith(service):

@@ -1,11 +1,11 @@
 """The demo's nodes on Cyclone DDS: ``python -m sros_tool.demo.cyclone_node ROLE``.
 
-They read the environment of a ROS 2 node and use the DDS topics and types of its messages, so that
-rclpy nodes receive them, and a launcher can start both kinds of nodes in the same way.
+The nodes read the environment of a ROS 2 node, and use the DDS topics and types of ROS messages. So
+rclpy nodes receive their messages, and both kinds of nodes are started in the same way.
 
 Services and actions use the DDS topics of rmw_cyclonedds (rq/...Request, rr/...Reply,
-rt/..._action/...), but send strings: names and rights are as in ROS 2, types are not.
-A request is "CLIENT NUMBER TEXT"; its reply begins with the same CLIENT and NUMBER.
+rt/..._action/...), but send strings: names and rights are as in ROS 2, types are not. A request is
+"CLIENT NUMBER TEXT"; the reply begins with the same CLIENT and NUMBER.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class CycloneNode:
         self._readers.append((reader, hear))
 
     def types(self, name: str, *, of_publishers: bool) -> Sequence[str]:
-        """Return the ROS type of each discovered publisher, or else subscription, of a topic."""
+        """Return the ROS types of a topic's discovered publishers, or else of its subscriptions."""
         participant, topic = self._participant, self.wire_name(name)
         endpoints = participant.publications() if of_publishers else participant.subscriptions()
         return [ros_type(endpoint.type_name) for endpoint in endpoints if endpoint.topic == topic]
@@ -72,7 +72,7 @@ class CycloneNode:
         self._readers.append((reader, reply))
 
     def client(self, name: str) -> Call:
-        """Return a function that sends a request to a service, and hands over every reply."""
+        """Return a function that sends a request to a service, and passes replies to ``hear``."""
         (requests,), (replies,) = dds_names("request", name)
         reader, writer = self._participant.reader(replies), self._participant.writer(requests)
         waiting: list[Hear] = []
@@ -90,7 +90,7 @@ class CycloneNode:
         return call
 
     def watch(self) -> None:
-        """Start to discover publishers; a no-op, because every participant discovers them."""
+        """Do nothing: every participant discovers publishers."""
 
     def publications(self) -> Sequence[str]:
         """Return the DDS topics of the discovered publishers."""

@@ -82,7 +82,7 @@ class Diagnosis(NamedTuple):
 
     @property
     def conclusion(self) -> str:
-        """What enforces security here and what does not, in sentences."""
+        """Sentences on the DDS and RMWs here that enforce security, and on the others."""
         if not self.enforces:
             return f"Nothing here enforces DDS Security. {self.advice}"
         named = " and ".join(stack.name for stack in self.stacks if stack.enforces)
@@ -99,7 +99,7 @@ class Diagnosis(NamedTuple):
 
     @property
     def advice(self) -> str:
-        """What to install if nothing here enforces security, or an empty string."""
+        """What to install if no DDS here enforces security, or an empty string."""
         return "" if self.enforces else f"{INSTALL_ADVICE} {ROS_ADVICE}"
 
 
@@ -139,7 +139,8 @@ def _indented(texts: Sequence[str]) -> list[str]:
 
 
 _OURS = ("sros_tool", "sros_ros2_security")
-"""Python distributions that provide sros's command; the second one is for workspaces."""
+"""Python packages that provide the `ros2 security` of sros; the second package is for workspaces.
+"""
 _SECONDS = 60.0
 _ASK = """
 import sys
@@ -157,7 +158,7 @@ class SecurityProvider:
     provider: str
     """The package whose command runs; ``sros_tool`` and ``sros_ros2_security`` belong to sros."""
     hidden: tuple[str, ...]
-    """Other packages with this command, whose command does not run."""
+    """Other packages that have `ros2 security`, but whose command does not run."""
 
     @property
     def ours(self) -> bool:
@@ -174,7 +175,7 @@ class SecurityProvider:
 
 
 def security_provider(environment: Mapping[str, str]) -> SecurityProvider | None:
-    """Return who provides `ros2 security`, or None if that cannot be found out."""
+    """Return the provider of `ros2 security`, or None if that cannot be found out."""
     program = shutil.which("ros2", path=environment.get("PATH"))
     words = _interpreter(Path(program)) if program else []
     if not words:
@@ -197,7 +198,7 @@ def security_provider(environment: Mapping[str, str]) -> SecurityProvider | None
 
 
 def _interpreter(script: Path) -> list[str]:
-    """Return the words behind ``#!`` in a script's first line, if they name a Python."""
+    """Return the interpreter words of a script's ``#!`` line, if they name a Python."""
     with suppress(OSError, ValueError), script.open("rb") as file:
         first = file.readline(512)
         if first.startswith(b"#!") and b"python" in first:

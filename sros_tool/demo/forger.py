@@ -71,7 +71,7 @@ class KeystoreCopy:
     """A keystore to forge; ``foreign`` is another keystore with the same enclaves.
 
     ``cast`` has the enclave of each part; ``topic`` is the attacked ROS topic, ``domain`` a domain
-    of the keystore; ``keyring`` says where the keys of its CAs are.  ``router`` is the enclave of
+    of the keystore; ``keyring`` finds the keys of the keystore's CAs.  ``router`` is the enclave of
     the Zenoh router ("": none), which listens at ``endpoint``.
     """
 
@@ -170,7 +170,7 @@ class KeystoreCopy:
     ) -> None:
         """Issue another certificate for an enclave, and perhaps a new key.
 
-        Its subject stays, or becomes the subject of the part ``subject_of``.
+        The subject stays the same, or becomes the subject of the part ``subject_of``.
         """
         subject = self.certificate(subject_of or part).subject
         key = generate_key() if new_key else self.key(part)
@@ -181,7 +181,7 @@ class KeystoreCopy:
 
 
 class UncastError(KeystoreError):
-    """The keystore has no enclave for a part of the row."""
+    """Raised if the keystore has no enclave for a part of the row."""
 
     def __init__(self, part: str) -> None:
         needed = _NEEDED.get(part, f"an enclave for the {part}")
@@ -197,7 +197,7 @@ _NEEDED = {
     "client": _SERVICE_OF_TWO,
     "newcomer": "an enclave that the demo made without a policy",
 }
-"""Part → what the keystore needs to have, if none of its enclaves fits the part."""
+"""Part → the enclave that a keystore needs, if no enclave fits the part."""
 
 
 Forge = Callable[[KeystoreCopy], None]
@@ -214,7 +214,7 @@ def _same_template(template: Template) -> Template:
 
 
 class Undefended(NamedTuple):
-    """A forgery in a new keystore that lacks a defense: its template is changed first."""
+    """A forgery in a new keystore that lacks a defense, because its template is changed first."""
 
     forge: Forge = _forge_nothing
     template: Callable[[Template], Template] = _same_template
@@ -372,12 +372,12 @@ def enclave_among_the_signers(copy: KeystoreCopy) -> None:
 
 
 def borrowed_permissions(copy: KeystoreCopy) -> None:
-    """Give the guest the admin's permissions; the admin's name contains the guest's."""
+    """Give the guest the permissions of the admin, whose name contains the guest's name."""
     copy.put("guest", PERMISSIONS_FILE, copy.read("admin", PERMISSIONS_FILE))
 
 
 def borrowed_permissions_and_subject(copy: KeystoreCopy) -> None:
-    """Give the guest the permissions and, in a new certificate, the subject of the admin."""
+    """Give the guest the admin's permissions, and a new certificate with the admin's subject."""
     borrowed_permissions(copy)
     validity = Window(copy.now - _DAY, copy.now + _DAY)
     copy.reissue("guest", validity, subject_of="admin")
@@ -482,7 +482,7 @@ def _revoke(copy: KeystoreCopy, part: str) -> None:
 def _outdated_lists(copy: KeystoreCopy) -> dict[Path, bytes]:
     """Return the CRLs (empty: none) of enclaves that lack the keystore's current CRL.
 
-    An enclave that did not get the last list will not get the next one, either.
+    An enclave that did not get the last list will not get the next list, either.
     """
     newest = copy.root / CRL
     revoked = any(entry.what == "revocation" for entry in OpenedKeystore(copy.root).ledger.entries)

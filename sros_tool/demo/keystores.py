@@ -50,7 +50,7 @@ from sros_tool.zenoh.configuration import Mode
 class KeystoreSpec:
     """The inputs for creating keystores: ROS topic (absolute), domains, template, and time.
 
-    ``endpoint`` is where a Zenoh router listens.
+    ``endpoint`` is the endpoint of a Zenoh router.
     """
 
     topic: str
@@ -112,9 +112,9 @@ class KeystoreSet:
         return self.enclave(party.identity) if party.identity.keystore is not None else ""
 
     def shorten(self, identity: Identity, lifetime: int, elapsed: float) -> float:
-        """Replace an enclave's certificate by one that expires soon; return the seconds left.
+        """Issue an enclave a certificate that expires soon; return the seconds left.
 
-        ``lifetime`` is its validity in seconds, and ``elapsed`` the time since the keystores were
+        ``lifetime`` is the validity in seconds, and ``elapsed`` the time since the keystores were
         made. The result can differ from ``lifetime``, because certificates have whole seconds.
         """
         assert identity.keystore is not None
@@ -155,7 +155,7 @@ class KeystoreSet:
         return ProbeEnclave(environment, topic, DENIED_TOPIC)
 
     def inapplicable(self, row: Row) -> str:
-        """Return why a row does not apply to this keystore (no enclave plays a part), or ""."""
+        """Return why a row does not apply to this keystore (no enclave for a part), or ""."""
         for party in row.parties:
             identity = party.identity
             part = identity.enclave
@@ -172,7 +172,7 @@ class KeystoreSet:
         return ""
 
     def problem(self, row: Row) -> str:
-        """Return why a row cannot run (a keystore could not be made), or ""."""
+        """Return why a row cannot run (a keystore that could not be created), or ""."""
         return next((str(e) for party in row.parties if (e := self._missing(party))), "")
 
     def _missing(self, party: Party) -> Exception | None:
@@ -199,7 +199,7 @@ class KeystoreSet:
 def create_keystores(
     folder: Path, scenario: Scenario, spec: KeystoreSpec, user: UserKeystore | None = None
 ) -> KeystoreSet:
-    """Create all keystores of a scenario in ``folder``, and return them.
+    """Create all keystores of a scenario in ``folder``.
 
     The own keystore is a copy of the ``user`` keystore, if given.  If a forgery cannot be made,
     only the rows that use it are skipped.
@@ -239,7 +239,7 @@ def create_scenario_keystore(root: Path, scenario: Scenario, spec: KeystoreSpec)
 
 
 def _forgeries_of(scenario: Scenario) -> list[Forge | Undefended]:
-    """Return the forgeries that the rows of a scenario use, without duplicates."""
+    """Return the different forgeries that the rows of a scenario use."""
     used: list[KeystoreChoice | None] = [
         party.identity.keystore for row in scenario.rows for party in row.parties
     ]
@@ -259,7 +259,7 @@ def _forge(
     spec: KeystoreSpec,
     user: UserKeystore | None,
 ) -> KeystoreCopy:
-    """Create one forged keystore in ``root``, and return it."""
+    """Create a forged keystore in ``root``."""
     cast, keyring = scenario.cast, IN_KEYSTORE
     if isinstance(choice, Undefended):
         weakened = replace(spec, template=choice.template(spec.template))

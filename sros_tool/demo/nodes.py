@@ -1,7 +1,7 @@
 """Command line and roles of the demo's nodes, shared by Cyclone DDS and Zenoh.
 
 Services and actions have the names and rights of ROS 2, but send strings: a request is text that
-ends with ``: FIRST + SECOND``, its answer text that ends with ``: FIRST + SECOND = SUM``.
+ends with ``: FIRST + SECOND``, the answer is text that ends with ``: FIRST + SECOND = SUM``.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ class NodeOptions:
     ``topic`` is the ROS name of the role's topic, service or action.  ``period`` is in seconds.
     ``text`` is sent in messages, and identifies a server.  ``also`` are further topics for an
     observer.  On Zenoh, messages of a talker have ``size`` bytes or more, and ``patience`` is how
-    long a process waits for its connection, in seconds.  A talker or listener ``by_hand`` needs no
-    right but that of its topic, and reports the types of other endpoints on the topic
-    (`OtherTypes`).  A talker on rclpy publishes messages of the ROS type ``type`` with default
-    values, if it is not `STRING`.
+    long a process waits for its connection, in seconds.  A talker or listener ``by_hand`` needs
+    only the right for its topic, and reports the types of other endpoints on the topic
+    (`OtherTypes`).  If ``type`` is not `STRING`, a talker on rclpy publishes messages of the ROS
+    type ``type`` with default values.
     """
 
     role: str
@@ -175,10 +175,10 @@ class Node(Protocol):
         """Subscribe to a topic; ``hear`` is called with every text received."""
 
     def types(self, name: str, *, of_publishers: bool) -> Sequence[str]:
-        """Return the type of each discovered publisher, or else subscription, of a topic."""
+        """Return the types of a topic's discovered publishers, or else of its subscriptions."""
 
     def count(self, name: str, kind: str, on_count: Callable[[int], None]) -> str:
-        """Count messages of a type other than string; return why that cannot be done, or "".
+        """Count messages of a type other than string; return why that is impossible, or "".
 
         ``on_count`` is called with the number of messages since its last call.
         """
@@ -187,20 +187,20 @@ class Node(Protocol):
         """Offer a service; ``answer`` is called with a request and returns the reply."""
 
     def client(self, name: str) -> Call:
-        """Return a function that sends a request to a service, and hands over every reply."""
+        """Return a function that sends a request to a service, and passes replies to ``hear``."""
 
     def watch(self) -> None:
         """Start to discover publishers."""
 
     def publications(self) -> Sequence[str]:
-        """Return the topics of the discovered publishers, as named on the wire."""
+        """Return the topics of the discovered publishers, as packets name them."""
 
     def wire_name(self, topic: str) -> str:
-        """Return the name of a ROS topic on the wire."""
+        """Return the name of a ROS topic as packets have it."""
 
 
 class NodeRole:
-    """The behavior of a node in a role; call ``step`` repeatedly to do due work."""
+    """The behavior of a node in a role; call ``step`` repeatedly to do the work that is due."""
 
     def __init__(self, node: Node, options: NodeOptions, events: EventWriter) -> None:
         self._node, self._options, self._events = node, options, events
@@ -263,7 +263,7 @@ class OtherTypes:
         self._due = 0.0
 
     def step(self) -> None:
-        """Report what changed, and how many messages were heard, once in a period."""
+        """Once in a period, report new types and the number of messages heard."""
         if (moment := time.monotonic()) < self._due:
             return
         self._due = moment + self._period
@@ -296,7 +296,7 @@ STRING = NodeOptions.type
 
 
 def ros_type(dds_type: str) -> str:
-    """Return the name in ROS of a type: std_msgs/msg/String of std_msgs::msg::dds_::String_."""
+    """Return the ROS name of a DDS type: std_msgs/msg/String for std_msgs::msg::dds_::String_."""
     return dds_type.replace("::dds_::", "::").removesuffix("_").replace("::", "/")
 
 

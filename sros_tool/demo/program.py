@@ -1,8 +1,8 @@
 """Run the whole demo: check options, make keystores, choose a backend, run the rows of scenarios.
 
-A row's window starts when all its processes are ready, also on a busy machine.  It has the same
-length for expected silence and expected messages; only a brief row that expects no silence ends
-early.  No process outlives the process that started it.
+The observation of a row starts when all its processes are ready, also on a busy machine. The
+observation has the same length for expected silence and expected messages; only a brief row that
+expects no silence ends early.  No process outlives the process that started it.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ _DEFAULT_DOMAIN = 80
 _DEFAULT_TEMPLATE = "production"
 
 _ENDPOINT = "localhost:7447"
-"""Endpoint of the Zenoh routers; every router has a network of its own."""
+"""Endpoint of the Zenoh routers; every router has a separate network."""
 
 _ZENOH_WINDOW = 2.0
 """Length of a row's observation on Zenoh, in seconds."""
@@ -115,7 +115,7 @@ _HOST = "host"
 
 @dataclass(frozen=True)
 class Limits:
-    """Time limits in seconds: for the start, for the window of a row, and for all rows.
+    """Time limits in seconds: for the start, for the observation of a row, and for all rows.
 
     ``wave`` is for one group of parallel rows, so that many rows get more time than ``total``.  All
     limits except ``window`` exist only to detect hanging processes, also on slow machines.
@@ -132,12 +132,12 @@ class Limits:
 class DemoOptions:
     """The options of a demo; ``keep`` is the folder for all files (None: deleted at the end).
 
-    ``keystore`` is a keystore of the user, a copy of which is attacked.  The default ``template``
-    is the template of that keystore, or production; the default ``topic`` is one that the cast may
-    use.  ``only`` selects the rows whose names contain one of its words.  ``accept_open`` names the
-    rows of attacks that may succeed because of the user's keystore.  ``advisories`` are the known
-    DDS vulnerabilities; None for those that ship with sros.  ``secrets`` returns the passphrases of
-    the CA keys in ``keystore``.
+    ``keystore`` is a user's keystore; the demo attacks a copy.  The default ``template`` is the
+    template of that keystore, or production; the default ``topic`` is a topic that the cast may
+    use. ``only`` has words, and selects the rows whose names contain such a word.  ``accept_open``
+    names the rows of attacks that may succeed because of the user's keystore.  ``advisories`` are
+    the known DDS vulnerabilities; None for those that ship with sros.  ``secrets`` returns the
+    passphrases of the CA keys in ``keystore``.
     """
 
     template: Template | None = None
@@ -274,7 +274,7 @@ def _result_of(
 def _scenario_results(
     scenarios: Sequence[Scenario], rows: Sequence[RowResult]
 ) -> Iterator[ScenarioResult]:
-    """Yield the result of each scenario in order, with its part of the rows of all scenarios."""
+    """Yield the result of each scenario in order; ``rows`` has the rows of all scenarios."""
     left = iter(rows)
     for scenario in scenarios:
         own_results = itertools.islice(left, len(scenario.rows))
@@ -287,7 +287,7 @@ def _with_expectation(row: Row, backend: Backend, template: Template, topic: str
 
 
 def _with_default_template_status(row: Row, strong_row: Row, options: DemoOptions) -> Row:
-    """Return the row, marked as accepted, or as open although the default template prevents it."""
+    """Return the row, marked as accepted, or as open if the user's keystore allows the attack."""
     opened = bool(row.open_because) and not strong_row.open_because
     accepted = row.name in options.accept_open
     return replace(row, accepted=accepted, unaccepted=opened and not accepted)
@@ -481,7 +481,7 @@ _TICK = 0.05
 """Seconds between two reads of the processes' reports."""
 
 _GRACE = 0.3
-"""Seconds in which messages on the wire may still arrive after a window closes."""
+"""Seconds in which messages on the wire may still arrive after the observation."""
 
 
 class _Patience(NamedTuple):
@@ -789,13 +789,13 @@ class _Runner:
 
 
 def _is_hopeless(claim: Claim, row: Row, processes: Mapping[str, _PartyProcess]) -> bool:
-    """Return whether a claim can no longer hold: its intruder was refused, or has ended."""
+    """Return whether a claim can no longer hold, because its intruder was refused or has ended."""
     names = [name for name in (claim.subject, claim.talker) if name and row.party(name).intruder]
     return not all(processes[name].running for name in names)
 
 
 def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, _PartyProcess]) -> bool:
-    """Return whether a claim expects silence that could still end, so needs the full time."""
+    """Return whether a claim needs the full time: it expects silence that could still end."""
     if claim.holds or claim.relation in (Relation.HEARS_AGAIN, Relation.BELIEVES):
         return False
     names = [name for name in (claim.subject, claim.talker) if name and row.party(name).intruder]
@@ -815,7 +815,7 @@ def _uses_shared_memory(row: Row) -> bool:
 
 
 def _is_needed(party: Party, row: Row) -> bool:
-    """Return whether a row needs a party to run: no claim expects the party's refusal."""
+    """Return whether a row needs a party to run, because no claim expects the party's refusal."""
     refused = {claim.subject for claim in row.claims if claim.relation is Relation.IS_REFUSED}
     return not party.intruder and party.name not in refused
 
@@ -834,7 +834,7 @@ def _is_decided_by_start(row: Row) -> bool:
 
 
 async def _end_softly(processes: Collection[_PartyProcess]) -> None:
-    """Send SIGTERM, and wait up to `_SECONDS_TO_END` for last log lines and reports."""
+    """Send SIGTERM, and wait up to `_SECONDS_TO_END` for the last log lines and reports."""
     for process in processes:
         process.ask_to_end()
     latest = time.monotonic() + _SECONDS_TO_END
@@ -852,9 +852,10 @@ _AFTER_FORGERY = 1.0
 
 
 async def _replay_packets(talker: _PartyProcess, tap: Wiretap, lease: float) -> Injection:
-    """End a talker, then send its captured packets again, with pauses shortened.
+    """End a talker, then send the captured packets again, with pauses shortened.
 
-    A listener that still knows the talker, for up to ``lease`` seconds, takes them for duplicates.
+    A listener still knows the talker for up to ``lease`` seconds, and drops the packets as
+    duplicates.
     """
     packets = tap.packets(talker.ports())
     await _end_softly([talker])
@@ -872,8 +873,8 @@ async def _replay_packets(talker: _PartyProcess, tap: Wiretap, lease: float) -> 
 async def _forge_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
     """Suspend a talker, then send changed copies of its last packet of every length.
 
-    An attacker need not know which packet has a message, or where.  For every sequence number,
-    there are copies with a bit changed in each place, because a reader drops malformed copies.
+    An attacker need not know which packet has a message, or where. For every sequence number, there
+    is a copy for each place in which a bit is changed, because a reader drops malformed copies.
     """
     talker.hold()
     await asyncio.sleep(_GRACE)
@@ -995,7 +996,7 @@ class _PartyProcess:
         return self._own_status is not None
 
     def ports(self) -> frozenset[int]:
-        """Return the ports that the process has bound; after its end, the last known ones."""
+        """Return the ports that the process has bound; after its end, the last known ports."""
         self._ports = bound_ports(self._process.pid) or self._ports
         return self._ports
 

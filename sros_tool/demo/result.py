@@ -47,9 +47,9 @@ from sros_tool.wording import counted, first_few
 class PartyRecord:
     """The record of a process that has ended.
 
-    ``text`` marks the messages of a talker; ``topic`` is its ROS topic; ``through`` is the name of
-    the library that it used; ``output`` is what it printed; ``status`` is its exit status (negative
-    for a signal) if it ended by itself.
+    ``text`` marks the messages of a talker; ``topic`` is the ROS topic of the process; ``through``
+    is the name of its library; ``output`` is its output; ``status`` is its exit status (negative
+    for a signal) if the process ended by itself.
     """
 
     text: str = ""
@@ -67,8 +67,8 @@ class RowRecord:
     ``window`` is the start and end of the observation (seconds of CLOCK_MONOTONIC), or None if a
     party was not ready in time.  ``injected`` counts packets that were sent again or changed;
     ``skipped`` is the reason why the row was not run, or "".  ``expiry`` is the time at which the
-    certificate of a short-lived talker expires (CLOCK_MONOTONIC, s); ``memory`` counts, for each
-    party, the segments of shared memory that contain its text.  If ``applies`` is False, the
+    certificate of a short-lived talker expires (CLOCK_MONOTONIC, s); ``memory`` maps each party to
+    the number of shared memory segments that contain its text.  If ``applies`` is False, the
     keystore has no enclave for a part of the row.  ``libraries`` are the DDS libraries that the
     parties had mapped at the end.
     """
@@ -107,7 +107,7 @@ class RowResult:
     observed: RowStatus
     """The observed outcome."""
     mechanism: str
-    """Why this outcome is expected."""
+    """Reason for the expected outcome."""
     detail: str
     """Observation, with counts of messages."""
     domain: int
@@ -119,7 +119,7 @@ class RowResult:
     defence_removed: str = ""
     """Defense that the row removes, or an empty string."""
     open_because: str = ""
-    """Why the attack is known to succeed, or an empty string."""
+    """Reason that the attack is known to succeed, or an empty string."""
     remedy: str = ""
     """Defense against the attack, or an empty string."""
     accepted: bool = False
@@ -146,15 +146,15 @@ class RowResult:
 
     @property
     def open_here(self) -> bool:
-        """Whether the attack succeeds because of the keystore, and the user did not accept that."""
+        """Whether the attack succeeds because of the user's keystore, without being accepted."""
         return self.unaccepted and self.observed is self.expected
 
     @property
     def untried(self) -> bool:
-        """Whether the row of an attack that has to fail was skipped, so that it may succeed.
+        """Whether an attack that has to fail was not tried, so that it may succeed.
 
         False for rows that prove nothing about a keystore (without the defense, or of an attack
-        that is known to succeed or was accepted), and for rows that do not apply to it.
+        that is known to succeed or was accepted), and for rows that do not apply to the keystore.
         """
         if self.observed is not RowStatus.SKIPPED or not self.applies or self.defence_removed:
             return False
@@ -303,7 +303,7 @@ def _judge_answers(case: _Case) -> _Finding:
 
 
 def _judge_execution(case: _Case) -> _Finding:
-    """Judge a call by the requests that the server executed: its reply may be lost afterwards."""
+    """Judge a call by the requests that the server executed, because a reply may be lost."""
     claim, asked = case.claim, case.messages_sent(case.talker)
     if not asked:
         return _undecided(f"{claim.talker} sent no request in the window")
@@ -335,7 +335,7 @@ def _judge_expiry(case: _Case) -> _Finding:
 def _with_evidence(finding: _Finding, claim: Claim, record: RowRecord) -> _Finding:
     """Return a refusal with the log line that proves it, if the claim names a log text.
 
-    Without that line, nothing is proved: a process without a connection may only be slow.
+    Without such a line, a refusal is not proved: a process without a connection may only be slow.
     """
     if not claim.evidence or finding.status is not RowStatus.NOT_LET_IN:
         return finding
@@ -526,14 +526,14 @@ def _is_in_window(event: Event, record: RowRecord) -> bool:
 
 
 class KeystoreSummary(NamedTuple):
-    """How much of a user's keystore the demo tried."""
+    """The number of a user's enclaves, and which of them the demo did not try."""
 
     enclaves: int
     """Number of enclaves in the keystore."""
     elsewhere: int = 0
     """Number of enclaves whose key is elsewhere; the demo did not try them."""
     not_tried: tuple[str, ...] = ()
-    """Tests that a proof needs and the demo did not run; if there are any, the status is not 0."""
+    """Tests that a proof needs and the demo did not run; with such tests, the status is not 0."""
 
 
 @shows("name", "title", "as_expected", "cast", "keystore", "rows", "cost")
@@ -558,14 +558,14 @@ class ScenarioResult:
 
     @property
     def keystore(self) -> KeystoreSummary | None:
-        """With `--keystore`: how much of the keystore was tried."""
+        """With `--keystore`: the number of enclaves, and the tests that did not run."""
         return self.attacked and self.attacked._replace(not_tried=self.not_tried)
 
     @property
     def not_tried(self) -> tuple[str, ...]:
-        """Tests that the demo did not run, although a proof of the user's keystore needs them.
+        """Tests that a proof of the user's keystore needs, and that the demo did not run.
 
-        The demo's own keystores only show what works, and prove nothing about others.
+        Empty without a user's keystore: the demo's own keystores prove nothing about others.
         """
         if self.attacked is None:
             return ()
@@ -594,7 +594,7 @@ class DemoResult:
     dds: str
     """Name and version of the DDS, or of Zenoh."""
     why: str
-    """Why this backend was chosen."""
+    """Reason for the choice of this backend."""
     template: str
     """Template of the keystores."""
     topic: str
@@ -604,14 +604,16 @@ class DemoResult:
     own_network: bool
     """Whether the demo ran in a network namespace of its own."""
     network_reason: str
-    """Why the demo had no network namespace of its own, or an empty string."""
+    """Reason that the demo had no network namespace of its own, or an empty string."""
     scenarios: tuple[ScenarioResult, ...]
     """Results of the scenarios."""
     left_out: int = 0
     """Number of rows that `--only` left out."""
     libraries: tuple[UsedLibrary, ...] = ()
-    """DDS libraries that the processes had loaded, with their known vulnerabilities; an empty
-    list if none was seen."""
+    """DDS libraries that the processes had loaded, with their known vulnerabilities.
+
+    An empty list if no library was seen.
+    """
 
     @property
     def vulnerabilities(self) -> str:
@@ -636,7 +638,7 @@ class DemoResult:
 
     @property
     def exit_status(self) -> int:
-        """The exit status: 0 if all rows are as expected, 1 if one is not, else `NOT_DONE`."""
+        """The exit status: 0 if all rows are as expected, 1 if a row is not, else `NOT_DONE`."""
         if any(scenario.wrong for scenario in self.scenarios):
             return 1
         return 0 if self.as_expected else NOT_DONE
@@ -659,12 +661,12 @@ class UsedLibrary(NamedTuple):
     releases.
     """
     vulnerabilities: Sequence[str] | None
-    """Ids of the known vulnerabilities of this version; null if they are not known."""
+    """Ids of the known vulnerabilities of this version; null if the version is not known."""
     unclear: Sequence[str]
     """Ids of vulnerabilities that this version may or may not have."""
 
     def sentence(self, maximum: int) -> str:
-        """Return what is known of the library, with at most ``maximum`` ids."""
+        """Return a sentence on the library's vulnerabilities, with at most ``maximum`` ids."""
         version = self.version or "of unknown version"
         name = f"{self.product} {version}, which the processes loaded,"
         if self.vulnerabilities is None:
@@ -721,7 +723,7 @@ _INDENT = " " * 6
 
 
 def demo_table(result: DemoResult) -> str:
-    """Return the result as a text table: the backend above, a summary line below."""
+    """Return the result as a text table, with a line on the backend above and a summary below."""
     network = (
         "a separate network namespace"
         if result.own_network
@@ -795,7 +797,7 @@ def _mark(row: RowResult) -> str:
 
 
 def _summary(result: DemoResult) -> str:
-    """Return the last sentence: how many rows were as expected, and what was not tried."""
+    """Return the last sentence: the number of rows as expected, and the tests that did not run."""
     rows = result.rows
     opened = sum(1 for row in rows if row.open_here)
     wrong = sum(1 for row in rows if not row.as_expected)

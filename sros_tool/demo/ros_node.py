@@ -1,7 +1,7 @@
 """The demo's nodes on rclpy: ``python -m sros_tool.demo.ros_node ROLE [--ros-args ...]``.
 
-They are ordinary ROS 2 nodes.  rclpy and the ROS interfaces are imported when a role starts, so
-that this module can be imported without ROS.
+The nodes are ordinary ROS 2 nodes.  rclpy and the ROS interfaces are imported when a role starts,
+so that this module can be imported without ROS.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sros_tool.demo.nodes import (
 from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
 
 _LOG_FLUSH_SECONDS = 0.3
-"""Seconds for the log thread of Fast DDS: its lines are lost if the process exits at once."""
+"""Seconds for Fast DDS to write its log: lines are lost if the process exits at once."""
 
 _TICK_SECONDS = 0.1
 """Seconds between two checks for a signal."""
@@ -110,9 +110,9 @@ def _spin(nodes: Sequence[Any], ended: Callable[[], bool]) -> None:
 def _signal_watch() -> Callable[[], bool]:
     """Handle SIGINT and SIGTERM; return a function that tells whether a signal has arrived.
 
-    rclpy's handlers are not used: they shut its context down in the middle of a callback, or just
-    before a wait without end, and a KeyboardInterrupt inside its C++ becomes another error there
-    ("Unable to convert call argument").
+    The handlers of rclpy are not used: they shut the rclpy context down in the middle of a
+    callback, or just before an endless wait, and a KeyboardInterrupt inside the C++ code of rclpy
+    becomes another error ("Unable to convert call argument").
     """
     received: list[int] = []
     for signal_number in (signal.SIGINT, signal.SIGTERM):
@@ -347,7 +347,7 @@ def _fibonacci_action() -> Any:
     """Return the class ``Fibonacci`` of the first installed ROS 2 package that has it.
 
     Raises:
-        ImportError: no package has it.
+        ImportError: no package has the class.
     """
     reasons = []
     for package in _FIBONACCI_PACKAGES:

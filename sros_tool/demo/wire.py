@@ -1,9 +1,9 @@
 """Capture packets, count readable and protected ones, and send packets again or changed.
 
-Packets of DDS are UDP, those of Zenoh TCP or TLS over TCP; Zenoh can also use shared memory.
+DDS packets are UDP; Zenoh packets are TCP, or TLS over TCP. Zenoh can also use shared memory.
 
-The packet and raw sockets need CAP_NET_RAW in their network: root has it, and also a process in a
-network namespace that it created (`sros_tool.runtime.netns`).
+The packet and raw sockets need CAP_NET_RAW in their network: root has this capability, and so does
+a process in a network namespace that it created (`sros_tool.runtime.netns`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ _SO_RCVBUFFORCE = 33
 
 _RTPS_HEADER = 20
 _PROTECTED_SUBMESSAGES = range(0x30, 0x35)
-"""SEC_BODY, SEC_PREFIX, SEC_POSTFIX, SRTPS_PREFIX, SRTPS_POSTFIX (DDS-Security 1.1 §7.3.6)."""
+"""Ids of SEC_BODY, SEC_PREFIX, SEC_POSTFIX, SRTPS_PREFIX, SRTPS_POSTFIX (DDS-Security 1.1 §7.3.6).
+"""
 
 
 _TLS_DATA = b"\x17\x03\x03"
@@ -44,8 +45,8 @@ class _CapturedPacket(NamedTuple):
 class PacketCounter:
     """A counter of protected packets, and of packets that contain one of ``marks``.
 
-    ``plain`` counts by mark, ``protected`` by port, for both ports of a packet.  With
-    ``keep``, the RTPS packets themselves are in ``kept``, in order.
+    ``plain`` counts by mark, ``protected`` by port, for both ports of a packet.  With ``keep``,
+    ``kept`` has the RTPS packets in order.
     """
 
     def __init__(self, marks: Sequence[str], *, keep: bool = False) -> None:
@@ -146,7 +147,7 @@ def _is_protected(payload: bytes) -> bool:
 
 
 def bound_ports(process: int) -> frozenset[int]:
-    """Return the UDP and TCP ports of a process (from /proc); empty if it has ended."""
+    """Return the UDP and TCP ports of a process (from /proc); empty for an ended process."""
     folder = Path(f"/proc/{process}")
     try:
         links = list((folder / "fd").iterdir())
@@ -176,7 +177,7 @@ _LARGEST_SEGMENT = 1 << 28
 
 
 def mapped_segments(process: int) -> frozenset[Path]:
-    """Return the shared memory segments that a process maps; empty if it has ended."""
+    """Return the shared memory segments that a process maps; empty for a process that has ended."""
     try:
         lines = Path(f"/proc/{process}/maps").read_text("utf-8", "surrogateescape").splitlines()
     except OSError:
@@ -186,7 +187,7 @@ def mapped_segments(process: int) -> frozenset[Path]:
 
 
 def shared_memory(texts: Mapping[str, str], segments: Collection[Path]) -> dict[str, int]:
-    """Return for each party the number of shared memory segments that contain its text."""
+    """Map each party to the number of shared memory segments that contain its text."""
     return {
         name: sum(_contains_text(path, text) for path in segments) if text else 0
         for name, text in texts.items()
@@ -214,7 +215,7 @@ _SEQUENCE_NUMBER = 20
 class _Injector:
     """A sender of whole IPv4 packets with their original source address.
 
-    A packet socket does not work here: the kernel drops its packets with loopback addresses.
+    A packet socket cannot be used: the kernel would drop packets with loopback addresses.
 
     Raises:
         PermissionError: the process lacks CAP_NET_RAW.
@@ -233,16 +234,16 @@ class _Injector:
 
 
 def packets_of(packets: Sequence[_CapturedPacket], ports: Collection[int]) -> list[_CapturedPacket]:
-    """Return the captured packets that were sent from one of the ports, in order."""
+    """Return the captured packets that were sent from one of ``ports``, in order."""
     return [packet for packet in packets if packet.source in ports]
 
 
 def with_changed_bit(packet: bytes, later: int, place: int, places: int) -> bytes | None:
     """Return a copy of an RTPS packet with one bit changed, or None if it has no content.
 
-    The change does not depend on what can be read: an attacker without keys can do as much to an
-    encrypted packet.  The sequence number of a readable DATA submessage is raised by ``later``, so
-    that a DataReader takes it for a later message of the writer (RTPS 2.3 §9.4.5.3).
+    An attacker without keys can change encrypted packets in the same way.  The sequence number of a
+    readable DATA submessage is raised by ``later``, so that a DataReader takes it for a later
+    message of the writer (RTPS 2.3 §9.4.5.3).
     """
     begin = (packet[0] & 0x0F) * 4 + 8 + _RTPS_HEADER
     if len(packet) <= begin:
@@ -285,8 +286,9 @@ _CERTIFICATE = "-----BEGIN CERTIFICATE-----"
 class Wiretap:
     """A capture of the packets of a demo row; ``problem`` says why it is not permitted, or "".
 
-    ``texts`` has the text of each party, by name; ``topic`` is the topic as packets name it.  The
-    capture starts at once: create it in the network of the row, and inside a running asyncio loop.
+    ``texts`` maps parties to their texts; ``topic`` is the topic in the form of packets. The
+    capture starts at once, so create a wiretap in the network of the row, and in a running asyncio
+    loop.
     """
 
     def __init__(self, texts: Mapping[str, str], topic: str, *, replayed: bool) -> None:
@@ -317,7 +319,7 @@ class Wiretap:
         }
 
     def packets(self, ports: Collection[int]) -> list[_CapturedPacket]:
-        """Return the packets that were sent from one of the ports so far, in order."""
+        """Return the packets that were sent from one of ``ports`` so far, in order."""
         if self._capture is None:
             return []
         self._capture.drain()

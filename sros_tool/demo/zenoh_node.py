@@ -1,8 +1,9 @@
 """The nodes of the demo on Zenoh: ``python -m sros_tool.demo.zenoh_node ROLE``.
 
-They take the configuration from the variables of rmw_zenoh, and use its key expressions, graph
-tokens, attachments and messages in CDR (ros2/rmw_zenoh, docs/design.md).  Services and actions have
-the names and messages of ROS 2, but send strings.  The role ``router`` is a Zenoh router.
+The nodes take the configuration from the variables of rmw_zenoh, and use the key expressions, graph
+tokens, attachments and CDR messages of rmw_zenoh (ros2/rmw_zenoh, docs/design.md).  Services and
+actions have the names and messages of ROS 2, but send strings.  The role ``router`` is a Zenoh
+router.
 
 A process without a connection reports a refusal only if the router's port is open.
 """
@@ -63,7 +64,7 @@ _CDR_HEADER = b"\0\1\0\0"
 
 
 def _type_of_topic(name: str, default: tuple[str, str]) -> tuple[str, str]:
-    """Return the type of a name and its hash: of a part of an action, or else ``default``."""
+    """Return the type and type hash of a name: of a part of an action, or else ``default``."""
     return _ACTION_TYPES.get(name.rpartition("/_action/")[2], default)
 
 
@@ -80,9 +81,9 @@ def _text_of(payload: zenoh.ZBytes | None) -> str:
 
 
 class _ZenohNode:
-    """One node in the graph; the enclave in its tokens is chosen by the process itself.
+    """A node in the graph; the process itself chooses the enclave in the node's tokens.
 
-    Its messages have ``size`` bytes or more.  A router, which is no node, has no ``name``.
+    Messages of the node have ``size`` bytes or more.  A router, which is no node, has no ``name``.
     """
 
     def __init__(
@@ -130,11 +131,11 @@ class _ZenohNode:
         self._keep(self._session.declare_subscriber(key, lambda it: hear(_text_of(it.payload))))
 
     def types(self, name: str, *, of_publishers: bool) -> Sequence[str]:
-        """Return the ROS type of each publisher, or else subscription, of a topic in the graph."""
+        """Return the ROS types of a topic's publishers in the graph, or else subscriptions."""
         return [ros_type(kind) for kind, _ in self._types(name, "MP" if of_publishers else "MS")]
 
     def _types(self, name: str, kind: str) -> list[tuple[str, str]]:
-        """Return the type, with its hash, of each endpoint of a kind that a topic has."""
+        """Return the types, with their hashes, of a topic's endpoints of one kind."""
         chunks = (token.split("/") for token in tuple(self._graph) if _kind_of(token) == kind)
         wire = self.wire_name(name)
         return [(of[10], of[11]) for of in chunks if len(of) > 11 and of[9] == wire]
@@ -160,7 +161,7 @@ class _ZenohNode:
         self._keep(self._session.declare_queryable(key, reply, complete=True))
 
     def client(self, name: str) -> Call:
-        """Return a function that sends a request to a service, and passes on each reply.
+        """Return a function that sends a request to a service, and passes every reply to ``hear``.
 
         ``name`` may have Zenoh wildcards.
         """
@@ -227,7 +228,7 @@ class _ZenohNode:
         return len(other_tokens)
 
     def wire_name(self, topic: str) -> str:
-        """Return a name as it is in tokens."""
+        """Return a name in the form that tokens have."""
         return topic.replace("/", "%") or "%"
 
     def _key_of(self, name: str, kind: tuple[str, str]) -> str:
@@ -308,14 +309,15 @@ _FLOODER, _ERASER = "flooder", "eraser"
 
 
 class _RefusedError(Exception):
-    """No connection, although the port is open."""
+    """Raised without a connection to a router whose port is open."""
 
 
 def _open(config: zenoh.Config, patience: float, stop: threading.Event) -> zenoh.Session | None:
     """Open a session, and wait until it is connected to its router; return None if stopped before.
 
     Raises:
-        _RefusedError: that took longer than ``patience`` seconds, and the router's port is open.
+        _RefusedError: there was no connection within ``patience`` seconds, but the router's port is
+            open.
         zenoh.ZError: the session does not open for another reason.
     """
     mode = json.loads(config.get_json("mode"))

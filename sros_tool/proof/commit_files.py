@@ -31,7 +31,8 @@ _MOST_FILES = 300  # of a folder
 _MOST_POLICY_BYTES = 64 * 1024 * 1024  # of its files
 _MOST_POLICY_ENTRIES = 100_000
 _NOWHERE = Path("/dev/null/git")
-"""A path that never exists on disk, so that files of a revision are not mixed up with others."""
+"""A path that never exists on disk, under which files of a revision are known to the policy reader.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +52,7 @@ class Revision:
 
     @property
     def place(self) -> Path:
-        """The path of the file or folder for the policy reader; it does not exist on disk."""
+        """The path of the file or folder for the policy reader; nothing has this path on disk."""
         return _NOWHERE / self.path
 
     def policies(self) -> tuple[Revision, ...]:
@@ -59,7 +60,7 @@ class Revision:
 
         Raises:
             DocumentError: a file may be a policy but is unreadable (`policy_files`), or there is a
-                link or a submodule, which are not followed.
+                link or a submodule; sros follows neither.
         """
         entry = self.repository.find(self.commit, self.path)
         if entry is None or entry.mode != FOLDER:
@@ -166,7 +167,7 @@ def checked_path(text: str) -> str:
     """Return a path from the top of a repository in its shortest form.
 
     Raises:
-        UsageError: it is empty, absolute, or leads out of the repository.
+        UsageError: the path is empty, absolute, or leads out of the repository.
     """
     path = os.path.normpath(text) if text else ""
     if not text or path.startswith(("/", "../")) or path in ("..", ".") or not path.isprintable():
@@ -182,8 +183,8 @@ def checked_path(text: str) -> str:
 class CommitFiles:
     """The requested files of a commit, which are written to the private folder ``folder``.
 
-    ``name`` is the commit's name in messages.  ``fell_back`` has the includes that use their
-    fallback because the commit lacks the file; ``refused`` has the reasons why files were not read.
+    ``name`` is the commit's name in messages. ``fell_back`` has the includes whose fallback is used
+    because the commit lacks the included file; ``refused`` has the reasons why files were not read.
     """
 
     repository: Repository
@@ -199,7 +200,7 @@ class CommitFiles:
         return self.repository.find(self.commit, path)
 
     def file(self, path: str) -> Path | None:
-        """Write the file at a path of the commit; return its location, or None if nothing is there.
+        """Write the file at a path of the commit; return its new path, or None for a missing path.
 
         Raises:
             DocumentError: the path is no regular file: for instance, it is a link.
@@ -212,7 +213,7 @@ class CommitFiles:
         return self._write(path, entry, self.repository.content(entry.id))
 
     def policies(self, path: str, *, placeholders: bool) -> list[Path]:
-        """Write the policies at a path, which is a file or a folder; return their locations.
+        """Write the policies at a path, which is a file or a folder; return their new paths.
 
         Included files are written, too.  If the path does not exist, the result is empty.
 
@@ -235,10 +236,11 @@ class CommitFiles:
             raise DocumentError(*texts) from error
 
     def tree(self, path: str) -> Path | None:
-        """Write a folder with all its content, such as a keystore; return its location, or None.
+        """Write a folder with all its content, such as a keystore; return its new path, or None.
 
         Raises:
-            DocumentError: not a folder, too large, or with a submodule or a link that leads out.
+            DocumentError: the path is no folder, or the folder is too large, has a submodule, or
+                has a link that leads out.
         """
         entry = self.entry(path)
         if entry is None:
@@ -289,11 +291,11 @@ class CommitFiles:
         return top
 
     def written(self, path: str) -> bytes:
-        """Return the content of a file of ``files``, from the folder, without asking git again."""
+        """Return the content of a file that was written, without asking git again."""
         return (self.folder / path).read_bytes()
 
     def differing_files(self, work_tree: Path) -> list[str]:
-        """Return the files of this snapshot that differ from a work tree, or are missing there."""
+        """Return the written files that a work tree lacks, or has with other content."""
         paths = []
         with Folder(work_tree) as folder:
             for path in self.files:
@@ -370,7 +372,7 @@ _MOST_PATTERNS = 100
 
 
 def converting_patterns(content: bytes) -> dict[str, str]:
-    """Map patterns in a file of git attributes to an attribute that changes or drops files.
+    """Map patterns in a .gitattributes file to an attribute by which git changes or drops files.
 
     Lines that unset an attribute do not count.
     """
@@ -388,7 +390,7 @@ def converting_patterns(content: bytes) -> dict[str, str]:
 
 
 def may_match(pattern: str, path: str) -> bool:
-    """Return whether a pattern of gitattributes(5) may match a path relative to its file's folder.
+    """Return whether a pattern in .gitattributes may match ``path``, relative to the same folder.
 
     Characters that git reads in a special way stand for any text, and a pattern for folders matches
     files, too.
@@ -407,7 +409,7 @@ _OF_POLICIES = (
     *((b"<policy", b"version"), (b"<enclaves", b"path"), (b"<profile", b" ns=")),
     *((b"<topics", b"ALLOW"), (b"<services", b"ALLOW"), (b"<actions", b"ALLOW")),
 )
-"""Texts that mark an XML file as a policy, or as a part of one."""
+"""Texts that mark an XML file as a policy, or as a part of a policy."""
 _EBCDIC = b"\x4c\x6f\xa7\x94"
 """The beginning of an XML file in EBCDIC (XML 1.0, appendix F)."""
 _ENCODING = re.compile(rb"encoding ?= ?[\"']([^\"']*)")
@@ -418,11 +420,11 @@ _BEGIN = 4096
 _NAMES = frozenset(kind.removesuffix("s") for kind in RIGHTS)
 _WITH_PARTS = ("policy", "enclaves", "enclave", "profiles", "profile", *RIGHTS)
 _WHOLE = re.compile(r"(?:xpointer\(/(?:\*|[\w.-]+)(?P<below>/\*)?\))?")
-"""An xpointer that selects all of a file, or all below its root element."""
+"""An xpointer that selects a whole file, or everything below its root element."""
 
 
 def may_be_policy(content: bytes) -> bool:
-    """Return whether a file may be a policy, or a part of one; its name does not matter."""
+    """Return whether a file, whatever its name, may be a policy or a part of a policy."""
     text = content.replace(b"\0", b"")  # in UTF-16, ASCII letters have a zero byte
     if text.startswith(_EBCDIC):
         return True
@@ -482,7 +484,7 @@ def used_whole(policies: Iterable[str], content: Callable[[str], bytes | None]) 
 
     Args:
         policies: the paths of the policies.
-        content: returns the content of the file at a path; None if there is none.
+        content: returns the content of the file at a path; None without a file.
     """
     used = dict.fromkeys(policies, True)
     left = list(used)
@@ -497,7 +499,7 @@ def used_whole(policies: Iterable[str], content: Callable[[str], bytes | None]) 
 
 
 def includes_files(content: bytes) -> bool:
-    """Return whether a file may include other files: whether it may be XML."""
+    """Return whether a file may be XML, and so may include other files."""
     begin = content[:_BEGIN].replace(b"\0", b"").lstrip(_BEFORE)
     return not begin or begin.startswith((b"<", _EBCDIC))
 

@@ -63,15 +63,15 @@ from sros_tool.proof.worlds import (
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS
 
 MOST_STEPS = 8_000_000
-"""Highest number of search steps for names that wildcards share: about twenty seconds."""
+"""Maximum number of search steps for names that several wildcards match: about twenty seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Use:
     """A use of a DDS topic by an enclave, which writes or reads it.
 
-    ``right`` is the right to the ROS name ``name`` to which the topic belongs; "" if it belongs to
-    none, such as a DDS topic without a ROS name.
+    ``right`` is the right to the ROS name ``name`` to which the topic belongs; "" for a DDS topic
+    without a ROS name.
     """
 
     enclave: str
@@ -86,8 +86,8 @@ class Witness:
     """The reason why a requirement does not hold: a shortest list of forbidden or missing uses.
 
     For influence, the uses are a chain: after each use that writes comes the use that reads.
-    ``others`` are the uses of each further enclave that breaks the requirement as well: the same
-    uses if it has them, else others.
+    ``others`` are uses of each further enclave that breaks the requirement: the uses of the witness
+    if this enclave has them, else different uses.
     """
 
     uses: tuple[Use, ...]
@@ -112,8 +112,8 @@ class Verdict:
     requirement that do not exist, and on names that no enclave may use.  ``always`` is a clause
     that says why the requirement cannot fail whatever rights enclaves get, or "".  ``assumed`` is a
     name whose protection is assumed because the policy does not state it, or "".  ``kept`` is a
-    demanded use that does not pass between Zenoh routers, so other enclaves do not get it; or None.
-    ``unnamed`` are names in the requirement that no right states, and only wildcards match.
+    demanded use whose messages do not pass between Zenoh routers, or None. ``unnamed`` are names in
+    the requirement that no right states, and that only wildcards match.
     """
 
     requirement: Requirement
@@ -127,7 +127,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class KeptUse:
-    """A use that does not pass between Zenoh routers to or from the enclaves ``others``."""
+    """A use whose messages do not pass between Zenoh routers to or from the enclaves ``others``."""
 
     use: Use
     others: tuple[str, ...]
@@ -136,7 +136,7 @@ class KeptUse:
 class Worlds:
     """Several worlds in which requirements are decided.
 
-    Worlds with equal access share a decision; the engine of each world confirms the witness.
+    Worlds with equal access share a decision; the engine of every world confirms the witness.
     """
 
     def __init__(self, worlds: Iterable[World]) -> None:
@@ -152,7 +152,7 @@ class Worlds:
         """Yield each world with its verdict.
 
         Raises:
-            DocumentError: there are too many wildcards to decide it.
+            DocumentError: there are too many wildcards to decide the requirement.
         """
         known: dict[World, Verdict] = {}
         for world, representative in self._first_alike.items():
@@ -167,7 +167,7 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
     """Return the decision on a requirement; decisions for one question share ``limit``.
 
     Raises:
-        DocumentError: there are too many wildcards to decide it.
+        DocumentError: there are too many wildcards to decide the requirement.
     """
     limit = limit or SearchLimit()
     match requirement:
@@ -257,12 +257,12 @@ def _parts_of(right: str) -> tuple[_Part, ...]:
 
 @lru_cache(maxsize=16)
 def _sufficient_parts(right: str) -> tuple[_Part, ...]:
-    """Return the DDS topics of a right; access to one of them is enough to do a part of it."""
+    """Return the DDS topics of a right that are enough, alone, to do a part of the right."""
     return tuple(part for part in _parts_of(right) if part.writes or right == "subscribe")
 
 
 def _topics_of_rights(rights: RightNames) -> Iterator[tuple[str, _Part, Topics]]:
-    """Yield the DDS topics of some rights, each with its right."""
+    """Yield pairs of a right and one of its DDS topics, for some rights."""
     for right, names in rights:
         for name in names:
             for part in _sufficient_parts(right):
@@ -270,7 +270,7 @@ def _topics_of_rights(rights: RightNames) -> Iterator[tuple[str, _Part, Topics]]
 
 
 def _matching_enclaves(patterns: Sequence[str], enclaves: Collection[str]) -> set[str]:
-    """Return the enclaves that match a pattern of the list, and none of its exceptions."""
+    """Return the enclaves that match a pattern of the list, and no exception in the list."""
     matching: set[str] = set()
     excepted: set[str] = set()
     for pattern in patterns:
@@ -282,7 +282,7 @@ def _matching_enclaves(patterns: Sequence[str], enclaves: Collection[str]) -> se
 def restricted_enclaves(
     requirement: Requirement, enclaves: Collection[str]
 ) -> tuple[set[str], ...]:
-    """Return the sets of enclaves that a requirement lists to restrict them; () for all others."""
+    """Return the sets of enclaves that a requirement restricts by listing them, or ()."""
     match requirement:
         case Widest(enclaves=listed) | NothingBut(enclaves=listed):
             return (_matching_enclaves(listed, enclaves),)
@@ -314,7 +314,7 @@ def _witness_against_only(
 def _uses_of_rights(
     rights: RightNames, world: World, limit: SearchLimit, excluded: Sequence[str] = ()
 ) -> Mapping[str, Sequence[Use]]:
-    """Map each enclave with one of the rights, except ``excluded``, to a use of it."""
+    """Map each enclave that has one of the rights to uses of it, without ``excluded`` enclaves."""
     left_out = _matching_enclaves(excluded, world.enclaves)
     uses: defaultdict[str, list[Use]] = defaultdict(list)
     for right, part, topics in _topics_of_rights(rights):
@@ -546,7 +546,7 @@ def _witness_against_nothing_but(
 def _witness_against_not_both(
     requirement: NotBoth, world: World, limit: SearchLimit
 ) -> Witness | None:
-    """Return a witness with an enclave that has rights of both sets: its shortest use of each."""
+    """Return a witness with an enclave that has rights of both sets: the shortest uses."""
     first, second = (
         _with_anybody(_uses_of_rights(rights, world, limit), world)
         for rights in (requirement.first, requirement.second)
@@ -599,7 +599,7 @@ def _assumed_protection(requirement: Requirement, world: World, limit: SearchLim
 
 
 def _topics_of_names(names: Iterable[tuple[str, str]]) -> Iterator[Topics]:
-    """Yield the DDS topics of names, given as pairs of kind and name, without duplicates."""
+    """Yield the DDS topics of names (pairs of kind and name), without duplicates."""
     return iter(
         dict.fromkeys(
             part.topics(name)
@@ -637,7 +637,8 @@ def _uses(hop: TopicHop) -> Iterator[Use]:
 
 
 _OF_OTHER_KIND = {"call": "request", "request": "call", "execute": "reply", "reply": "execute"}
-"""For a right to an action, the same right to a service, and the other way round."""
+"""Right → the right with the same role in the other kind: action for service, service for action.
+"""
 
 
 def _missing_enclaves_clauses(requirement: Requirement, world: World) -> Iterator[str]:
@@ -659,11 +660,11 @@ def _missing_enclaves_clauses(requirement: Requirement, world: World) -> Iterato
 def _unused_names(
     requirement: Requirement, world: World, limit: SearchLimit
 ) -> tuple[list[str], list[str]]:
-    """Return clauses on names in a requirement without users, and the names that no right states.
+    """Return clauses on unused names in a requirement, and the names that no right states.
 
-    The latter names may be used only by wildcards, or by nobody, as their requirement (`Nobody`)
-    demands.  Such a name counts as one without users if a right states another name that differs by
-    one slip, as in ``/cmd_vle``, or if the name is in use as another kind (service or action).
+    Names that no right states are used by wildcards only, or by nobody, as `Nobody` demands. Such a
+    name counts as unused if a right states another name that differs by one typing error, as in
+    ``/cmd_vle``, or if the name is in use as another kind (service or action).
     """
     clauses, unnamed = [], []
     for right, name, parts in _restricted_names(requirement):
@@ -688,7 +689,7 @@ def _unused_names(
 
 
 def _restricted_names(requirement: Requirement) -> Iterator[tuple[str, str, tuple[_Part, ...]]]:
-    """Yield each name whose use a requirement restricts: a right, the name, and parts to use it.
+    """Yield each name whose use a requirement restricts: a right, the name, and parts of the right.
 
     For `Nobody` and `Protected`, uses at the other side of a name count as well.
     """
@@ -708,7 +709,7 @@ def _restricted_names(requirement: Requirement) -> Iterator[tuple[str, str, tupl
 
 
 def _meant(name: str, stated: Iterable[frozenset[str]]) -> str:
-    """Return a clause with a stated name that differs by one slip, or ""."""
+    """Return a clause with a stated name that differs by one typing error, or ""."""
     similar = shortest(one for names in stated for one in names.intersection(_with_one_slip(name)))
     return f" (perhaps {similar} is meant)" if similar else ""
 
@@ -716,7 +717,7 @@ def _meant(name: str, stated: Iterable[frozenset[str]]) -> str:
 def _with_one_slip(name: str) -> Iterator[str]:
     """Yield the names that differ by a letter within a word: wrong, missing, or in wrong order.
 
-    Digits, and letters that are a word of their own, distinguish names on purpose (``/arm_l``,
+    Digits, and single letters between separators, distinguish names on purpose (``/arm_l``,
     ``/arm_r``).
     """
     for at in range(len(name) + 1):
@@ -738,7 +739,7 @@ _LETTERS = tuple(f"{ascii_letters}_/")
 def _why_never_fails(requirement: Requirement, world: World) -> str:
     """Return why a requirement cannot fail with the current enclaves, as a clause, or "".
 
-    That a list names all present enclaves is no reason, because enclaves may be added.
+    A list that names all present enclaves is no reason, because enclaves may be added.
     """
     count = len(world.enclaves)
     if world.open_topics:
@@ -768,7 +769,7 @@ def _named_right(right: str, name: str) -> str:
 def _is_used_by_anybody(
     world: World, right_parts: Iterable[_Part], name: str, limit: SearchLimit
 ) -> bool:
-    """Return whether some enclave may use one of the DDS topics of a name."""
+    """Return whether an enclave may use at least one DDS topic of a name."""
     for part in right_parts:
         met = world.side(part.writes).users_of_topics(part.topics(name), limit)
         if any(meeting.stated for meeting in met) or any(
@@ -812,8 +813,8 @@ def _shortest_chain(
 ) -> _Chain:
     """Return a shortest chain of hops from a source to one of ``targets``, or ().
 
-    It does not pass through the enclaves ``excluded``.  An enclave with rights in several ROS
-    domains passes on what it learns in one of them to the others.
+    The chain does not pass through the enclaves ``excluded``. An enclave with rights in several ROS
+    domains passes information on from every domain to all its domains.
     """
     worlds = (world, *world.elsewhere)
     targets = {each for each in targets if any(_may_learn(of, each, excluded) for of in worlds)}
@@ -850,9 +851,9 @@ def _shortest_chain(
 
 
 def _may_learn(world: World, enclave: str, excluded: Container[str]) -> bool:
-    """Return whether an enclave may learn something from another one that is not ``excluded``.
+    """Return whether an enclave may learn something from another enclave that is not ``excluded``.
 
-    The answer may be True wrongly; that this is asked first saves a search of the whole robot.
+    True may be wrong, but False is certain, and saves a search of the whole robot.
     """
     around = world.side(False).of.get(enclave, NameSet()).around()
     if around is None or around.automata:
@@ -882,7 +883,7 @@ def influencers(world: World, limit: SearchLimit) -> dict[str, set[str]]:
 class _Flow:
     """The hops between the enclaves of a world.
 
-    Topics that are shared only by wildcards are searched once for each pair of enclaves.
+    For each pair of enclaves, topics that only wildcards allow are searched once.
     """
 
     def __init__(self, world: World, limit: SearchLimit) -> None:
@@ -895,10 +896,10 @@ class _Flow:
         is_unused: Callable[[str], bool],
         is_new: Callable[[str], bool],
     ) -> Iterator[tuple[str, str]]:
-        """Yield pairs of a topic and a reader to which information goes from an enclave.
+        """Yield pairs of a topic and an enclave that reads the topic from ``enclave``.
 
-        Only readers for which ``is_new`` returns True are considered.  Exact topics come first,
-        without topics for which ``is_unused`` returns False; matches of wildcards follow.
+        Only readers for which ``is_new`` returns True count. Exact topics come first, except topics
+        for which ``is_unused`` returns False; matches of wildcards follow.
         """
         written, around, exact = self._world.written_by(enclave, _IGNORED)
         for topic in sorted(exact, key=_topics_before_services):

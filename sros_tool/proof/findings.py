@@ -54,7 +54,8 @@ from sros_tool.wording import first_few
 class Step:
     """A use in a witness, with the place of the right that states it, or None.
 
-    ``permissions_of`` is another enclave whose permissions allow the use; "" if none is needed.
+    ``permissions_of`` is another enclave whose permissions allow the use; "" for the enclave's own
+    permissions.
     """
 
     use: Use
@@ -79,7 +80,7 @@ class Step:
     def drawn(self) -> tuple[str, str, str, str]:
         """Return right, kind and name as a policy states them, and the wildcard that allows them.
 
-        A part of an action is shown as the right that the policy states: to the action or to the
+        A part of an action is shown as the policy states it: as a right to the action, or to the
         part.
         """
         right, name, stated = self.use.right, self.use.name, self.place and self.place.right
@@ -101,10 +102,11 @@ class Step:
 class Violation:
     """A broken requirement, the steps that show it, and the worlds in which it does not hold.
 
-    ``worlds`` is empty if it holds in no decided world.  ``missing`` is an enclave in the witness
-    that does not exist, or "".  With ``idle``, no process could start with the enclave's files,
-    whatever rights it has.  ``others`` are the steps of further enclaves that break the
-    requirement: at most five that do the same, and five that do something else.
+    ``worlds`` is empty if the requirement holds in no decided world.  ``missing`` is an enclave in
+    the witness that does not exist, or "".  With ``idle``, no process could start with the
+    enclave's files, whatever rights the enclave has. ``others`` are the steps of further enclaves
+    that break the requirement: at most five enclaves with the same uses, and five with different
+    uses.
     """
 
     requirement: Requirement
@@ -117,12 +119,12 @@ class Violation:
 
     @property
     def alike(self) -> list[str]:
-        """Further enclaves that break the requirement by the same uses."""
+        """Further enclaves that break the requirement with the same uses."""
         return [uses[0].enclave for uses in self.witness.others if _are_alike(uses, self.witness)]
 
     @property
     def differing(self) -> list[tuple[Step, ...]]:
-        """The steps of ``others`` that break the requirement by other uses."""
+        """The steps of ``others`` that break the requirement with different uses."""
         similar_enclaves = {*self.alike}
         return [steps for steps in self.others if steps[0].use.enclave not in similar_enclaves]
 
@@ -134,13 +136,13 @@ def _are_alike(uses: Sequence[Use], witness: Witness) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Decided:
-    """All decisions on requirements: which are broken, and why others cannot fail.
+    """The decisions on all requirements: broken requirements, and reasons why others cannot fail.
 
     ``assumed`` are requirements that hold only with the assumed protection of the default template,
-    each with a name whose protection the policy does not state.  ``kept`` are requirements that
-    hold, each with a use that does not pass between Zenoh routers.  ``unnamed`` are requirements
-    that hold, each with its names that no right states.  ``unjudged`` are enclaves that an export
-    lacks, and that have to have rights.
+    with a name whose protection the policy does not state.  ``kept`` are requirements that hold,
+    with a use that does not pass between Zenoh routers. ``unnamed`` are requirements that hold,
+    with their names that no right states.  ``unjudged`` are enclaves that have to have rights, but
+    that an export lacks.
     """
 
     violations: tuple[Violation, ...]
@@ -201,7 +203,7 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
 
 
 def _step(use: Use, world: World, system: System) -> Step:
-    """Return a use with the right that allows it; the right can be one of another enclave."""
+    """Return a use with the right that allows the use, which may be of another enclave."""
     holder = world.other_sufficient_enclave(use.enclave, use.writes, use.topic)
     stating = replace(use, enclave=holder) if holder else use
     return Step(use, system.places.find(stating), holder)
@@ -216,7 +218,7 @@ def _never_fails(verdicts: Sequence[Verdict]) -> Iterator[str]:
 
 
 def _in_all(lists: Iterable[Sequence[str]]) -> tuple[str, ...]:
-    """Return the texts that are in each of some lists, in the order of the first one."""
+    """Return the texts that are in all ``lists``, in the order of the first list."""
     first, *others = lists
     return tuple(text for text in first if all(text in other for other in others))
 
@@ -240,7 +242,7 @@ def requirement_findings(
 
 
 def robots_left_out(system: System, namespaces: Sequence[str]) -> list[Finding]:
-    """Return a finding if requirements in ``namespaces`` are not for all robots of the fleet.
+    """Return a finding if requirements in ``namespaces`` leave out robots of the fleet.
 
     Requirements in the namespace ``/`` may be for every robot.
     """
@@ -263,7 +265,7 @@ def remappings_unused(
     """Return a finding for each rule that changes no requirement in ``files``.
 
     Raises:
-        UsageError: ``system`` does not have the new name of such a rule, either.
+        UsageError: a name that such a rule gives is also missing in ``system``.
         SrosError: a file cannot be read.
     """
     unused = unused_remappings(files, system.fleet, namespaces, remaps) if remaps else []
@@ -285,7 +287,7 @@ def remappings_unused(
 
 
 def _with_those_above(namespace: str) -> Iterator[str]:
-    """Yield a namespace and all namespaces above it, except ``/``."""
+    """Yield a namespace and all its parent namespaces, except ``/``."""
     while namespace.strip("/"):
         yield namespace
         namespace = namespace.rpartition("/")[0]
@@ -360,7 +362,7 @@ def _violation_finding(violation: Violation) -> Finding:
 
 
 def _edit_text(violation: Violation) -> str:
-    """Return the edit of a requirement that would accept what breaks it, as a sentence, or ""."""
+    """Return a sentence on the edit that makes a requirement accept its violation, or ""."""
     requirement = violation.requirement
     match requirement:
         case Only(enclaves=listed):
@@ -387,7 +389,7 @@ def _with_title(requirement: Requirement) -> str:
 
 
 def short_text(violation: Violation) -> str:
-    """Return what breaks the requirement, such as ``/teleop may publish /cmd_vel``.
+    """Return the violation in short, such as ``/teleop may publish /cmd_vel``.
 
     The chain of an influence is left out, and further enclaves are only counted.
     """
@@ -404,7 +406,7 @@ def short_text(violation: Violation) -> str:
 
 
 def _fact(violation: Violation) -> str:
-    """Return a clause that says what breaks the requirement, without the finding's subject."""
+    """Return a clause with the violation of a requirement, without the finding's subject."""
     match violation.requirement:
         case Apart():
             return f"{_clause(violation)}: {_chain(violation.steps)}"
@@ -516,6 +518,6 @@ def _not_crossing_finding(requirement: Requirement, kept_use: KeptUse) -> Findin
 
 
 def assumption_text(name: str) -> str:
-    """Return a clause that says that the protection of a name is assumed, not stated."""
+    """Return a clause which says that the protection of a name is assumed, not stated."""
     assumed = f"sros assumes the template {DEFAULT_TEMPLATE}"
     return f"the policy does not say how {name} is protected; {assumed}"

@@ -1,10 +1,10 @@
 """Find access that HEAD grants and BASE does not, and the reverse, for all names.
 
-The rules of each vendor are compared as sets of topics.  Each reported name is confirmed by that
-vendor's decision on it.  An empty result means that no name is added.
+The rules of each vendor are compared as sets of topics.  The vendor's decision on each reported
+name confirms the result.  An empty result means that no name is added.
 
 A policy states no governance and, except for robots of a fleet, no domains; permissions state no
-governance.  The comparison assumes what a side does not state, and says so.
+governance.  If a side does not state these, the comparison assumes them, and names its assumptions.
 
 This module reads no files.
 """
@@ -108,7 +108,8 @@ class Gain:
     """The operation; ``write`` and ``read`` are for a DDS topic that no right states."""
     right: Right | None
     """The right that gives the access, or null if no right states it. If a vendor accepts the
-    permissions of another enclave for ``enclaves``, too, it is a right of that other enclave."""
+    permissions of another enclave for ``enclaves``, too, this is a right of that other enclave.
+    """
     name: str
     """Example of a ROS name with the access; empty for ``join``."""
     topic: str
@@ -135,7 +136,7 @@ class Gain:
 
 @dataclass(frozen=True, slots=True)
 class NewReach:
-    """An enclave that another enclave can influence on one side only, with a shortest path."""
+    """A pair of enclaves: the source can influence the target on one side only."""
 
     source: str
     """The enclave that influences."""
@@ -183,16 +184,18 @@ class NewNode(NamedTuple):
     moved_from: str
     """An enclave that had the node in BASE, and no longer has it; or empty."""
     rights: tuple[Right, ...]
-    """Rights of the enclave that the process did not have, those of every node last. Where a DENY
-    of BASE is gone, the name is an example."""
+    """Rights of the enclave that the process did not have.
+
+    Rights that every node needs come last. Where a DENY of BASE is gone, the name is an example.
+    """
     place: Source
     """File and line of the node in HEAD."""
 
 
 class DroppedDenial(NamedTuple):
-    """A DENY of BASE of which HEAD neither denies nor allows all names.
+    """A DENY of BASE if HEAD leaves some of its names without ALLOW or DENY.
 
-    It gives no access, but users who merge the policy with others may rely on it.
+    The missing DENY gives no access, but users who merge the policy with others may rely on it.
     """
 
     denial: Right
@@ -200,7 +203,8 @@ class DroppedDenial(NamedTuple):
     name: str
     """Example of a name that is no longer denied; empty if HEAD denies none of the names."""
     moved_from: str
-    """The enclave that denied it in BASE, if another enclave has its node in HEAD; or empty."""
+    """The enclave that denied the name in BASE, if another enclave has its node in HEAD; or empty.
+    """
 
 
 @shows(
@@ -210,7 +214,7 @@ class DroppedDenial(NamedTuple):
 )
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """Access and protection that HEAD adds and removes; true if it adds access or protects less.
+    """Access and protection that HEAD adds and removes; true if HEAD adds access or protects less.
 
     ``reach_unknown`` says why ``reach`` is not known, or is "".
     """
@@ -220,7 +224,8 @@ class Growth:
     removed: tuple[Gain, ...]
     """Access that BASE grants and HEAD does not."""
     reach: tuple[NewReach, ...]
-    """Enclaves that others can influence in HEAD, and not in BASE; at most 10,000 pairs."""
+    """Enclaves that another enclave can influence in HEAD, and not in BASE; at most 10,000 pairs.
+    """
     reach_unknown: str
     lost: tuple[SettingChange, ...]
     """The settings that protect less in HEAD."""
@@ -233,13 +238,13 @@ class Growth:
     assumed: tuple[str, ...]
     """Assumptions about a side that does not state everything, such as a policy."""
     left_out: tuple[str, ...]
-    """Parts that are not compared on purpose."""
+    """Parts that the comparison leaves out on purpose."""
     not_compared: tuple[str, ...]
     """Parts that could not be compared; if nothing is new, this is an error with exit status 2."""
     new_nodes: tuple[NewNode, ...]
-    """Nodes that HEAD assigns to an enclave of BASE, and that get more rights by it."""
+    """Nodes that HEAD assigns to an enclave of BASE, and that thereby get more rights."""
     dropped_denials: tuple[DroppedDenial, ...]
-    """Denials that HEAD drops or narrows without allowing their names; they are no new access."""
+    """Denials that HEAD drops or narrows without allowing their names; this is no new access."""
 
     @property
     def new_access(self) -> bool:
@@ -248,8 +253,10 @@ class Growth:
 
     @property
     def reach_known(self) -> bool:
-        """Whether ``reach`` is known: not if a side has only some enclaves, or there are too many
-        hops between enclaves.
+        """Whether ``reach`` is known.
+
+        It is not known if a side has only some enclaves, or if there are too many hops between
+        enclaves.
         """
         return not self.reach_unknown
 
@@ -272,8 +279,8 @@ class Growth:
     def without_renames(self, renamed: Mapping[str, str]) -> Growth:
         """Return this growth without access that only comes from the new names of enclaves.
 
-        ``renamed`` is what `renamed_between` returns.  If no other access is added, all influence
-        is that of before, under the old names.
+        ``renamed`` is the result of `renamed_between`. If no other access is added, then no
+        influence is added either.
         """
         names = {*renamed, *renamed.values()}
 
@@ -291,10 +298,10 @@ class Growth:
 
 
 def renamed_between(base: AccessSource, head: AccessSource) -> dict[str, str]:
-    """Map enclaves of BASE to enclaves of HEAD with the same rights under another name.
+    """Map enclaves of BASE to the enclaves of HEAD with the same rights under a new name.
 
-    Their permissions are the same except for the subject.  If a side has Zenoh rules, which are not
-    compared, no enclave counts as renamed.
+    Both enclaves have the same permissions except for the subject. If a side has Zenoh rules, which
+    are not compared, no enclave counts as renamed.
     """
     if base.zenoh is not None or head.zenoh is not None:
         return {}
@@ -318,7 +325,7 @@ class ComparedSide(NamedTuple):
     kind: SourceKind
     """Kind of the side, such as policy or keystore."""
     enclaves: Sequence[str] | None
-    """The enclaves of the side, if it has only some; null for all."""
+    """The enclaves of the side, if only some enclaves are compared; null for all."""
     notes: Sequence[Note]
     """Notes on the side."""
 
@@ -341,12 +348,13 @@ class NewAccess(NamedTuple):
 
 
 def compare_access(base: AccessSource, head: AccessSource) -> Growth:
-    """Return the access that ``head`` adds to ``base`` and removes from it.
+    """Return the access that ``head`` adds to ``base``, and the access that ``head`` removes.
 
     A policy counts as signed, with a governance that controls all access.  A policy as BASE stands
-    for encryption wherever it demands no other protection, so a keystore HEAD that protects less
-    has lost protection. A policy as HEAD lowers no protection of a keystore.  A policy is for the
-    domains of the other side; enclaves of a fleet's robots are for the domain of their robot.
+    for encryption of all names for which it demands no other protection, so a keystore HEAD that
+    protects less has lost protection. A policy as HEAD lowers no protection of a keystore.  A
+    policy is for the domains of the other side; enclaves of a fleet's robots are for the domain of
+    their robot.
 
     Raises:
         DocumentError: the comparison cannot be decided: there are too many wildcards, or
@@ -396,8 +404,8 @@ def _lost_protection(
 ) -> Iterator[SettingChange]:
     """Yield changes that make ``new`` protect less than ``old``, or let more names pass.
 
-    With ``rules``, rules between Zenoh routers are compared, too, unless the settings state the
-    cause: new rights would change these rules.
+    With ``rules``, rules between Zenoh routers are also compared, except where new rights caused
+    the change.
     """
     yield from less_protection(old, new, limit)
     crossing = tuple(added_crossing(old, new, limit))
@@ -602,7 +610,7 @@ def _access_on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
 def _access_by_rights(
     side: AccessSource, robots: Mapping[str, int]
 ) -> Callable[[str, int], _Access]:
-    """Return a function for the access that ROS rights give in a domain.
+    """Return a function that returns the access by ROS rights, from an enclave and a domain.
 
     ``robots`` maps enclaves of a policy to the domain of their robot, if the fleet states one.
     """
@@ -671,7 +679,7 @@ def _gains(
     scope: Collection[str] | None,
     limit: SearchLimit,
 ) -> Iterator[Gain]:
-    """Yield the access that only ``new`` gives; the same access in several worlds is joined."""
+    """Yield the access that only ``new`` gives; equal access in several worlds is merged."""
     gains: dict[tuple[object, ...], tuple[Gain, set[str], set[int]]] = {}
     for gain in _each_gain(old, new, worlds, scope, limit):
         key = gain.enclaves[0], gain.action, gain.right, gain.name or gain.topic
@@ -723,7 +731,7 @@ def _each_gain(
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """An enclave in a domain of a world, and the limit on the search for what it gains there."""
+    """An enclave in a domain of a world, and the limit on the search for its added access."""
 
     enclave: str
     world: _World
@@ -769,12 +777,12 @@ class AccessByVendors:
     ) -> Iterator[Gain]:
         """Yield the topics that an enclave may use by ``after``, but not by ``before``.
 
-        ``after`` has the permissions that fit the enclave's certificate by the rules of
-        ``vendor``, ``before`` those that fit it by the rules of another vendor.  ``names`` are the
-        names that the permissions state without wildcards.
+        ``after`` has the permissions that fit the enclave's certificate by the rules of ``vendor``,
+        ``before`` the permissions that fit the certificate by the rules of another vendor.
+        ``names`` are the names that the permissions state without wildcards.
 
         Raises:
-            DocumentError: there are too many wildcards to decide.
+            DocumentError: there are too many wildcards to decide the access.
         """
         world = _World(
             vendor.title,
@@ -802,7 +810,7 @@ class AccessByVendors:
 
 
 def _joined_access(accesses: Sequence[Access]) -> _Access:
-    """Return the access that several permissions give an enclave that can use all of them."""
+    """Return the joint access by several permissions that an enclave can use."""
     return _Access(
         {verb: NameSet.union([access.topics(verb) for access in accesses]) for verb in _VERBS},
         lambda verb, topic: any(access.decide(verb, topic).outcome.ok for access in accesses),
@@ -811,7 +819,7 @@ def _joined_access(accesses: Sequence[Access]) -> _Access:
 
 
 def _has_same_access(old: AccessSource, new: AccessSource, enclave: str, world: _World) -> bool:
-    """Return whether an enclave certainly has the same access on both sides; False may be wrong."""
+    """Return whether an enclave has the same access on both sides; False may be wrong."""
     if world.title == _ZENOH:
         return None not in (old.zenoh, new.zenoh) and old.enforcers == new.enforcers
     if old.governance != new.governance:
@@ -839,7 +847,7 @@ def _without_name(grant: Grant) -> Grant:
 
 
 class _Denials:
-    """The rights that deny an enclave to write, or to read; ``names`` is all that they deny."""
+    """The rights that deny an enclave to write, or to read; ``names`` are all denied names."""
 
     def __init__(self, rights: Sequence[Right], verb: AccessVerb, style: Style) -> None:
         pairs = [(right, text) for right in rights for text in getattr(right.topics, verb)]
@@ -854,7 +862,7 @@ class _Denials:
 
 
 class _Stated:
-    """The rights that both sides state, to find the right that gives an added access."""
+    """The rights that both sides state, in which the right that gives an added access is found."""
 
     def __init__(self, old: AccessSource, new: AccessSource) -> None:
         self._old, self._new = old, new
@@ -875,7 +883,7 @@ class _Stated:
     def gains(self, place: _Place, verb: AccessVerb, added_names: NameSet) -> Iterator[Gain]:
         """Yield the access that an enclave gains to the topics ``added_names``.
 
-        That is one `Gain` for each right of the policy that covers some of these topics, and one
+        Yields a `Gain` for each right of the policy that covers some of these topics, and a `Gain`
         for the topics that no right covers.
         """
         enclave, world = place.enclave, place.world
@@ -925,7 +933,7 @@ class _Stated:
     def _example(
         self, names: NameSet, verb: AccessVerb, expression: str, place: _Place
     ) -> str | None:
-        """Return an example name; if possible, the same as in another world, or a stated name."""
+        """Return an example name; preferably the example of another world, or a stated name."""
         longest, known = place.world.longest, self._examples[place.enclave, verb, expression]
         example = _example(names, expression, place.world, place.limit)
         if example is None:
@@ -938,9 +946,10 @@ class _Stated:
         return example
 
     def _likely_topics(self, expression: str) -> Iterator[str]:
-        """Yield some exact topics of the new rights that begin as the expression does.
+        """Yield some exact topics of the new rights that begin with the fixed part of an
+        expression.
 
-        Topics of the services that every node has come last.
+        Topics of services that belong to every node come last.
         """
         prefix = literal_prefix(expression)
         if prefix != expression:
@@ -975,10 +984,10 @@ class _Stated:
 
 
 _MOST_NEAR = 100
-"""Largest number of stated topics that are tried as an example."""
+"""Maximum number of stated topics that are tried as an example."""
 
 _Sources = dict[str, dict[Right, Source]]
-"""Cache: for each enclave, the file and line that states each right."""
+"""Cache that maps enclaves and rights to the file and line that states the right."""
 
 
 def _source(known: _Sources, side: AccessSource, right: Right | None) -> Source | None:
@@ -990,7 +999,7 @@ def _source(known: _Sources, side: AccessSource, right: Right | None) -> Source 
 
 
 def _example(names: NameSet, expression: str, world: _World, limit: SearchLimit) -> str | None:
-    """Return a topic of a set that an expression covers, if possible one with a ROS name."""
+    """Return a topic of a set that an expression covers, preferably a topic with a ROS name."""
     if not is_expression(expression):
         return expression if expression in names else None
     example = names.example(limit, longest=world.longest)
@@ -1003,7 +1012,7 @@ def _example(names: NameSet, expression: str, world: _World, limit: SearchLimit)
 
 
 _Edges = Mapping[str, Mapping[str, Callable[[], Hop]]]
-"""Maps pairs of enclaves (source, target) to a function that returns a hop between them."""
+"""Source enclave → target enclave → function that returns a hop between both."""
 _MOST_REACH = 10_000
 _MOST_HOPS = 200_000
 
@@ -1011,7 +1020,7 @@ _MOST_HOPS = 200_000
 def _new_reach(before: _Edges | None, after: _Edges | None) -> Iterator[NewReach]:
     """Yield pairs of enclaves of which the first influences the second only in ``after``.
 
-    Yields nothing if one side is not known (None).
+    Yields nothing if ``before`` or ``after`` is not known (None).
     """
     if before is None or after is None:
         return
@@ -1036,7 +1045,7 @@ def _new_reach(before: _Edges | None, after: _Edges | None) -> Iterator[NewReach
 
 
 def _fitting_pairs(side: AccessSource, worlds: Iterable[_World]) -> Iterator[tuple[str, str]]:
-    """Yield pairs of an enclave and another whose permissions it can also use in a world."""
+    """Yield pairs of an enclave and another enclave whose permissions it can use in a world."""
     worlds = tuple(worlds)
     for enclave in side.permissions:
         fitting_others = (
@@ -1048,8 +1057,8 @@ def _fitting_pairs(side: AccessSource, worlds: Iterable[_World]) -> Iterator[tup
 def _edges(side: AccessSource, fitting_pairs: Iterable[tuple[str, str]]) -> _Edges | None:
     """Return all hops between enclaves, or None if there are too many to follow.
 
-    An enclave that uses the permissions of another one counts as a further enclave, to which its
-    own denials do not apply.
+    An enclave with the permissions of another enclave counts as a further enclave, without the
+    denials in its own permissions.
     """
     rights = side.zenoh if side.kind == "zenoh" and side.zenoh is not None else side.rights
     names_by_holder: dict[str, list[str]] = defaultdict(list)
@@ -1105,7 +1114,7 @@ def _hop_of(hop: Callable[[], Hop], source: str, target: str) -> Hop:
 
 
 def _reached(neighbors: Mapping[str, Iterable[str]], start: str) -> dict[str, str]:
-    """Map the enclaves that can be reached from ``start`` to the enclave before each of them."""
+    """Map the enclaves that can be reached from ``start`` to their predecessors on the way."""
     reached: dict[str, str] = {}
     row = [start]
     for enclave_here in row:
@@ -1122,8 +1131,8 @@ def _reached(neighbors: Mapping[str, Iterable[str]], start: str) -> dict[str, st
 def _new_nodes(before: AccessSource, after: AccessSource, limit: SearchLimit) -> Iterator[NewNode]:
     """Yield the nodes that policies assign to another enclave, which has more rights.
 
-    A node that is alone in its enclave may have another name than before, and a node whose name a
-    wildcard of the enclave matched is not new.
+    The only node of an enclave may be renamed; and a node whose name a wildcard of the enclave
+    matched is not new.
     """
     old_nodes, new_nodes = _enclaves_of_nodes(before, after), _enclaves_of_nodes(after, before)
     assigned = []
@@ -1151,9 +1160,9 @@ def _new_nodes(before: AccessSource, after: AccessSource, limit: SearchLimit) ->
 def _gained_rights(
     had: Sequence[Collection[Right]], rights: Collection[Right], limit: SearchLimit
 ) -> tuple[Right, ...]:
-    """Return what ``rights`` of an enclave allow and ``had`` do not allow; see `NewNode.rights`.
+    """Return the ``rights`` of an enclave that ``had`` does not include; see `NewNode.rights`.
 
-    ``had`` has the rights of several enclaves. Rights that every node has, such as to its own
+    ``had`` has the rights of several enclaves. Rights that every node needs, such as to its own
     services, come last.
     """
     known, now = [_allowed_names(enclave) for enclave in had], _allowed_names(rights)
@@ -1185,7 +1194,7 @@ _ROS_NAMES = valid_topics("", "")
 
 
 def _allowed_names(rights: Iterable[Right]) -> dict[str, NameSet]:
-    """Map each right, such as publish, to the names that rights allow and do not deny."""
+    """Map each kind of right, such as publish, to the names that ``rights`` allow in the end."""
     names: dict[tuple[str, Qualifier], list[str]] = defaultdict(list)
     for _, qualifier, right, name in split_actions(rights):
         names[right, qualifier].append(name)
@@ -1204,7 +1213,7 @@ def _allowed_names(rights: Iterable[Right]) -> dict[str, NameSet]:
 
 
 def _dropped_denials(before: AccessSource, after: AccessSource) -> Iterator[DroppedDenial]:
-    """Yield denials that ``after`` drops or narrows, and denials that a node left behind."""
+    """Yield denials that ``after`` drops or narrows, and denials that a moved node left behind."""
     denials = {right for right in split_actions(before.rights) if right.qualifier is DENY}
     if not denials:
         return
@@ -1232,9 +1241,10 @@ _EnclavesByRobot = dict[str, dict[str, Profile]]
 
 
 def _enclaves_of_nodes(side: AccessSource, other: AccessSource) -> dict[_Node, _EnclavesByRobot]:
-    """Map namespace and name of each node in policies to its enclaves, with its profiles there.
+    """Map namespace and name of each node in policies to its enclaves, with the node's profile.
 
-    The enclaves are divided by their robots ("": no robot), which may have nodes of the same name.
+    The enclaves are grouped by robot ("": no robot), because robots may have nodes of the same
+    name.
     """
     fleet = side.fleet or other.fleet
     nodes: dict[_Node, _EnclavesByRobot] = {}
@@ -1272,10 +1282,10 @@ def undenied_name(denied: Right, stated: Rules) -> str | None:
 
 
 def _completed(side: AccessSource, other: AccessSource) -> AccessSource:
-    """Return a side in which domains and access control that it leaves open are filled in.
+    """Return a side with defaults for domains and access control that the side does not state.
 
     Enclaves of robots are for the domain of their robot.  A side without a governance gets access
-    control of everything, in its own domains and those of the other side.
+    control of everything, in the domains of both sides.
     """
     domains = _domains_of_robots(side, other)
     permissions = _certified_as(side, other)
@@ -1302,8 +1312,8 @@ def _completed(side: AccessSource, other: AccessSource) -> AccessSource:
 def _certified_as(side: AccessSource, other: AccessSource) -> Mapping[str, Permissions]:
     """Return the permissions of a side; a policy gets the certificate subjects of the other side.
 
-    If the other side is a keystore with unique subjects, enclaves that only the policy has get a
-    unique subject, too.
+    If the other side is a keystore with unique subjects, enclaves that are only in the policy also
+    get a unique subject.
     """
     if side.kind != "policy" or other.kind == "policy":
         return side.permissions
@@ -1391,7 +1401,7 @@ def _with_access_control(
 
 
 def _assumptions(base: AccessSource, head: AccessSource) -> Iterator[str]:
-    """Yield, as clauses, what is assumed about a side that does not state everything."""
+    """Yield clauses on assumptions about a side that does not state everything."""
     if "zenoh" not in (base.kind, head.kind):
         if base.governance is None and head.governance is None:
             yield "both are signed with the same governance, which controls all access"
@@ -1417,7 +1427,7 @@ def _assumptions(base: AccessSource, head: AccessSource) -> Iterator[str]:
 
 
 def _left_out_texts(base: AccessSource, head: AccessSource) -> Iterator[str]:
-    """Yield the parts that are not compared on purpose, in words."""
+    """Yield clauses on the parts that are left out of the comparison on purpose."""
     yield "dates"
     sides = (("BASE", base), ("HEAD", head))
     if "zenoh" in (base.kind, head.kind):

@@ -1,11 +1,11 @@
-"""Find what is protected less on one side of a comparison: messages, trust, routers.
+"""Find weaker protection on one side of a comparison: of messages, of trust, at routers.
 
 A side without a governance, such as a policy, stands for a strict governance, so a keystore with a
 looser governance protects less.  A policy never lowers the protection of a keystore.
 
-Two enclaves at the same Zenoh router exchange all that their rights allow.  At two routers they
-exchange only names that both routers let pass.  So more names pass if ``crossing`` gets wider, if
-a router is removed, or if an enclave moves to the router of another one.
+Two enclaves at the same Zenoh router exchange all that their rights allow.  Enclaves at two routers
+exchange only names that both routers let pass. So more names pass if ``crossing`` gets wider, if a
+router is removed, or if an enclave moves to the router of another enclave.
 
 This module reads no files.
 """
@@ -41,7 +41,7 @@ from sros_tool.zenoh.configuration import ZenohNetwork
 
 @lru_cache(maxsize=1)
 def strict_protection() -> DomainProtection:
-    """Return the protection of a side without a governance: that of the template production.
+    """Return the protection for a side without governance: the one of the template production.
 
     Whole RTPS messages only have to be signed, as in the template development, because their
     content is encrypted separately.
@@ -54,7 +54,7 @@ def _demanded_governance(
 ) -> Governance:
     """Return the weakest governance that a policy allows: strict, except where it states a level.
 
-    If it states both levels for a name, the stronger level counts.
+    If a policy states both levels for a name, the stronger level counts.
     """
     (rule,) = governance_for(strict_protection(), domains).domain_access_rules
     (rule_for_all,) = rule.topic_access_rules
@@ -101,7 +101,7 @@ def _payload_governance(governance: Governance) -> Governance:
 
 
 def contradiction(side: AccessSource) -> str:
-    """Return, as a clause, two statements of policies that demand different protection; else ""."""
+    """Return a clause with two policy lines that demand different protection of a name, or ""."""
     for protection, other in contradictions(side.protections or ()):
         places = (
             side.shown_source(stated_protection.source) for stated_protection in (other, protection)
@@ -185,7 +185,7 @@ def _looser_later(
 
 
 def _certified_otherwise(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
-    """Yield enclaves whose certificate names another enclave, or has the key of another."""
+    """Yield enclaves whose certificate has the name, or the key, of another enclave."""
     names = {enclave.key: enclave.name for enclave in old.certified.values()}
     for enclave, new_one in new.certified.items():
         before = names.get(new_one.key, enclave)
@@ -270,7 +270,7 @@ def _looser_topics(
 
 
 def _topics_by_protection(rule: DomainRule, style: Style) -> list[tuple[TopicRule, NameSet]]:
-    """Return pairs of a protection (a topic rule without expression) and all its topics."""
+    """Return pairs of a protection (a topic rule without expression) and all topics with it."""
     rules = [
         (names_of(style, (topic_rule.topic_expression,)), replace(topic_rule, topic_expression="*"))
         for topic_rule in rule.topic_access_rules
@@ -284,7 +284,7 @@ def _topics_by_protection(rule: DomainRule, style: Style) -> list[tuple[TopicRul
 def _dropped_statements(
     old: Iterable[StatedProtection], new: Iterable[StatedProtection], limit: SearchLimit
 ) -> Iterator[SettingChange]:
-    """Yield names for which ``new`` demands less protection than ``old``, or none."""
+    """Yield names for which ``new`` demands less protection than ``old``, or no protection."""
     later = tuple(new)
     for protection in old:
         enough = [
@@ -327,13 +327,13 @@ _ALL = names_of_expression("*")
 
 
 def limits_crossing(side: AccessSource) -> bool:
-    """Return whether settings or fleet of a side limit what passes between Zenoh routers."""
+    """Return whether settings or fleet of a side limit the names that pass between routers."""
     network = _network(side, side)
     return network is not None and _routers_limit_names(network)
 
 
 def states_routers(side: AccessSource) -> bool:
-    """Return whether a side's settings or fleet state the routers, and what may pass them."""
+    """Return whether settings or fleet of a side state the routers, and names that pass them."""
     return _network(side, side) is not None
 
 
@@ -342,7 +342,7 @@ def added_crossing(
 ) -> Iterator[SettingChange]:
     """Yield the changes of settings and fleet file that let more names pass between Zenoh routers.
 
-    More names pass in ``new`` than in ``old``.
+    The changes are from ``old`` to ``new``.
     """
     before, after = _network(old, new), _network(new, old)
     if before is None or not _routers_limit_names(before):
@@ -368,7 +368,7 @@ def added_crossing(
 def _moved_enclaves(
     before: ZenohNetwork, after: ZenohNetwork, enclaves: set[str], limit: SearchLimit
 ) -> Iterator[SettingChange]:
-    """Yield moves of enclaves to another router that lets more of their names pass."""
+    """Yield moves of enclaves to other routers that let more names of these enclaves pass."""
     places: dict[tuple[str, str], str] = {}
     for enclave in sorted(enclaves):
         places.setdefault((_router(before, enclave), _router(after, enclave)), enclave)
@@ -397,8 +397,7 @@ def looser_router_rules(
 ) -> Iterator[SettingChange]:
     """Yield changes of routers' rules that allow other routers more than in ``old``.
 
-    A removed router counts only if the settings do not say to which routers its enclaves connect
-    now.
+    A removed router counts only if the settings do not state the new routers of its enclaves.
     """
     if new.routers and not (states_routers(old) and states_routers(new)):
         for router in sorted({*old.passing} - {*new.routers}):
@@ -468,10 +467,10 @@ def _routers_limit_names(network: ZenohNetwork) -> bool:
 
 
 def _network(side: AccessSource, other: AccessSource) -> ZenohNetwork | None:
-    """Return the Zenoh network of a side, or None if neither side says anything about routers.
+    """Return the Zenoh network of a side, or None if neither side states routers.
 
-    The network is from the settings of the side, else from its fleet and the settings of the other
-    side.
+    The source of the network is the settings of the side, or else the fleet of the side together
+    with the settings of the other side.
     """
     if side.later is not None:
         return side.later.zenoh

@@ -1,6 +1,6 @@
 """Read objects and references of a git repository that need not be trusted.
 
-Git only reads objects here, and the hash of each object is verified. So the returned content of a
+Git only reads objects, and sros verifies the hash of each object. So the returned content of a
 commit is right, whatever replacements, grafts, alternates, attributes or settings the repository
 has.  No program that the repository configures is run (hooks, filters, textconv, fsmonitor,
 transports), only `Repository.fetch_missing` fetches anything, and no file of the work tree is read.
@@ -54,7 +54,7 @@ _ELSEWHERE = (
     *("GIT_GRAFT_FILE", "GIT_INDEX_FILE", "GIT_NAMESPACE", "GIT_OBJECT_DIRECTORY", "GIT_PREFIX"),
     *("GIT_REPLACE_REF_BASE", "GIT_SHALLOW_FILE", "GIT_WORK_TREE"),
 )
-"""Environment variables that make git read another repository than that of the folder."""
+"""Environment variables that make git read another repository than the given folder."""
 _OF_SETTINGS = ("HOME", "XDG_CONFIG_HOME", "GIT_CONFIG_GLOBAL", "GIT_CONFIG_SYSTEM")
 """Environment variables that tell git where it finds settings outside of the repository."""
 _NO_BASE = "none"
@@ -91,7 +91,7 @@ class Repository:
     # ── references ─────────────────────────────────────────────────────────────────────────
 
     def exact_commit(self, name: str, option: str = "") -> str:
-        """Return the full id of the commit with this full id or full reference (refs/…).
+        """Return the full id of the commit that a full id or a full reference (refs/…) names.
 
         Shorter names are refused: git looks them up in several places, and whoever may push a tag
         can create one that git finds first.  ``option`` is the option of sros that has the name.
@@ -246,9 +246,9 @@ class Repository:
     def base_commit(self, name: str, remote: str | None) -> str:
         """Return the full id of the base commit to compare with, or "" for the name ``none``.
 
-        The name has a form of `exact_commit`; it can also be such a name of a merge commit with
-        ``^1`` behind it, for its first parent.  With a ``remote``, a missing commit is fetched from
-        there.
+        The name has a form that `exact_commit` accepts. With ``^1`` behind such a name of a merge
+        commit, the base is the first parent. With a ``remote``, a missing commit is fetched from
+        the remote.
         """
         if name == _NO_BASE:
             return ""
@@ -265,7 +265,7 @@ class Repository:
         return self.commit(name) if name == "HEAD" else self.exact_commit(name, "--head")
 
     def merged_into(self, merge: str) -> str:
-        """Return the id of a merge commit's first parent, on the branch that was merged into.
+        """Return the id of a merge commit's first parent: the target branch before the merge.
 
         Raises:
             UsageError: ``merge`` is not a full id.
@@ -313,10 +313,10 @@ class Repository:
         return {words[0]: (words[1], int(words[2])) for words in fields if len(words) == 3}
 
     def find(self, commit: str, path: str) -> TreeEntry | None:
-        """Return the entry at a path of a commit ("" is the root), or None if there is none.
+        """Return the entry at a path of a commit ("" is the root), or None for a missing path.
 
         Raises:
-            DocumentError: a part of the path before its end is not a folder, such as a link.
+            DocumentError: a parent in the path is not a folder, but for instance a link.
         """
         entry = _top(self, commit)
         gone: list[str] = []
@@ -418,12 +418,12 @@ class Repository:
     def fetch_missing(self, digits: str, remote: str) -> None:
         """Fetch a missing commit from a remote, without its history.
 
-        The git settings of the clone, the user and the machine apply, because they have the
-        credentials.
+        The git settings of the clone, the user and the machine apply, because a fetch may need
+        credentials from these settings.
 
         Raises:
-            UsageError: ``digits`` is not a full id, ``remote`` is not one of the repository, or
-                git would read settings in the work tree.
+            UsageError: ``digits`` is not a full id, ``remote`` is not a remote of the repository,
+                or git would read settings in the work tree.
             DocumentError: the commit cannot be fetched.
         """
         if not _HASH.match(digits):
@@ -443,9 +443,10 @@ class Repository:
         self._git(["fetch", *options], environment=_FETCHING, wait=_WAIT_FOR_SERVER)
 
     def _refuse_settings_inside(self) -> None:
-        """Refuse to go on if git would read settings from the work tree.
+        """Raise if git would read settings from the work tree.
 
-        Anybody may have written the files there, and a fetch runs programs that settings name.
+        Anybody may have written files in the work tree, and a fetch runs programs that settings
+        name.
 
         Raises:
             UsageError: an environment variable names such a file or folder.
@@ -566,8 +567,8 @@ def walk(
 ) -> Iterator[tuple[str, TreeEntry]]:
     """Yield path and entry of all files, links and submodules below a folder, level by level.
 
-    With ``other``, the id of another folder, entries are left out that this folder has at the same
-    path with the same content.
+    With ``other``, the id of another folder, entries are left out that both folders have at the
+    same path with the same content.
 
     Raises:
         DocumentError: there are more than ``maximum`` entries (a few objects can stand for
@@ -638,10 +639,9 @@ def _digest(kind: str, content: bytes, digits: int) -> str:
 
 
 def _header(content: bytes, key: bytes) -> str:
-    """Return the object id that stands behind ``key`` in the first line of a commit or tag.
+    """Return the object id that follows ``key`` in the first line of a commit or tag.
 
-    Raises:
-        DocumentError: the object is malformed.
+    Raises: DocumentError: the object is malformed.
     """
     first, _, digits = content.partition(b"\n")[0].partition(b" ")
     object_hash = digits.decode(errors="replace")

@@ -10,8 +10,8 @@ A requirement is a table of the file, such as::
 Names are ROS names, with the wildcards of policies; enclaves are names or patterns, as for
 ``--match``, and ``!`` before a name excepts an enclave from a list.  A file can be read for a
 namespace: then all enclaves, and the names without ``/`` or ``*`` at their beginning, are below it.
-It can also be read with remappings of names, such as those with which nodes are started.
-The class of each kind says what such a requirement demands.
+A file can also be read with remappings of names, such as the remappings of a node's command line.
+The docstrings of the classes state the demands of the kinds.
 
 Names and enclaves can have the placeholders of policies, which a fleet fills in.  A table with
 ``{robot}`` or ``{namespace}`` stands for a requirement for each robot; ``{robots}`` and
@@ -19,7 +19,7 @@ Names and enclaves can have the placeholders of policies, which a fleet fills in
 
 Whoever changes a policy can also change its requirements.  A requirement counts as kept if
 requirements of the new file together demand at least as much, whatever their names and order: in
-the namespace ``/``, and also in every other one, for a file that is read for no namespace.
+the namespace ``/``, and also in every other namespace, for a file that is read for no namespace.
 """
 
 from __future__ import annotations
@@ -82,11 +82,11 @@ class RobotNames(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Requirement:
-    """Base class of requirements: place of its table in the file, its name and reason (or "").
+    """Base class of requirements, with the place of the table in the file, name and reason (or "").
 
-    ``robot`` is the robot whose values its placeholders have, or "".  ``as_written`` says whether
-    its names are those in the file, and not of a robot or namespace; ``is_relative`` says whether
-    one of the names moves with the namespace.  ``elsewhere`` is the requirement in any other
+    ``robot`` is the robot whose values replaced the placeholders, or "". ``as_written`` says
+    whether the names are as in the file, and not changed for a robot or namespace; ``is_relative``
+    says whether a name moves with the namespace.  ``elsewhere`` is the requirement in any other
     namespace; None if the file was read for a namespace.
     """
 
@@ -102,7 +102,7 @@ class Requirement:
     elsewhere: Requirement | None = field(default=None, compare=False, repr=False)
 
     def __str__(self) -> str:
-        """Return the requirement's own name, or the sentence with its demand."""
+        """Return the requirement's own name, or else its demand as a sentence."""
         return self.name or demand(self)
 
 
@@ -297,8 +297,8 @@ def read_requirements(
 ) -> tuple[Requirement, ...]:
     """Return the requirements in a TOML file, in their order, for the robots of a fleet.
 
-    With ``namespaces``, each requirement is returned once for each namespace; else for ``/``.  Its
-    names are remapped there by ``remaps``, of `parse_remapping_of_names`.
+    With ``namespaces``, each requirement is returned once for each namespace; else for ``/``. In
+    every namespace, names are remapped by ``remaps`` (from `parse_remapping_of_names`).
 
     Raises:
         DocumentError: the file cannot be read, or a part of it is not valid; the error has file and
@@ -315,7 +315,7 @@ def read_all_requirements(
     namespaces: Sequence[str] = (),
     remaps: Sequence[Remapping] = (),
 ) -> tuple[Requirement, ...]:
-    """Return the requirements in several TOML files, as `read_requirements` does for one.
+    """Return the requirements in several TOML files; see `read_requirements`.
 
     Raises:
         SrosError: as `read_requirements`.
@@ -355,10 +355,10 @@ def parse_requirements(
 ) -> tuple[Requirement, ...]:
     """Return the requirements in a TOML document, for each of the ``namespaces``, remapped.
 
-    ``file`` is its name in errors and sources.
+    ``file`` is the name of the document in errors and sources.
 
     Raises:
-        DocumentError: a part of it is not valid.
+        DocumentError: a part of the document is not valid.
     """
     unfilled_tables = _stated_tables(data, file)
     filled = (
@@ -432,7 +432,7 @@ def _stated_tables(data: bytes, file: str) -> list[_Table]:
 
 
 def _pairs(requirement: Requirement) -> int:
-    """Return how many pairs of names have to be compared for a requirement with two lists."""
+    """Return the number of pairs of names to compare for a requirement with two lists."""
     match requirement:
         case NotBoth(first=first, second=second):
             first_count, second_count = (
@@ -569,7 +569,7 @@ class _Table:
         return tuple(map(self.enclave_below, enclaves))
 
     def enclave_below(self, enclave: str) -> str:
-        """Return an enclave or pattern below the namespace; one for all enclaves stays."""
+        """Return an enclave or pattern below the namespace; a pattern for all enclaves stays."""
         begin = EXCEPT if enclave.startswith(EXCEPT) else ""
         name = enclave.removeprefix(begin)
         return begin + below_namespace(name, self.namespace) if name.startswith("/") else enclave
@@ -617,7 +617,7 @@ class _Table:
 
 
 def _filled_tables(table: _Table, fleet: FleetSource) -> Iterator[_Table]:
-    """Yield a table with its placeholders filled in, for each robot if they stand for one robot.
+    """Yield a table with its placeholders filled in; singular placeholders make a table per robot.
 
     Raises:
         DocumentError: there is no fleet, or a placeholder is not valid or has no value.
@@ -653,7 +653,7 @@ def _filled_tables(table: _Table, fleet: FleetSource) -> Iterator[_Table]:
 
 
 def _placeholders(table: _Table) -> dict[Placeholder, str]:
-    """Map the placeholders in the names of a table to a key that has them."""
+    """Map the placeholders in the names of a table to a key whose value has the placeholder."""
     used: dict[Placeholder, str] = {}
     for key, value in table.values.items():
         for name in filter(has_placeholder, () if key in _WORDS else _names_in(value)):
@@ -739,7 +739,7 @@ def _filled_names(
 def _plural_names(
     table: _Table, members: Mapping[str, Sequence[Robot]], robot: Robot
 ) -> Iterator[RobotNames]:
-    """Yield the names that each name with a plural placeholder in a table stands for."""
+    """Yield the names for which each name with a plural placeholder in a table stands."""
     values = [value for key, value in table.values.items() if key not in _WORDS]
     for name in filter(has_placeholder, _names_in(values)):
         if name.startswith(EXCEPT):
@@ -757,7 +757,7 @@ def _plural_names(
 def _filled_words(text: object, used_placeholders: Iterable[Placeholder], robot: Robot) -> object:
     """Return the name or reason of a requirement with the values of a robot.
 
-    ``used_placeholders`` are the placeholders in the names of the requirement; they tell the group
+    ``used_placeholders`` are the placeholders in the names of the requirement, which show the group
     of the robot.
     """
     if not isinstance(text, str):
@@ -875,9 +875,9 @@ KINDS = tuple(_READERS)
 class DroppedRequirement:
     """A requirement of the earlier file that the new file drops or weakens.
 
-    ``requirement`` has its place in the earlier file; ``kept`` are requirements of the new file
-    about some of the same names or enclaves.  ``only_elsewhere``: the new file demands the same,
-    but not in every other namespace.
+    ``requirement`` is the requirement of the earlier file; ``kept`` are requirements of the new
+    file about some of the same names or enclaves.  ``only_elsewhere`` says that the new file
+    demands the same, but not in every other namespace.
     """
 
     requirement: Requirement
@@ -920,7 +920,7 @@ class DroppedRequirement:
         return tuple(demand(requirement) for requirement in self.kept)
 
     def text(self) -> str:
-        """Return a clause with the part of the requirement that the new file still demands."""
+        """Return a clause on the part of the requirement that the new file still demands."""
         if self.only_elsewhere:
             return (
                 "the new file demands less in another namespace (`sros check --namespace`): a name "
@@ -1047,7 +1047,7 @@ def _parts(requirement: Requirement) -> Iterator[Requirement]:
 
 
 def _single_enclaves(enclaves: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """Yield lists with one enclave or pattern of a list, each with all its exceptions."""
+    """Yield lists with a single enclave or pattern of a list, together with all exceptions."""
     excepted = tuple(enclave for enclave in enclaves if enclave.startswith(EXCEPT))
     yield from ((enclave, *excepted) for enclave in enclaves if not enclave.startswith(EXCEPT))
 
@@ -1060,7 +1060,7 @@ def _single_rights(
 
 
 def _only_demand(part: Requirement) -> Requirement:
-    """Return a requirement without its place, name and reason, to compare demands."""
+    """Return a requirement without place, name and reason, so that demands can be compared."""
     return replace(part, source=_NOWHERE, name="", why="", robot="")
 
 

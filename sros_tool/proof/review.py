@@ -120,10 +120,10 @@ _MOST_BYTES = 1024 * 1024 * 1024
 _MOST_OUTSIDE = 32 * 1024 * 1024
 """Size in bytes of the largest changed file that is searched for a policy.
 
-No policy is larger.
+No policy is larger than that.
 """
 _PACKED = (b"\x1f\x8b", b"PK\x03\x04", b"\xfd7zXZ", b"BZh", b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf")
-"""How files of gzip, ZIP, xz, bzip2, Zstandard and 7z begin."""
+"""First bytes of files of gzip, ZIP, xz, bzip2, Zstandard and 7z."""
 _MOST_NAMESPACES = 20
 _LONGEST = 200  # characters that are shown of a link's target
 _NOT_USED = (
@@ -136,7 +136,7 @@ _PRIVATE_KEY = re.compile(rb"-----BEGIN (?:[A-Z0-9]+ )*PRIVATE KEY-----(?:\s|\\[
 _OF_POLICIES = tuple(
     kind.id for kind in (STALE, LESS_PROTECTED, NOT_IN_POLICY, NOT_IN_KEYSTORE, NOT_IN_EXPORT)
 )
-"""The findings on a keystore that is not signed for the policies."""
+"""Ids of findings which say that a keystore is not signed for the policies."""
 _OF_TEMPLATES = ("authorities", "certificates", "permissions", "protection")
 _SETTINGS = re.compile(
     rf"^[ \t]*\[+(?:{'|'.join((*_OF_TEMPLATES, *KINDS))})\b".encode(), re.MULTILINE
@@ -157,10 +157,10 @@ class ReviewRequest:
     ``head`` is the commit to review, ``base`` the commit to compare with ("": none). With
     ``namespaces`` and ``remaps``, the requirements are read for these namespaces and names; with
     ``allow_new_access``, new access and unreviewed policies are shown but do not make the review
-    fail; with ``allow_dropped_requirements``, neither do requirements that HEAD drops or weakens.
-    The review fails if an enclave expires within ``renew_within``.  ``left_out`` are files and
-    folders of policies that are not reviewed.  ``template`` is the keystore template, a path or the
-    name of one that ships with sros, whose protection the policies get ("": none is named).
+    fail; with ``allow_dropped_requirements``, the same applies to requirements that HEAD drops or
+    weakens. The review fails if an enclave expires within ``renew_within``.  ``left_out`` are files
+    and folders of policies that are not reviewed.  ``template`` is the keystore template whose
+    protection the policies get: a path, the name of a shipped template, or "".
     """
 
     repository: Repository
@@ -193,7 +193,7 @@ class AccessChange:
 
 @dataclass(frozen=True, slots=True)
 class RightsChange:
-    """How the rights of all reviewed policies in HEAD differ from those in BASE.
+    """The differences between the rights of all reviewed policies in HEAD and in BASE.
 
     ``absolute`` and ``relative`` are rights that are new only for users who put the node into
     another namespace: absolute names that do not move with the node, and relative names that do.
@@ -210,7 +210,7 @@ class RightsChange:
 class DroppedRequirements:
     """Findings on requirements of BASE that HEAD drops or weakens, and their number.
 
-    Each such requirement has one finding, and another one if HEAD breaks the requirement.
+    Each such requirement has a finding, and a second finding if HEAD breaks the requirement.
     """
 
     count: int
@@ -219,14 +219,14 @@ class DroppedRequirements:
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """Facts as lines of text: pairs of a sentence and a name; ``named`` are no reason to fail."""
+    """Facts as lines of text: pairs of a sentence and a name; ``named`` facts fail no step."""
 
     failing: tuple[tuple[str, str], ...]
     named: tuple[tuple[str, str], ...] = ()
 
     @property
     def lines(self) -> tuple[tuple[str, str], ...]:
-        """The failing facts, and then the facts that are only named."""
+        """The failing facts, followed by the facts that are only named."""
         return self.failing + self.named
 
 
@@ -247,9 +247,10 @@ class ReviewStep:
 
     ``kind`` is "files", "policy", "requirements", "requirements-before", "new-access", "rights",
     "keystore", "signed" (whether the keystore is signed for the reviewed policies) or "expiry".
-    ``subject`` is the path that the step is about.  If the result is an error, it says why the step
-    could not be decided.  ``allowed``: the step found something that the request or its kind
-    allows, so that its status is 0.  ``fleet`` are the robots of the examined policy or keystore.
+    ``subject`` is the path that the step is about.  An error as result is the reason why the step
+    could not be decided. ``allowed`` says that the step found something that the request or the
+    step's kind allows, so that the status is 0. ``fleet`` are the robots of the examined policy or
+    keystore.
     """
 
     kind: str
@@ -324,10 +325,10 @@ class StepResult(NamedTuple):
     """Exit status of the step: 0, 1 or 2, as for the review."""
     allowed: bool
     """Whether the step found something that is allowed, by an option or always (``signed``,
-    ``rights``, and private keys that were there before); its status is 0 then.
+    ``rights``, and private keys that were there before); the status is then 0.
     """
     result: str
-    """The result as a sentence, or why the step could not be decided."""
+    """The result as a sentence, or the reason why the step could not be decided."""
     lines: Sequence[str]
     """New access, dropped requirements, changed rights, or findings."""
 
@@ -353,7 +354,7 @@ def review(request: ReviewRequest, folder: Path) -> Review:
     """Return the review of a change; files of both commits are written below ``folder``.
 
     Args:
-        request: what is reviewed.
+        request: the commits and paths to review.
         folder: a new folder, outside of the repository, that nobody else can open.
 
     Raises:
@@ -384,14 +385,14 @@ class _Review:
     head: CommitFiles
     base: CommitFiles | None
     robots: dict[str, Fleet | None] = field(default_factory=dict)
-    """Map the subject of a step to the fleet of the policy or keystore that it examines."""
+    """The fleet of the policy or keystore that a step examines, by subject of the step."""
     is_relative: bool = False
     """Whether a requirement has a name that moves with the namespace."""
     is_compared_elsewhere: bool = True
     """Whether the review decided which requirements the change breaks in another namespace."""
 
     def _allows(self, kind: str) -> bool:
-        """Return whether the request, or the kind itself, allows what steps of a kind find."""
+        """Return whether findings of a kind of step are allowed, by the request or always."""
         if kind == "requirements-before":
             return self.request.allow_dropped_requirements
         # Authors of a policy seldom have the CA keys, so the keystore may be signed later; and only
@@ -508,7 +509,7 @@ class _Review:
     # ── files ──────────────────────────────────────────────────────────────────────────────
 
     def _fleet(self, side: CommitFiles | None) -> Generator[ReviewStep, None, Fleet | None]:
-        """Return the fleet of BASE or HEAD, None without one; yield the steps that read it."""
+        """Return the fleet of BASE or HEAD, or None; yield the steps that read the fleet."""
         if not self.request.fleet or not side:
             return None
         files = yield from self._files(side, "files", [self.request.fleet])
@@ -518,7 +519,7 @@ class _Review:
     def _files(
         self, side: CommitFiles, kind: str, paths: Iterable[str]
     ) -> Generator[ReviewStep, None, dict[str, Path]]:
-        """Return the files that BASE or HEAD has at paths; HEAD has to have all of them."""
+        """Return the files that BASE or HEAD has at paths; a step reports files that HEAD lacks."""
 
         def file_at(path: str) -> Path | None:
             file = side.file(path)
@@ -531,7 +532,7 @@ class _Review:
     def _policies(
         self, side: CommitFiles, fleet: Fleet | None
     ) -> Generator[ReviewStep, None, list[Path]]:
-        """Return the policy files of BASE or HEAD; yield the steps that read them."""
+        """Return the policy files of BASE or HEAD; yield the steps that read the policies."""
 
         def files_at(path: str) -> Sequence[Path]:
             files = side.policies(path, placeholders=fleet is not None)
@@ -556,7 +557,7 @@ class _Review:
         return (yield from _read_each("keystore", self.request.keystores, folder_at))
 
     def _missing_file_error(self, path: str, advice: str = "") -> DocumentError:
-        """Return the error for a file that HEAD lacks, with a hint where it may have moved."""
+        """Return the error for a file that HEAD lacks, with a hint at the new path after a move."""
         entry = self.base.entry(path) if self.base else None
         became = ""
         if entry:
@@ -574,7 +575,7 @@ class _Review:
     def _changed_files(
         side: CommitFiles, other: CommitFiles | None
     ) -> Iterator[tuple[str, TreeEntry]]:
-        """Yield path and entry of files of a commit that are missing or different in the other."""
+        """Yield path and entry of files of a commit that the other commit lacks or has changed."""
         tree = side.repository.tree(side.commit)
         before = other.repository.tree(other.commit) if other else ""
         return walk(side.repository, tree, maximum=_MOST_ENTRIES, other=before)
@@ -636,7 +637,7 @@ class _Review:
     def _contents(
         self, ids: Iterable[str], largest: int = _MOST_OUTSIDE
     ) -> Iterator[tuple[str, bytes]]:
-        """Yield ids and contents of files that need not be policies; large ones are left out."""
+        """Yield ids and contents of files that need not be policies; large files are left out."""
         return self.request.repository.contents_in_batches(ids, _MOST_BYTES, largest=largest)
 
     def _keys_step(self) -> tuple[int, Content] | None:
@@ -765,8 +766,8 @@ class _Review:
     def _not_reviewed_users(self, changed: Iterable[tuple[str, TreeEntry]]) -> list[str]:
         """Return policies that are not reviewed and include a file that changes.
 
-        A policy includes only what is in its own folder and below.  Where no reviewed policy has
-        the file, only policies whose names end with ``.xml`` are found.
+        A policy includes only files in its own folder and below.  Where no reviewed policy has the
+        file, only policies whose names end with ``.xml`` are found.
         """
         repository, files = self.request.repository, self.head.files
         parts = [
@@ -1039,7 +1040,7 @@ class _Review:
     def _read(
         self, files: Mapping[str, Path], fleet: FleetSource
     ) -> Generator[ReviewStep, None, list[Requirement]]:
-        """Return the requirements of files, by path; yield the steps that cannot read them."""
+        """Return the requirements of files, by path; yield steps for unreadable files."""
         read = yield from _read_each(
             "requirements",
             files,
@@ -1057,7 +1058,7 @@ class _Review:
         before: Iterable[Right],
         elsewhere: Callable[[], Iterable[Finding]],
     ) -> tuple[int, ChosenFindings]:
-        """Return the step on requirements, also on the robots that have another namespace."""
+        """Return the decisions on requirements, also for robots that have another namespace."""
         asked = self.request
         findings = [
             *requirement_findings(requirements, system, before),
@@ -1078,7 +1079,7 @@ class _Review:
         """Yield a finding for each requirement that the change breaks in another namespace alone.
 
         Users may put the nodes of a package, and its requirements, into their own namespaces.
-        ``requirements`` are those of ``files`` for the namespace / of ``system``.
+        ``requirements`` are the requirements in ``files`` for the namespace / of ``system``.
         """
         asked = self.request
         if not any(requirement.is_relative for requirement in requirements):
@@ -1119,15 +1120,15 @@ class _Review:
                     yield from broken
 
     def place(self) -> str:
-        """Return a clause with the namespaces of the requirements; "" without any."""
+        """Return a clause with the namespaces of the requirements; "" without namespaces."""
         namespaces = self.request.namespaces
         return f"in {enumerated(namespaces)}" if namespaces else ""
 
     def _template(self) -> Template | None:
-        """Return the named keystore template, as HEAD has it; None without one.
+        """Return the keystore template that the request names, as in HEAD; None without a template.
 
         Raises:
-            DocumentError: HEAD does not have it, or it is malformed.
+            DocumentError: HEAD lacks the template, or the template is malformed.
         """
         choice = self.request.template
         if not choice or choice in template_names():
@@ -1146,7 +1147,7 @@ class _Review:
             return True
 
     def _keystore_fleet(self, path: str) -> Fleet | None:
-        """Return the fleet of a keystore in BASE; None if it has none."""
+        """Return the fleet of a keystore in BASE; None for a keystore without fleet."""
         file = self.base.file(f"{path}/{FLEET}") if self.base else None
         return read_fleet(file) if file else None
 
@@ -1242,7 +1243,7 @@ def _decisive_first(where: str) -> tuple[bool, str]:
 
 
 def _delivery_place(robot: Robot) -> str:
-    """Return where the keys of a robot are delivered, in words: user and address, or its name."""
+    """Return the place to which a robot's keys are delivered: user and address, or its name."""
     return f"{robot.user}@{robot.address}" if robot.user else robot.address or "its name"
 
 
@@ -1284,8 +1285,8 @@ def _is_same_file(base: CommitFiles | None, head: CommitFiles, path: str) -> boo
 def _fixed_or_moving_names(before: AccessSource, after: AccessSource) -> Iterator[PlacedRight]:
     """Yield the rights in ``after`` that are new only for nodes in another namespace.
 
-    Their names became absolute, or relative.  Denials that deny less in another namespace are
-    yielded, too.
+    The names of these rights became absolute, or relative. Denials that deny less in another
+    namespace are yielded, too.
     """
     of_before, of_after = (
         [*chain.from_iterable(map(_moved_rights, source.enclaves.values()))]
@@ -1325,9 +1326,9 @@ def _moved_rights(enclave: Enclave) -> Iterator[tuple[PlacedRight, Right]]:
 def _namespaces_to_try(before: AccessSource, after: AccessSource) -> list[str]:
     """Return namespaces in which requirements may be broken that hold in ``/``.
 
-    The first namespace has a name that is in no right; it stands for all other such namespaces.
-    The other namespaces are those in names that do not move with the namespace, or are matched by
-    wildcards of these names; those of added and removed rights come first.
+    The first namespace is in no right, and stands for all other such namespaces. It is followed by
+    the namespaces in names that do not move with the namespace, and by namespaces that wildcards in
+    these names match; namespaces of added and removed rights come first.
     """
     enclaves = (*before.enclaves.values(), *after.enclaves.values())
     placed = chain.from_iterable(map(placed_rights, enclaves))
@@ -1357,7 +1358,7 @@ def _status(chosen_findings: ChosenFindings) -> int:
 def _requirements_left(
     requirements: Sequence[Requirement], before: AccessSource, after: AccessSource
 ) -> Iterator[Finding]:
-    """Yield a finding for each requirement on enclaves that a node leaves by a move to another."""
+    """Yield a finding for each requirement on an enclave that a node leaves for another enclave."""
     old_enclaves, new_enclaves = (
         _enclaves_by_node(source.enclaves.values()) for source in (before, after)
     )
@@ -1391,10 +1392,10 @@ def _enclaves_by_node(enclaves: Iterable[Enclave]) -> dict[NodeName, set[str]]:
 
 
 def _without_left_robots(before: Fleet | None, after: FleetSource) -> Fleet | None:
-    """Return the fleet ``before`` without the robots that left it.
+    """Return the fleet ``before`` without the robots that ``after`` lacks.
 
-    So no requirement is dropped because its robot left.  A group that lost all of its robots keeps
-    them here.
+    So no requirement counts as dropped because its robot left the fleet. A group keeps its robots
+    if all of them left.
     """
     now = after()
     if before is None or now is None:

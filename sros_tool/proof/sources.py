@@ -81,7 +81,7 @@ UNCERTAIN = {
     "rights.zenoh-no-name",
     "rights.zenoh-strangers",
 }
-"""Ids of notes that say that rights are not fully known, so that access may be new."""
+"""Ids of notes which say that rights are not fully known, so that access may be new."""
 
 
 KEYSTORE_ITSELF = "the keystore"
@@ -90,7 +90,7 @@ KEYSTORE_ITSELF = "the keystore"
 
 @dataclass(frozen=True, slots=True)
 class Trust:
-    """The identity CAs that an enclave trusts, and the certificates of these CAs that it refuses.
+    """The identity CAs that an enclave trusts, and the revoked certificates of these CAs.
 
     A CA is given by the SHA-256 of its public key; ``revoked`` has pairs of a CA and a serial
     number.
@@ -113,19 +113,18 @@ class CertifiedEnclave:
 class AccessSource:
     """The access that a file, a folder or a revision gives to enclaves.
 
-    ``kind`` is "policy", "permissions", "enclave", "keystore" or "zenoh"; ``shown`` is its name.
-    ``permissions`` are what DDS loads for each enclave, or would load after signing.  ``rights``
-    are the rights in ROS terms.  ``zenoh`` are the rights that Zenoh rules give, None without
-    rules; if there are no permissions, ``key_domains`` maps them to the ROS domains in their keys,
-    None for a wildcard.  ``enforcers`` are these rules, ``routers`` the enclaves of routers.
-    ``passing`` maps each of several routers to the rights that it gives to the others.  ``scope``
-    are the enclaves that the source is for; None for all.  ``governance`` is None if the source has
-    none.
-    ``authorities`` are the CAs that its enclaves trust, as pairs of role and fingerprint.
-    ``trusts`` maps enclaves and `KEYSTORE_ITSELF` to their trust; None if it is not known.
-    ``later`` are the settings for enclaves that are created later, or None.  ``certified`` has the
-    facts about the certificate of each enclave that has one.  ``zenoh_files`` are the
-    Zenoh configurations, by enclave and file name.
+    ``kind`` is "policy", "permissions", "enclave", "keystore" or "zenoh"; ``shown`` is the name of
+    the source in texts. ``permissions`` are what DDS loads for each enclave, or would load after
+    signing.  ``rights`` are the rights in ROS terms.  ``zenoh`` are the rights that Zenoh rules
+    give, None without rules; if there are no permissions, ``key_domains`` maps these rights to the
+    ROS domains in their keys, None for a wildcard. ``enforcers`` are the Zenoh rules, ``routers``
+    the enclaves of routers. ``passing`` maps each of several routers to the rights that the router
+    gives to the other routers. ``scope`` are the enclaves that the source is for; None for all.
+    ``governance`` is None for a source without governance. ``authorities`` are the CAs that the
+    enclaves trust, as pairs of role and fingerprint. ``trusts`` maps enclaves and `KEYSTORE_ITSELF`
+    to their trust; None if trust is not known. ``later`` are the settings for enclaves that are
+    created later, or None. ``certified`` has the facts about the certificates of enclaves.
+    ``zenoh_files`` are the Zenoh configurations, by enclave and file name.
     """
 
     shown: str
@@ -172,7 +171,7 @@ class AccessSource:
         )
 
     def sources_of(self, enclave: str) -> dict[Right, Source]:
-        """Map the rights of an enclave to their file and line; empty without a policy."""
+        """Map the rights of an enclave to file and line; empty without a policy."""
         sources: dict[Right, Source] = {}
         stated = self.enclaves.get(enclave)
         for placed in placed_rights(stated) if stated else ():
@@ -307,7 +306,7 @@ def _access_of_source(path: Path, source: RightsSource) -> AccessSource:
 
 
 def _certified_enclaves(folders: Mapping[str, Path]) -> dict[str, CertifiedEnclave]:
-    """Map the enclaves that have a certificate to its subject, name and key."""
+    """Map the enclaves that have a certificate to its subject, common name and key digest."""
     certified = {}
     for name, folder in folders.items():
         if (file := folder / CERTIFICATE_FILE).exists():
@@ -332,7 +331,7 @@ def _zenoh_file(path: Path, document: ConfigurationDocument) -> SignedConfigurat
 
 
 def _common_governance(root: Path, folders: Iterable[Path]) -> Governance:
-    """Return the governance of a keystore, after a check that all enclaves have the same one.
+    """Return the governance of a keystore, after a check that all enclaves have it.
 
     Raises:
         DocumentError: an enclave has another governance, such as an earlier one with less
@@ -357,7 +356,7 @@ def _common_governance(root: Path, folders: Iterable[Path]) -> Governance:
 
 
 def _signed_text(message: bytes) -> bytes | None:
-    """Return the document in a signed message, which is not verified; None if it is not signed."""
+    """Return the document in a signed message, without verification; None for other messages."""
     try:
         return smime.parse(message).document
     except PkiError:
@@ -368,8 +367,8 @@ def _exported_governance(root: Path, folders: Iterable[Path]) -> Governance:
     """Return the governance of an export's enclaves, after verifying the document of each enclave.
 
     Raises:
-        DocumentError: enclaves have different governances, or an enclave lacks a file without
-            which no node starts in it.
+        DocumentError: enclaves have different governances, or an enclave lacks a file that every
+            node needs to start.
     """
     enclaves: dict[Governance, Path] = {}
     for folder in folders:
@@ -409,7 +408,7 @@ _NEVER = "9999"
 
 
 def _expiries(root: Path) -> dict[int, str]:
-    """Map serial numbers of certificates to their expiry, by the ledger of the keystore."""
+    """Map serial numbers of certificates to expiries, by the ledger of the keystore."""
     if not (root / CRL).exists():
         return {}
     expiries: dict[int, str] = {}
@@ -431,7 +430,7 @@ def _trusts(
     Raises:
         DocumentError: a list is damaged, is of no CA that the enclave trusts, does not cover all
             certificates, or has entries that may revoke nothing; or there are several lists of a
-            CA, of which OpenSSL takes one: it is uncertain what is revoked.
+            CA, so that it is uncertain which of them OpenSSL takes.
     """
 
     @lru_cache(maxsize=8)  # most enclaves have the same files, so this is cached
@@ -493,7 +492,7 @@ def _governance(file: Path) -> Governance:
 
 
 AT = datetime(2026, 1, 1, tzinfo=UTC)
-"""The time for which permissions are compared; they all count as valid then."""
+"""The time for which permissions are compared; all permissions then count as valid."""
 _VALID = window(AT - timedelta(days=2), timedelta(days=9))
 
 
@@ -519,7 +518,7 @@ _Read = tuple[Policy, Fleet | None]
 
 
 def _read(path: Path, fleet: Fleet | None, policy_files: PolicyFiles | None = None) -> _Read:
-    """Return the policy in a file, and the fleet with the enclaves that the policy has."""
+    """Return the policy in a file, and the fleet with the enclaves of the policy."""
     if fleet is None:
         return read_policy(path, policy_files=policy_files), None
     expanded = FleetPolicy(read_policy(path, placeholders=True, policy_files=policy_files), fleet)
@@ -549,7 +548,7 @@ def _access_of_policies(shown: str, policies: list[_Read]) -> AccessSource:
 
 
 def load_policies(files: Iterable[Path], shown: str, fleet: Fleet | None = None) -> AccessSource:
-    """Return the access that the policies of one robot, or one fleet, give together.
+    """Return the joint access by the policies of one robot, or of one fleet.
 
     Raises:
         SrosError: a policy cannot be read, or two policies have the same enclave.

@@ -38,17 +38,17 @@ _SENDING = ("publish", "call", "request")
 _PEOPLE = "/operator/*"
 """The enclaves of people, such as those that sros ships: `ros2 topic echo` needs wildcards."""
 _FEW = 3
-"""Highest number of enclaves with a right to a name that are proposed as the only ones."""
+"""Maximum number of enclaves with a right to a name that are proposed as its only users."""
 _MOST = 1000
-"""Highest number of candidates for each robot, so that a person can read the proposals."""
+"""Maximum number of candidates for each robot, so that a person can read the proposals."""
 _MOST_ROBOTS = 100
-"""Highest number of robots whose candidates are decided."""
+"""Maximum number of robots whose candidates are decided."""
 _WIDE_LIST = 50
-"""Highest number of names that are joined into one requirement."""
+"""Maximum number of names that are joined into one requirement."""
 
 
 class Suggestions(NamedTuple):
-    """Requirements that hold, and comments on names that move a robot and that none reserves."""
+    """Requirements that hold, and comments on names that move a robot without being reserved."""
 
     requirements: Sequence[Requirement]
     comments: Sequence[str]
@@ -59,8 +59,8 @@ def suggest(
 ) -> Suggestions:
     """Propose requirements that hold in all worlds, by the allowed ``rights``.
 
-    What is proposed or said for each robot of ``fleet``, or of one of its groups, comes once, with
-    placeholders.
+    Proposals and comments that apply to all robots of ``fleet``, or of a group, are written once,
+    with placeholders.
 
     Raises:
         DocumentError: there are too many wildcards to decide a requirement.
@@ -82,9 +82,9 @@ def suggest(
 
 
 def _missing(stated: _Stated, proposed: Iterable[Requirement]) -> Iterator[Only]:
-    """Yield a requirement for each name that moves a robot, and that none of ``proposed`` reserves.
+    """Yield a requirement for each name that moves a robot, and that ``proposed`` does not reserve.
 
-    It does not hold, or was not decided.
+    These requirements do not hold, or were not decided.
     """
     reserved = {
         (right, name)
@@ -110,7 +110,7 @@ def _not_proposed(requirement: Requirement) -> str:
 
 
 def _joined_requirement(requirement: Requirement, other: Requirement) -> Requirement | None:
-    """Return a requirement that demands the same as two, or None if they cannot be joined."""
+    """Return a requirement that demands the same as two requirements, or None if there is none."""
     match requirement, other:
         case (
             Nobody(rights=(("request", names),)),
@@ -156,7 +156,7 @@ def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Req
 
 
 def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
-    """Yield a requirement for each up to three enclaves that alone use the same names.
+    """Yield a requirement for each group of up to three enclaves that alone use the same names.
 
     Names that move the robot get a requirement for any number of enclaves, even without a known
     receiver.
@@ -173,14 +173,14 @@ def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
 
 
 def _unused_services(stated_rights: _Stated) -> Iterator[Nobody]:
-    """Yield requirements that nobody calls unused services that change nodes."""
+    """Yield requirements that nobody may call unused services that change nodes."""
     last = {name.rpartition("/")[2] for name in stated_rights.names("reply") if name.count("/") > 1}
     for service in sorted(last.difference(READING_SERVICES)):
         yield Nobody(source=_NOWHERE, rights=(("request", (f"*/{service}",)),))
 
 
 def _gate_requirements(world: World) -> Iterator[Apart]:
-    """Yield requirements that enclaves can be influenced only through one other enclave."""
+    """Yield requirements that only one enclave may be a way to influence an enclave."""
     for target, sources in sorted(influencers(world, SearchLimit()).items()):
         if len(sources) == 1:
             yield Apart(source=_NOWHERE, sources=("*",), targets=(target,), through=tuple(sources))
@@ -212,7 +212,7 @@ def _with_placeholders_for_robots(
 
 
 def _robots_in(name: str, fleet: Fleet) -> set[str]:
-    """Return the robots whose name is a part of a name, or whose namespace it begins with."""
+    """Return the robots whose name is a part of ``name``, or whose namespace begins ``name``."""
     parts = name.split("/")
     robots = fleet.robots.keys() & set(parts)
     for end in range(2, len(parts)):
@@ -256,7 +256,7 @@ def _with_placeholder(name: str, robot: Robot, placeholder: Placeholder) -> str:
 
 
 def _joined_names(names: Names, value: str, fleet: Fleet) -> Names:
-    """Return names; names that exist for each robot of a group become one with a placeholder."""
+    """Return the names, with one placeholder for names that exist for each robot of a group."""
     names_by_pattern: dict[str, dict[str, str]] = {}
     for name in names:
         robots = _robots_in(name, fleet)
@@ -277,7 +277,7 @@ def _joined_names(names: Names, value: str, fleet: Fleet) -> Names:
 
 
 def _group_of(robots: Collection[str], fleet: Fleet) -> str | None:
-    """Return the group with exactly these robots, "" for the whole fleet; None if there is none."""
+    """Return the group with exactly these robots, "" for the whole fleet, or None."""
     groups = {"": tuple(fleet.robots), **fleet.groups}
     return next((name for name in groups if set(groups[name]) == set(robots)), None)
 
@@ -285,7 +285,7 @@ def _group_of(robots: Collection[str], fleet: Fleet) -> str | None:
 def _with_lists(requirement: Requirement, change: Callable[[Names, str], Names]) -> Requirement:
     """Return a requirement with other lists of names and enclaves.
 
-    ``change`` gets a list, and the placeholder value that suits it: "namespace" for names, "robot"
+    ``change`` gets a list, and the kind of placeholder for the list: "namespace" for names, "robot"
     for enclaves.
     """
 

@@ -81,19 +81,19 @@ _ZENOH = "zenoh"
 WORLDS = (*(vendor.value for vendor in TESTED), _ZENOH)
 """The worlds that are decided: the tested vendors, and Zenoh."""
 _PLANNED = timedelta(days=365)
-"""The assumed validity of permissions that are not signed yet."""
+"""Assumed validity of permissions that are not signed yet."""
 _OF_EVERY_NODE = ((True, ROS_DISCOVERY_TOPIC), (False, ROS_DISCOVERY_TOPIC))
-"""Access to topics without which no ROS 2 node starts on DDS: (whether it writes, topic)."""
+"""Topics without which no ROS 2 node starts on DDS, as pairs: whether the node writes, topic."""
 
 
 @dataclass(frozen=True, slots=True)
 class System:
     """The worlds of a policy or keystore.
 
-    ``file`` is its path, ``rights`` are the allowed rights as it states them, and ``places`` tells
-    where the rights are stated.  ``is_export`` says that it is an export, which may lack enclaves
-    of its keystore.  ``left_out`` is the reason why there is no Zenoh world, if Zenoh cannot
-    enforce the policy.  ``fleet`` returns the robots of the policy or keystore, or None.
+    ``file`` is the path, ``rights`` are the allowed rights as stated, and ``places`` finds the
+    places that state rights. ``is_export`` says that the source is an export, which may lack
+    enclaves of its keystore.  ``left_out`` is the reason why there is no Zenoh world, if Zenoh
+    cannot enforce the policy.  ``fleet`` returns the robots of the policy or keystore, or None.
     """
 
     file: str
@@ -120,7 +120,7 @@ def load_system(
     Raises:
         DocumentError: a file cannot be read, there is no policy, two policies state the same
             enclave, or only Zenoh is wanted and cannot enforce the policy.
-        KeystoreError: the keystore cannot be read, or what Zenoh enforces in it is not known.
+        KeystoreError: the keystore cannot be read, or its Zenoh rules are not known.
         UsageError: a template was given for a keystore.
     """
     paths = [path] if isinstance(path, Path) else path
@@ -145,7 +145,7 @@ def load_system(
 
 
 def policy_system(policy: Policy, at: Circumstances, template: Template | None = None) -> System:
-    """Return the worlds of a policy as if it were signed now, for its ROS domain or 0.
+    """Return the worlds of a policy as if the policy were signed now, for its ROS domain or 0.
 
     The governance is the template's, with the protection that the policy states added.  Without a
     template, a name has exactly the protection that the policy states for it, and all other names
@@ -205,7 +205,8 @@ def _planned_zenoh(
 ) -> World:
     """Return the Zenoh world with the rules that sros would write for a policy.
 
-    Only ROS names are decided, because only for them the rules have the same meaning as the policy.
+    Only ROS names are decided, because the rules have the same meaning as the policy only for ROS
+    names.
     """
     rules = {remote.common_name: AccessControl((remote,)) for remote in control.remotes}
 
@@ -236,12 +237,14 @@ def _dds_world(
 
     Args:
         vendor: the vendor.
-        access: for each enclave, its possible documents; it may do what any of them permits.
+        access: for each enclave, the access by its possible documents; a permission in any of them
+            counts.
         stated_access: the topics that rights name without wildcards, by enclave.
         title: the title of the world; "" for the vendor's.
         idle: the enclaves without valid permissions.
-        demanded: for each level, the topics for which a policy states it; None for a keystore.
-        fitting_others: for each enclave, the enclaves whose permissions it can present.
+        demanded: for each level, the topics for which a policy states the level; None for a
+            keystore.
+        fitting_others: for each enclave, other enclaves whose permissions it can present.
     """
 
     def confirm(enclave: str, writes: bool, topic: str) -> bool:
@@ -286,7 +289,7 @@ _RANK = {Level.NONE: 0, Level.SIGN: 1, Level.ENCRYPT: 2}
 
 
 def _weaker_topics(access: Iterable[Access]) -> dict[Level, NameSet]:
-    """Map levels to the topics that the governance of at least one enclave protects less."""
+    """Map levels to the topics that the governance of any enclave protects less than the level."""
     different = dict.fromkeys(enclave_access.protection() for enclave_access in access)
     return {
         level: NameSet.union(
@@ -347,10 +350,10 @@ _MOST_GOVERNANCES = 4
 def _keystore_system(keystore: OpenedKeystore, at: Circumstances) -> System:
     """Return the worlds of a keystore.
 
-    Each vendor has one world for each group of domains with the same rules.  The signed documents
-    of an enclave decide, even if its key is missing or its files could not be loaded: the robot may
-    have other files.  Permissions that become valid later count as valid.  The governance of each
-    enclave counts for all enclaves.  Enclaves in hidden folders are included.
+    For each vendor, there is a world for each group of domains with the same rules.  The signed
+    documents of an enclave decide, even if its key is missing or its files could not be loaded: the
+    robot may have other files.  Permissions that become valid later count as valid.  The governance
+    of each enclave counts for all enclaves.  Enclaves in hidden folders are included.
 
     Raises:
         KeystoreError: documents cannot be read, or differ too much to decide.
@@ -474,7 +477,7 @@ def _keystore_system(keystore: OpenedKeystore, at: Circumstances) -> System:
 
 
 def _link_domains(worlds: Sequence[World]) -> None:
-    """Tell the worlds of a vendor, or of Zenoh, which worlds are of other ROS domains."""
+    """Set `elsewhere` of the worlds of a vendor, or of Zenoh: the worlds of other ROS domains."""
     for world in worlds:
         world.elsewhere = tuple(other_world for other_world in worlds if other_world is not world)
 
@@ -519,12 +522,12 @@ def _zenoh_worlds(
 ) -> Iterator[World]:
     """Yield the worlds of Zenoh, one for each domain.
 
-    Only rules that other processes enforce on a session count, because a session can ignore its
-    own.  Routers in the settings are part of the network, but requirements are not about them: they
-    may pass on what their enclaves may send.
+    Only rules that other processes enforce on a session count, because a session can ignore its own
+    rules. Routers in the settings are part of the network, but requirements do not apply to
+    routers, which pass on the messages of their enclaves.
 
     Raises:
-        KeystoreError: there are no Zenoh configurations, or it is unclear what they enforce.
+        KeystoreError: there are no Zenoh configurations, or their effect is unclear.
     """
     root, source = keystore.root, load_zenoh_rights(keystore, hidden=True)
     for note in source.notes:
@@ -598,7 +601,7 @@ class Places:
         return cls({enclave.path: _AllowedRights(enclave) for enclave in policy.enclaves})
 
     def find(self, use: Use) -> Place | None:
-        """Return a right that permits a use, if possible one without wildcards, or None."""
+        """Return a right that permits a use, preferably a right without wildcards, or None."""
         topics = self._by_enclave.get(use.enclave)
         if topics is None:
             places = self._stated_topics.get(use.enclave, ())
@@ -617,7 +620,7 @@ class Places:
 
 
 class _AllowedRights:
-    """The allowed rights of an enclave in a policy, computed again each time they are iterated."""
+    """The allowed rights of an enclave in a policy, which every iteration computes again."""
 
     def __init__(self, enclave: Enclave) -> None:
         self._enclave = enclave

@@ -1,7 +1,8 @@
 """Find what changes for a keystore or policy with another ROS 2 distribution.
 
-The signed files stay the same, but another release of DDS reads them.  For each enclave, the rules
-of both releases decide whether it joins and which topics it may use, for all names at once.
+The signed files stay the same, but another release of DDS reads the files. For each enclave, the
+rules of both releases decide whether the enclave joins and which topics it may use, for all names
+at once.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ _ZENOH = "zenoh"
 
 @dataclass(frozen=True, slots=True)
 class DecidedFiles:
-    """The enclaves of a keystore or policy, with what is needed to decide on them.
+    """The enclaves of a keystore or policy, with all that decisions need.
 
     Without a ROS domain in ``at``, example domains from the documents of each enclave count.
     ``keystore`` is None for a policy, whose file is ``file``.  ``chosen`` are the
@@ -141,7 +142,7 @@ def signed_files(keystore: OpenedKeystore, at: Circumstances) -> DecidedFiles:
 
     Raises:
         KeystoreError: the folder is not a keystore.
-        DocumentError: rights in it cannot be read.
+        DocumentError: rights in the keystore cannot be read.
     """
     keystore.check()
     names = enclave_names(keystore.root, hidden=True)
@@ -196,7 +197,8 @@ def check_upgrade(
         path: the policy or keystore.
         later: the distribution after the update.
         circumstances: the moment, the ROS domain, and other conditions.
-        present: the distribution before the update; by default those that the keystore states.
+        present: the distribution before the update; by default, the distributions that the keystore
+            states.
         here: the distribution that is sourced, if the keystore states none.
         vendor: the only DDS vendor that is used, of any release, or ``zenoh``; "" for all.
 
@@ -265,9 +267,9 @@ def _upgrade_findings(
 def _products(
     before: Distribution, after: Distribution, vendor: str
 ) -> Iterator[tuple[Shipped, Shipped]]:
-    """Yield pairs of releases of a DDS product: in the earlier and the later distribution.
+    """Yield, for each DDS product, its releases in the earlier and in the later distribution.
 
-    With ``vendor``, only the product of this vendor.
+    With ``vendor``, yields only the product of this vendor.
     """
     product = Vendor(vendor).traits.product if vendor not in ("", _ZENOH) else ""
     for old in before.shipped if vendor != _ZENOH else ():
@@ -336,7 +338,7 @@ def check_distributions(keystore: OpenedKeystore, at: Circumstances) -> list[Fin
 
 
 def _pairs(distributions: Sequence[Distribution]) -> Iterator[tuple[Shipped, Shipped]]:
-    """Yield pairs of releases of a product, in different distributions, that decide differently."""
+    """Yield pairs of releases of one product in different distributions that decide differently."""
     by_product: dict[str, dict[Vendor, Shipped]] = {}
     for distribution in distributions:
         for shipped in distribution.shipped:
@@ -396,8 +398,8 @@ def changes(files: DecidedFiles, before: Shipped, after: Shipped) -> Iterator[De
 class _Decided:
     """The decision of one release of DDS on an enclave: causes of a refusal, and access.
 
-    The access includes permissions of other enclaves (``fitting_others``) that fit the enclave's
-    certificate.
+    The access includes access by permissions of other enclaves (``fitting_others``) that fit the
+    enclave's certificate.
     """
 
     def __init__(
@@ -530,7 +532,7 @@ def _nodes(files: DecidedFiles, before: Distribution, after: Distribution) -> It
 def _zenoh_findings(
     files: DecidedFiles, before: Distribution, after: Distribution
 ) -> Iterator[Finding]:
-    """Yield findings on what another release of rmw_zenoh changes for a keystore's Zenoh files."""
+    """Yield findings on changes for a keystore's Zenoh files by another release of rmw_zenoh."""
     old, new = before.zenoh, after.zenoh
     if old == new or not files.keystore or not has_zenoh_files(files.keystore.root, hidden=True):
         return
@@ -554,7 +556,7 @@ def _zenoh_findings(
 
 
 _OF_EACH = "_buf/*"
-"""Keys that rmw_zenoh uses for single subscriptions; they have no example without a wildcard."""
+"""Keys that rmw_zenoh uses for single subscriptions; only a wildcard can name them."""
 
 
 def _drops_below_name(

@@ -1,8 +1,8 @@
 """The access of enclaves to DDS topics in one world: with one DDS vendor, or on Zenoh.
 
-A world has an index of the topics of all its enclaves, which finds enclaves with access to names of
-an expression: exact topics are looked up, and only wildcards are compared.  On Zenoh, a key stands
-for the DDS topic of the same ROS name, so that all worlds use the same names.
+A world has an index of the topics of all its enclaves, which finds the enclaves with access to
+names that an expression matches: exact topics are looked up, and only wildcards are compared.  On
+Zenoh, a key stands for the DDS topic of the same ROS name, so that all worlds use the same names.
 """
 
 from __future__ import annotations
@@ -68,11 +68,11 @@ class Topics:
         return topic[len(self.begin) : len(topic) - len(self.end)]
 
     def every(self) -> NameSet:
-        """Return all these topics, even those that no ROS node would use."""
+        """Return all topics of the expression, even topics that no ROS node would use."""
         return names_of_expression(self.expression)
 
     def valid(self) -> NameSet:
-        """Return the topics whose names are valid in ROS."""
+        """Return the topics of the expression that have a valid ROS name."""
         return self.every() & valid_topics(self.begin, self.end)
 
 
@@ -112,7 +112,8 @@ ROS_TOPICS = NameSet.union(
 class TopicUser:
     """An enclave that may use some of the topics in question.
 
-    Its rights name the ``stated`` topics; with ``wild``, their wildcards may match further ones.
+    The rights of the enclave name the ``stated`` topics; with ``wild``, wildcards may match further
+    topics.
     """
 
     enclave: str
@@ -122,7 +123,7 @@ class TopicUser:
 
 
 def shortest(names: Iterable[str]) -> str | None:
-    """Return the shortest of some names, or None if there are none."""
+    """Return the shortest of ``names``, or None without names."""
     return min(names, key=lambda name: (len(name), name), default=None)
 
 
@@ -151,8 +152,8 @@ class Side:
     def users_of_topics(self, topics: Topics, limit: SearchLimit) -> list[TopicUser]:
         """Return the enclaves that may use some of the topics, sorted.
 
-        An enclave without ``stated`` topics may be listed wrongly: whether it may really use a
-        topic is only known from an example.
+        An enclave without ``stated`` topics may be listed wrongly; only an example topic is
+        certain.
         """
         stated: dict[str, list[str]] = {}
         for topic in self.topics_matching(topics.expression, limit):
@@ -228,7 +229,7 @@ class Side:
         return frozenset(met)
 
     def users_of(self, topic: str) -> list[str]:
-        """Return the enclaves that may use one topic, sorted."""
+        """Return the enclaves that may use a topic, sorted."""
         users = set(self.exact.get(topic, ())).union(self._any)
         for automaton, enclaves in self._wild.items():
             if not users.issuperset(enclaves) and automaton.matches(topic):
@@ -275,7 +276,7 @@ Confirm = Callable[[str, bool, str], bool]
 class Written(NamedTuple):
     """The topics that an enclave may write; ``exact`` are the topics stated without wildcards.
 
-    ``around`` is what `NameSet.around` returns for them.
+    ``around`` is the result of `NameSet.around` for the exact topics.
     """
 
     names: NameSet
@@ -286,8 +287,7 @@ class Written(NamedTuple):
 class World:
     """The topics that all enclaves may write and read, with one vendor or on Zenoh.
 
-    ``title`` is its name; ``longest`` is the length in bytes of the longest topic that is used in
-    it.
+    ``title`` names the world in texts; ``longest`` is the length in bytes of its longest topic.
     """
 
     def __init__(
@@ -311,16 +311,16 @@ class World:
         ``confirm`` decides on one topic without these sets, and ``stated_access`` has the topics
         that the rights of an enclave name without wildcards.
 
-        ``weak`` are the topics that are protected less than a level demands; without a level, there
-        are none.  ``demanded`` are the topics whose protection a policy demands, while the
-        protection of all others is assumed; None if nothing is assumed.  ``needed`` are topics that
-        every node has to write (True) and read (False).  ``idle`` are enclaves in which no process
-        starts with their files as they are: they count as allowed to use their rights, but not as
-        able to.  ``fitting_others`` maps an enclave to others whose permissions it can use as well.
-        These count for what it may do, but not for what it must be able to do.  ``crossing`` is
-        what passes between several Zenoh routers; None if all enclaves reach each other.
-        ``open_topics`` are the topics that processes without an identity may write and read, or
-        None.
+        ``weak`` maps levels to the topics that are protected less than the level demands.
+        ``demanded`` are the topics whose protection a policy demands, while the protection of all
+        other topics is assumed; None if nothing is assumed.  ``needed`` are topics that every node
+        has to write (True) and read (False).  ``idle`` are enclaves in which no process starts with
+        the present files: such an enclave counts as allowed to use its rights, but not as able to.
+        ``fitting_others`` maps an enclave to others whose permissions it can use as well. These
+        permissions count for what an enclave may do, but not for what it must be able to do.
+        ``crossing`` has the topics that pass between several Zenoh routers; None if all enclaves
+        reach each other. ``open_topics`` are the topics that processes without an identity may
+        write and read, or None.
         """
         self.title = title
         self.confirm_own = confirm
@@ -367,7 +367,7 @@ class World:
     def other_sufficient_enclave(self, enclave: str, writes: bool, topic: str) -> str:
         """Return another enclave whose permissions let ``enclave`` use a topic.
 
-        "" if the enclave's own permissions are enough, or no others fit.
+        Returns "" if the enclave's own permissions are enough, or if no other permissions fit.
         """
         if enclave not in self.fitting_others or self.confirm_own(enclave, writes, topic):
             return ""
@@ -404,8 +404,8 @@ class World:
     def example(self, names: NameSet, topics: Topics, limit: SearchLimit) -> str | None:
         """Return a topic among ``topics`` whose name is in ``names``, or None.
 
-        A topic that an enclave states is preferred to one that only wildcards match, then a valid
-        ROS name to others, then the shortest.
+        Topics that an enclave states come before topics that only wildcards match, then valid ROS
+        names before other names, then short topics before long ones.
         """
         if not is_expression(topics.expression):
             return topics.expression if topics.expression in names else None
@@ -427,7 +427,9 @@ class World:
         )
 
     def any_example(self, names: NameSet, limit: SearchLimit) -> str | None:
-        """Return a topic of a set, preferably a stated one or one that nodes can have; or None."""
+        """Return a topic of a set, or None; stated topics and topics that nodes can have come
+        first.
+        """
         sets = (names, *(names & name_set for name_set in _VALID))
         stated = (next(name_set.stated(), None) for name_set in sets)
         examples = (
@@ -436,7 +438,7 @@ class World:
         return next(filter(None, (*stated, *examples)), None)
 
     def stated_names(self, begin: str, end: str) -> frozenset[str]:
-        """Return the names in the topics that rights state with this text before and after it."""
+        """Return the names in stated topics with this text before and after the name."""
         if (begin, end) not in self._stated_names:
             self._stated_names[begin, end] = frozenset(
                 topic[len(begin) : len(topic) - len(end)]
@@ -472,7 +474,7 @@ class World:
         return self.crossing.topics_between(writer, reader) if self.crossing else None
 
     def router_of(self, enclave: str) -> str:
-        """Return the router that an enclave connects to; "" if there are not several routers."""
+        """Return the router that an enclave connects to; "" in a network with a single router."""
         return self.crossing.router_of.get(enclave, "") if self.crossing else ""
 
     def written_by(self, enclave: str, excluded_names: NameSet) -> Written:
@@ -490,7 +492,7 @@ class World:
     def shared_topic(
         self, writer: str, reader: str, written: NameSet, limit: SearchLimit
     ) -> str | None:
-        """Return a topic in ``written`` that the reader may read and that reaches it, or None.
+        """Return a topic in ``written`` that ``reader`` may read and receives, or None.
 
         ``written`` has to depend on the writer only.
         """
@@ -515,7 +517,7 @@ _VALID = tuple(valid_topics(*ends) for ends in (("rt", ""), ("rq", "Request"), (
 
 
 def topics_of(right: Right) -> Iterator[tuple[bool, str]]:
-    """Yield the DDS topics of a right, with True for those that it writes."""
+    """Yield pairs for the DDS topics of a right: whether it writes the topic, and the topic."""
     written, read = right.topics
     yield from ((True, topic) for topic in written)
     yield from ((False, topic) for topic in read)
@@ -535,10 +537,10 @@ _USES: dict[tuple[bool, str], tuple[tuple[Flow, Message], ...]] = {
 }
 """The Zenoh messages with which a process writes or reads topics with a prefix.
 
-All of them have to pass: replies without the offer to reply belong to the history of topics.
+All these messages have to pass: replies without the offer to reply belong to the history of topics.
 """
 _TYPE = f"/{ANY_TYPE}"
-"""Type and hash at the end of a key: rules that sros writes apply to all of them."""
+"""Type and hash at the end of a key, as wildcards: rules that sros writes apply to all types."""
 _UNTYPED = "/*/*"
 
 
@@ -548,7 +550,7 @@ def dds_access(access: Access) -> TopicAccess:
 
 
 def ros_access(stated_rights: Iterable[StatedRight]) -> TopicAccess:
-    """Return the topics of the ROS names that rights allow, and denials do not take away."""
+    """Return the topics of the ROS names that rights allow and denials leave allowed."""
     names: dict[tuple[bool, str, bool], list[NameSet]] = defaultdict(list)
     for right in (right.right for right in stated_rights):
         for writes, topic in topics_of(right):
@@ -568,7 +570,7 @@ def enforced_access(enforcers: Iterable[Enforcement], enclave: str, domain: int)
     """Return the topics that stand for the keys that an enclave may write and read on Zenoh.
 
     ``enforcers`` are the access control of the processes that the enclave has links to: it is
-    enough that one of them passes a message.
+    enough that one process passes a message.
     """
     remote = Remote(enclave)
 
@@ -609,9 +611,9 @@ def any_allows(
 def domains_of(
     enforcers: Iterable[Enforcement], other_domains: Collection[DomainSet] = ()
 ) -> tuple[int, ...]:
-    """Return the ROS domains of the keys in rules, only the first of domains with the same rules.
+    """Return an example ROS domain for each group of domains with the same rules.
 
-    If keys have a wildcard in place of the domain, a domain is added that no key names.  Domains in
+    If keys have a wildcard in place of the domain, a domain is added that no key names. Domains in
     ``other_domains`` are added, too; domains in different sets count as having different rules.
     """
     rules: dict[int, set[object]] = {}
@@ -647,7 +649,7 @@ _DOMAIN = re.compile(r"(?:0|[1-9][0-9]{0,8})\Z", re.ASCII)
 
 @lru_cache(maxsize=65536)
 def _topics(key: str, domain: int, begin: str) -> NameSet:
-    """Return the topics with a prefix that stand for what a key expression includes.
+    """Return the topics with a prefix that stand for the keys of a key expression.
 
     No ROS name has a part that begins with "@": such keys are the history of a topic, which belongs
     to its right, or the graph.

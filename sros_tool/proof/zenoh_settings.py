@@ -1,7 +1,7 @@
 """Compare two sets of Zenoh configurations: find settings of the new set that permit more.
 
-Access-control rules are compared elsewhere.  A setting with an unknown effect is never ignored: it
-is reported as not compared, so that the result cannot be "nothing new".  Source of the settings:
+Access-control rules are compared elsewhere.  A setting with an unknown effect is never ignored, but
+reported as not compared, so that the result cannot be "nothing new".  Source of the settings:
 DEFAULT_CONFIG.json5 of zenoh 1.9.
 
 This module reads no files.
@@ -22,7 +22,7 @@ from sros_tool.zenoh.document import ConfigurationDocument, parse_configuration
 
 @dataclass(frozen=True, slots=True)
 class SignedConfiguration:
-    """A Zenoh configuration; ``signature`` is "holds", "missing" or "broken"."""
+    """A Zenoh configuration; the state ``signature`` is "holds", "missing" or "broken"."""
 
     document: ConfigurationDocument
     signature: str
@@ -31,8 +31,7 @@ class SignedConfiguration:
 SIGNED = "holds"
 
 _Files = Mapping[str, SignedConfiguration]
-"""Configurations by enclave and file name, such as "/web session.json5"; or a single one under the
-key `LONE`.
+"""Configurations by enclave and file name, such as "/web session.json5"; a single file by `LONE`.
 """
 LONE = "the file"
 
@@ -98,7 +97,8 @@ _OPEN: tuple[tuple[str, Callable[[ConfigurationDocument], bool], bool, str], ...
         "it allows by default",
     ),
 )
-"""Settings with two values: path, function that reads it, value that permits more, and a clause."""
+"""Settings with two values: path, function that reads the value, value that permits more, clause.
+"""
 
 _COMPARED = re.compile(
     r"mode|namespace|(?:listen|connect)/endpoints(?:/\w+)?|transport/link/protocols"
@@ -126,14 +126,14 @@ _GIVING = (
         "anyone with a certificate of that CA gets a connection",
     ),
 )
-"""Expressions for paths of settings whose change may give access, each with a clause."""
+"""Patterns of setting paths whose change may give access, with a clause for each pattern."""
 
 
 def looser_settings(old: _Files, new: _Files) -> Iterator[SettingChange]:
     """Yield the changes of settings that make ``new`` permit more than ``old``.
 
-    A file that ``old`` lacks is compared with a file as sros writes it, and its endpoints with the
-    endpoints of all files of ``old``.
+    A file that ``old`` lacks is compared with a file that sros would write, and the endpoints in it
+    with the endpoints of all files of ``old``.
     """
     files: dict[tuple[str, str, str, str], list[str]] = defaultdict(list)
     for place, file in sorted(new.items()):
@@ -163,7 +163,7 @@ def unknown_settings(old: _Files, new: _Files) -> Iterator[str]:
 def _changes(
     old: _Files, place: str, file: SignedConfiguration
 ) -> Iterator[tuple[str, str, str, str]]:
-    """Yield path, old value, new value and meaning of each setting by which a file permits more.
+    """Yield path, old value, new value and meaning of each setting that makes a file permit more.
 
     ``place`` is the key of ``file``, by which the old file is looked up in ``old``.
     """

@@ -246,7 +246,7 @@ def _token_findings(
 ) -> Iterator[Finding]:
     """Yield a finding unless the token has the key of an enclave's certificate.
 
-    Without ``secrets``, the token is not opened: the signing request says which key it has.
+    Without ``secrets``, the token stays closed: the signing request says which key the token has.
     """
     state = keystore.enclave(name, now=now)
     if not state.token:
@@ -306,7 +306,7 @@ class InstalledEnclave(NamedTuple):
     problem: str
 
     def permissions_until(self) -> datetime | None:
-        """Return when its permissions expire; None if that is not known."""
+        """Return when the enclave's permissions expire; None if that is not known."""
         with suppress(SrosError):
             return self.state.grant.validity.not_after if self.state.grant else None
         return None

@@ -470,7 +470,7 @@ def _authority(
 def _ca_key_findings(
     keystore: CheckedKeystore, role: str, certificate: x509.Certificate
 ) -> Iterator[Finding]:
-    """Yield findings about the key that signs as a CA, and about a copy of it in the keystore."""
+    """Yield findings about the key that signs as a CA, and about copies of it in the keystore."""
     inside, subject = keystore.root / ca_key(role), f"{role} CA key"
     place = (keystore.settings.key_place(role) if keystore.settings else "") or ca_key(role)
     is_file = not (is_token_uri(place) or is_ca_service(place))

@@ -644,7 +644,7 @@ def check_governance(
 
 @dataclass(frozen=True, slots=True)
 class _Chosen:
-    """Tells whether a template chooses settings whose governance has the same finding."""
+    """A predicate for templates that choose settings whose governance has the same finding."""
 
     kind: FindingKind
     text: str

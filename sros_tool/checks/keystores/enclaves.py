@@ -45,7 +45,9 @@ from sros_tool.translate import allows_everything
 from sros_tool.validity import BACKDATE, Span, iso, parse_iso
 
 _SAME_DAY = timedelta(days=1)
-"""ros2/sros2 makes a CA and its certificates valid for ten years each, so the certificates expire
+"""Tolerance for an expiry after the CA's.
+
+ros2/sros2 makes a CA and its certificates valid for ten years each, so that certificates expire
 seconds after the CA.
 """
 _NOT_LOADABLE = "enclave.not-loadable"
@@ -401,7 +403,7 @@ def _denied_before_everything(grant: Grant) -> list[str]:
 
 
 def _lasts_at_least(chosen_validity: Span, length: timedelta) -> bool:
-    """Return whether a chosen validity is at least ``length``; a fixed date of expiry always is."""
+    """Return whether a chosen validity is at least ``length``, or is a fixed date of expiry."""
     return not isinstance(chosen_validity, timedelta) or length <= chosen_validity + BACKDATE
 
 

@@ -298,7 +298,7 @@ def _folder_findings(
 ) -> Iterator[Finding]:
     """Yield findings about the files and folders below ``start``.
 
-    Keys that belong only in the original keystore are added to ``kept_names``.
+    Appends the paths of keys that belong only in the original keystore to ``kept_names``.
     """
     root = os.fspath(keystore.root)
     keys = {os.path.join(root, ENCLAVES, name[1:], KEY_FILE) for name in keystore.names}
@@ -349,9 +349,9 @@ def _folder_findings(
 
 
 def _mounted(key: str) -> str:
-    """Return the real path of a key in a mounted Kubernetes secret; else ``key``.
+    """Return the real path of a key in a mounted Kubernetes secret; of other keys, the given path.
 
-    In such a secret, files are links into ..data, which is a link to a folder next to it.
+    In such a secret, files are links into ..data, which is a link to a sibling folder.
     """
     path = Path(key)
     if not path.is_symlink():
@@ -414,7 +414,7 @@ def key_mode_findings(path: str, mode: int) -> Iterator[Finding]:
 
 
 class _Links:
-    """The checks of links; the real paths of their targets' folders are cached."""
+    """Checks of links, with a cache of the real paths of the folders that links point to."""
 
     def __init__(self, root: str) -> None:
         self._real_root = os.path.realpath(root)
@@ -422,7 +422,7 @@ class _Links:
         self._link_targets: dict[str, str] = {}
 
     def check(self, link: str) -> Iterator[Finding]:
-        """Yield findings about one link."""
+        """Yield findings about ``link``."""
         target = os.readlink(link)  # noqa: PTH115 - a Path of each of very many takes long
         end = os.path.normpath(os.path.join(link.rpartition(os.sep)[0], target))
         real = self._link_targets.get(end)

@@ -201,7 +201,7 @@ _Key = TypeVar("_Key")
 
 _RIGHTS_SHOWN = 3
 _AUTHORITY_FILES = (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
-"""The CA files of an enclave, which define the peers that it trusts."""
+"""The CA files of an enclave, which decide which peers the enclave trusts."""
 
 
 class EnclaveSummary(NamedTuple):

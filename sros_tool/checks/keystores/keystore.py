@@ -92,7 +92,7 @@ def keystore_findings(
 ) -> list[Finding]:
     """Return all findings in a keystore, or in some of its enclaves.
 
-    With ``only_enclaves``, only these are checked, and not the keystore itself.
+    With ``only_enclaves``, only these enclaves are checked, and not the keystore itself.
 
     Raises:
         KeystoreError: the path of ``opened`` is not a keystore.
@@ -202,7 +202,7 @@ def _stated_distributions(
 
 
 def _vendors_of(distributions: Sequence[Distribution]) -> tuple[Vendor, ...]:
-    """Return the vendors that decide for some distributions, in the order of all vendors."""
+    """Return the vendors that decide for ``distributions``, in the order of all vendors."""
     shipped = {vendor for distribution in distributions for vendor in distribution.vendors}
     return tuple(vendor for vendor in TESTED if vendor in shipped)
 
@@ -238,7 +238,7 @@ def with_joined_findings(findings: Sequence[Finding]) -> list[Finding]:
 def _governing(keystore: CheckedKeystore, names: Sequence[str]) -> tuple[str, bytes]:
     """Return the first enclave with the keystore's signed governance, and this governance.
 
-    For an export, return those of its first enclave.
+    For an export, return the first enclave and its governance.
     """
     common = keystore.governance
     for name in names:
@@ -284,17 +284,17 @@ def _with_real_file(finding: Finding, keystore: OpenedKeystore, real_root: str) 
 _OF_SEVERAL = re.compile(
     r"(\bsros (?:renew|revoke|create_permission|create_enclave|distribute_key) \S+ )([^\s`]+)"
 )
-"""The beginning of a command that takes several enclaves, and its first enclave."""
+"""Matches a command that takes several enclaves, up to the first enclave."""
 _SIGNS_POLICY = re.compile(
     r"\bsros (?:create_permission|generate_artifacts -k) [^`]*?\bPOLICY(?:_FILE)?\b"
 )
-"""The beginning of a command that signs a policy, which can be that of a fleet."""
+"""Matches a command that signs a policy, which may be the policy of a fleet."""
 
 
 def _with_enclave_names(finding: Finding, keystore: CheckedKeystore) -> Finding:
-    """Return the finding with KEYSTORE and ENCLAVE in its remedy replaced by their names.
+    """Return the finding with the placeholders KEYSTORE and ENCLAVE in its remedy filled in.
 
-    The remedy for an export says that commands which sign have to run in the original keystore.
+    The remedy for an export says that signing commands have to run in the original keystore.
     """
     remedy = finding.remedy
     if not keystore.looks_like_original and NEEDS_CA_KEYS.search(remedy):
@@ -409,7 +409,7 @@ def _with_cause(
     text: str,
     remedy: str,
 ) -> list[Finding]:
-    """Return findings in which the errors and warnings of ``chosen`` get a common cause."""
+    """Return the findings; errors and warnings in ``chosen`` get a common cause."""
     together = {id(finding) for finding in chosen if finding.severity >= WARNING}
     if len(together) < 2:
         return list(findings)

@@ -49,7 +49,7 @@ def _shipped_template(name: str) -> Template | None:
 
 
 class UnreadablePart(NamedTuple):
-    """A file that exists but cannot be read; ``path`` is relative to the root."""
+    """A file that exists but cannot be read; ``path`` is relative to the keystore."""
 
     path: str
     error: SrosError
@@ -83,7 +83,7 @@ class Circumstances:
     """The keystores that are already open, by path."""
 
     def keystore(self, root: Path) -> OpenedKeystore:
-        """Return the keystore at a path; opened once and used for all checks of it."""
+        """Return the keystore at a path, which is opened once for all checks."""
         return self.opened.setdefault(root, OpenedKeystore(root))
 
 
@@ -199,9 +199,9 @@ class CheckedKeystore:
         )
 
     def accepts(self, kind: FindingKind, accepts_weakness: Callable[[Template], bool]) -> str:
-        """Return text naming the template or keystore that accepts a weakness; "" if none does.
+        """Return text that names the template or keystore which accepts a weakness; "" for neither.
 
-        ``accepts_weakness`` returns whether settings choose the weakness.  It is called with the
+        ``accepts_weakness`` returns whether settings choose the weakness.  Its argument is the
         template as sros ships it, so a changed setting of this keystore accepts nothing.  Without
         settings (keystores of ros2/sros2) no weakness is accepted.
 
@@ -239,7 +239,7 @@ class CheckedEnclave:
 
     @property
     def accepts_expiry(self) -> str:
-        """Text naming the template that accepts this enclave's early expiry; "" if none does."""
+        """Text that names the template which accepts this enclave's early expiry, or ""."""
         settings = self.keystore.settings
         short = settings is not None and settings.longest_validity(self.name) is not None
         return f"template {settings.name}" if settings and short else ""

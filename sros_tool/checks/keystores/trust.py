@@ -1,4 +1,4 @@
-"""Whether the nodes of several keystores and exports communicate, as their files say."""
+"""Checks whether the files of several keystores and exports let their nodes communicate."""
 
 from __future__ import annotations
 
@@ -105,8 +105,8 @@ PEERS_DOMAINS = FindingKind(
 
 _Certificates = tuple[x509.Certificate, ...]
 _Kind = tuple[tuple[_Certificates, ...], tuple[bool, ...], x509.Certificate | None]
-"""The CAs that an enclave trusts, which of them issued its certificate, and who signed its
-permissions."""
+"""The trusted CAs of an enclave, which of them issued its certificate, and its permissions' signer.
+"""
 
 
 class _Party:
@@ -163,10 +163,10 @@ def findings_between(
 def _strangers(
     targets: Targets, refused_pairs: set[frozenset[str]], *, on_zenoh: bool
 ) -> Iterator[Finding]:
-    """Yield findings about keystores and exports of which no two enclaves accept each other.
+    """Yield findings about two keystores or exports whose enclaves all refuse each other.
 
-    In a rotation of CAs, enclaves trust the old and the new one.  Pairs with a finding are added to
-    ``refused_pairs``.
+    In a rotation of CAs, enclaves trust the old CA and the new one.  Pairs with a finding are added
+    to ``refused_pairs``.
     """
     read = {shown: dict(_parties(*target)) for shown, target in targets.items()}
     # Most exports trust and present the same CAs as others: only one of each kind is compared.
@@ -202,7 +202,7 @@ def _refused_roles(
 ) -> tuple[int, ...]:
     """Return the roles in which all pairs of enclaves refuse each other.
 
-    () if one pair does not, or if no enclave can be read.
+    Returns () if enclaves of one pair accept each other, or if no enclave can be read.
     """
     pairs = (
         tuple(
@@ -216,7 +216,7 @@ def _refused_roles(
 
 
 def _parties(keystore: OpenedKeystore, enclaves: Sequence[str]) -> Iterator[tuple[_Kind, _Party]]:
-    """Yield one enclave of each group that trusts and presents the same CAs, with these CAs."""
+    """Yield a `_Party` for each different set of CAs that enclaves trust and present."""
     seen = set()
     for name in enclaves:
         folder = keystore.folder(name)
@@ -280,8 +280,9 @@ def _names_revoked(data: bytes, keystore: OpenedKeystore, enclaves: Sequence[str
 def _earlier_lists(targets: Targets, now: datetime) -> Iterator[Finding]:
     """Yield findings about targets that accept certificates which another target's list revokes.
 
-    A later list may lack certificates that have expired. The ledger of a keystore shows which ones;
-    without a keystore among the targets, every missing certificate counts as expired.
+    A later list may lack certificates that have expired. The ledger of a keystore shows which
+    certificates have expired; without a keystore among the targets, every missing certificate
+    counts as expired.
     """
     holders: dict[tuple[_Certificates, bytes, bytes], dict[str, None]] = defaultdict(dict)
     for shown, (keystore, enclaves) in targets.items():
@@ -327,9 +328,9 @@ def _earlier_lists(targets: Targets, now: datetime) -> Iterator[Finding]:
 def _unexpired(
     serials: frozenset[int], authority: x509.Certificate, targets: Targets, now: datetime
 ) -> frozenset[int]:
-    """Return the serial numbers of certificates that are not expired, by the ledgers of a CA.
+    """Return the serial numbers of certificates that have not expired, by the ledgers of their CA.
 
-    Empty if no keystore of the CA ``authority`` is a target, or if it is a CA service, which also
+    Empty if no keystore of the CA ``authority`` is a target, or if the CA is a service, which also
     issues certificates that no ledger has.
     """
     may_be_expired = True
@@ -377,7 +378,7 @@ class _Governed:
 
     @cached_property
     def domains(self) -> tuple[DomainSet, ...]:
-        """The different sets of domains of all enclaves; () if one of them cannot be read."""
+        """The different sets of domains of all enclaves; () if a set cannot be read."""
         return self._domains(self._enclaves)
 
     def _domains(self, enclaves: Sequence[str]) -> tuple[DomainSet, ...]:
@@ -396,7 +397,7 @@ class _Governed:
         return chain.from_iterable(self.domains)
 
     def overlaps(self, other: _Governed) -> bool:
-        """Return whether two enclaves may join one domain; True if that is unknown."""
+        """Return whether an enclave of both sides may join one domain; True if that is unknown."""
         return _domains_meet(self.first, other.first) or _domains_meet(self.domains, other.domains)
 
 
@@ -406,7 +407,7 @@ def _domains_meet(domain_sets: Sequence[DomainSet], other_sets: Sequence[DomainS
 
 
 class _Incompatibility(NamedTuple):
-    """Why two targets do not communicate.
+    """The reason that two targets do not communicate.
 
     ``differences`` are settings with both values; () if only the domains differ.
     """
@@ -481,7 +482,7 @@ _MOST_SHOWN = 3
 def _differences_between(
     own_governance: Governance, other: Governance
 ) -> tuple[Mismatch, tuple[tuple[str, str, str], ...]]:
-    """Return which communication fails under two documents, and the settings with both values."""
+    """Return the kind of communication that two documents prevent, and the settings that differ."""
     disturbed = mismatch(other, own_governance)
     if not disturbed:
         return disturbed, ()

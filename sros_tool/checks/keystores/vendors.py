@@ -126,7 +126,7 @@ _REFUSES = ("refuse it", "refuses it")
 def asked_vendors(words: Sequence[str]) -> tuple[Vendor, ...]:
     """Return the DDS vendors with the names in ``words``, or all if ``words`` is empty.
 
-    Only vendors are returned whose real library was tried.  ``zenoh`` is no DDS vendor, so that
+    Leaves out vendors whose real library was not tried.  ``zenoh`` is no DDS vendor, so that
     ``("zenoh",)`` gives no vendor.
     """
     return tuple(vendor for vendor in TESTED if not words or vendor.value in words)
@@ -163,9 +163,9 @@ def evaluate(
 
     Args:
         enclave: the enclave.
-        vendors: the vendors that its nodes may use.
+        vendors: the vendors that the enclave's nodes may use.
         domain: the ROS domain to join; None for the domains in the enclave's documents.
-        distributions: the ROS 2 distributions that it is for, which findings name.
+        distributions: the ROS 2 distributions that the enclave is for, which findings name.
     """
     keystore = enclave.keystore
     loaded = loaded_enclave(enclave.name, enclave.folder, enclave.state, moment=keystore.at.now)
@@ -304,7 +304,7 @@ def _file(finding: Finding) -> str:
 
 
 def refusal_clause(cause: RefusalCause, titles: Sequence[str]) -> str:
-    """Return a clause on what vendors with these titles do because of a cause."""
+    """Return a clause on how vendors with these titles react to a cause of refusal."""
     plural, singular = _HIT_PEERS if cause.hits_peers else _SAYS.get(cause.outcome, _REFUSES)
     says = singular if len(titles) == 1 else plural
     return f"{enumerated(titles)} {says} ({cause.text})"
@@ -419,8 +419,8 @@ _SOME_NODE = "/sros_nobody_has_this"
 class _Denial(NamedTuple):
     """The endpoints that an ordinary node needs and that a vendor denies.
 
-    ``text`` is a clause; ``by`` names the deciding deny rule as findings do, and ``partition`` is
-    a partition in which the access would be allowed.
+    ``text`` is a clause; ``by`` names the deciding deny rule in the words of findings; in the
+    partition ``partition``, the access would be allowed.
     """
 
     text: str
@@ -446,8 +446,8 @@ def with_start_finding(
 ) -> list[Finding]:
     """Return the findings, plus an error if no vendor lets an ordinary node start in the enclave.
 
-    Vendors that refuse the enclave do not count.  Findings with the cause of one of
-    ``known_findings`` are left out.
+    Vendors that refuse the enclave do not count.  Leaves out findings whose cause a known finding
+    names.
 
     An enclave with only a part of the rights that every node needs is for a tool such as the
     observer of `sros generate_policy`, which has no log and no services; it gets no error.
@@ -504,7 +504,7 @@ def _states_all(grant: Grant) -> bool:
 def _ordinary_node_denial(
     participant: VendorParticipant, grant: Grant, *, described: bool
 ) -> _Denial | None:
-    """Return the endpoints that an ordinary node needs and a vendor denies, or None.
+    """Return the endpoints that an ordinary node needs and a vendor denies; None without a denial.
 
     ``described`` says that nodes offer ~/get_type_description (since ROS 2 Iron).
     """
@@ -552,7 +552,7 @@ def _partitions(grant: Grant) -> tuple[str, ...]:
 def _offers_types(access: Access, grant: Grant) -> bool:
     """Return whether a node of any name may offer ~/get_type_description.
 
-    Tries a name that no rule has, and an example for each matching expression.
+    Tries a node name that no rule names, and an example name for each matching expression.
     """
     wanted = dds_names("reply", f"/*/{_TYPES}").publish[0]
     return any(
@@ -564,7 +564,7 @@ def _offers_types(access: Access, grant: Grant) -> bool:
 
 
 def _nodes_to_try(grant: Grant, wanted: str) -> Iterator[str]:
-    """Yield a node that no rule names, and a node for each expression that meets ``wanted``."""
+    """Yield a node that no rule names, and a node for each expression that overlaps ``wanted``."""
     yield _SOME_NODE
     with suppress(DocumentError):  # too many wildcards
         for expression in _allowed_to_publish(grant):

@@ -1,7 +1,7 @@
 """Checks of the Zenoh configurations of a keystore: signature, and the rights of the permissions.
 
-In the keystore itself they are compared with what `sros zenoh` would write; on a robot, with the
-permissions of the enclave that has them.
+In a keystore, configurations are compared with the files that `sros zenoh` would write; on a robot,
+with the permissions of their enclave.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ A scenario file is TOML: parties, rows, and the policy of their enclaves.
     [[party]]
     name = "camera"
     role = "talker"                       # a value of `sros_tool.demo.scenarios.model.Role`
-    enclave = "/arm/camera"               # without it: unsecured
+    enclave = "/arm/camera"               # without enclave: unsecured
     topic = "/image"                      # or the name of a service or action
 
     [[party]]
@@ -88,7 +88,7 @@ _PARTIES: Mapping[Relation, tuple[str, ...]] = {
     Relation.IS_REFUSED: ("party",),
     Relation.STARTS: ("party",),
 }
-"""The keys that name a claim's parties: the subject first, then the other party."""
+"""Relation → keys that name the parties of its claim: the subject first, then the other party."""
 
 _CLAIMS: Mapping[str, tuple[Relation, bool]] = {
     "heard": (Relation.HEARS, True),
@@ -112,7 +112,7 @@ _FITTING: Mapping[str, tuple[Role, ...]] = {
     "server": (Role.SERVER, Role.ACTION_SERVER, Role.COMPOSED),
     "party": tuple(Role),
 }
-"""Roles that a party may have, by the key of a claim that names it."""
+"""Key of a claim → roles that the named party may have."""
 
 _NAMED = (Role.SERVER, Role.CLIENT, Role.ACTION_SERVER, Role.ACTION_CLIENT)
 """Roles of parties that have to name a service or an action."""
@@ -354,7 +354,7 @@ def _check_controls(
     parties: Mapping[str, Party],
     rules: Rules,
 ) -> None:
-    """Raise `DocumentError` if a row expects silence and no claim that something works."""
+    """Raise `DocumentError` if a row expects silence, and no claim that something works."""
     happening = [claim for claim in (*claims, *controls) if _expects_success(claim)]
     for claim in claims:
         heard = claim.relation is Relation.HEARS
@@ -407,7 +407,7 @@ ALL = "all"
 
 
 def choose_scenarios(names: Sequence[str], *, on_zenoh: bool = False) -> tuple[Scenario, ...]:
-    """Return the scenarios with these names, or in these TOML files, in order.
+    """Return the scenarios with the given names, or in the given TOML files, in order.
 
     Without names: the default scenario on DDS, or all scenarios ``on_zenoh``.
 

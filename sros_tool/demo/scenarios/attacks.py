@@ -120,7 +120,7 @@ def _tampered_files_row(
 
 
 def _successful_injection_row(name: str, attacker: Identity, defence_removed: str) -> Row:
-    """Return a row in which the listener hears the attacker, because a defense is removed.
+    """Return a row in which the listener hears the attacker, because a defense was removed.
 
     The files of the attacker are valid.
     """
@@ -167,8 +167,8 @@ def _discovery_row(
 ) -> Row:
     """Return a row that shows whether the attacker discovers a publisher of the topic.
 
-    The control: an unsecured attacker discovers another publisher; or, if a secured attacker has to
-    fail, an enclave that may listen discovers this publisher.
+    The control is another publisher that an unsecured attacker discovers; or, if a secured attacker
+    has to fail, an enclave that may listen and discovers the publisher.
     """
     others: tuple[Party, ...] = ()
     controls: tuple[Claim, ...] = ()
@@ -193,7 +193,7 @@ def _discovery_row(
 
 
 def _service_party(role: Role, identity: Identity, name: str = "") -> Party:
-    """Return a client or server of the service; with a ``name``, it is the attacker."""
+    """Return a client or server of the service; with a ``name``, the party is the attacker."""
     return Party(name or role.value, role, identity, SERVICE, intruder=bool(name))
 
 
@@ -492,10 +492,10 @@ def _trespass_rows(
     forge: Forge,
     opened: str,
 ) -> tuple[Row, ...]:
-    """Return rows in which an enclave exceeds its rights, and in which its rights are wide enough.
+    """Return rows in which an enclave exceeds its rights, and control rows with wider rights.
 
-    ``forge`` gives the enclave of the ``part`` wide permissions, and ``opened`` says what they
-    allow.
+    ``forge`` gives the enclave of the ``part`` wide permissions, and ``opened`` names the
+    permissions.
     """
     unless_granted = " that it was not given" if attack.startswith("an enclave ") else ""
     done = RowStatus.ANSWERED if kind in (_call_row, _false_server_row) else RowStatus.HEARD
@@ -625,11 +625,11 @@ WIDEST: dict[str, Row] = {
         kind(f"the widest enclave {does}", Identity(OWN, part), RowStatus.REFUSED, mechanism),
     )
 }
-"""The attack of the enclave with the widest permissions in a user's keystore, by part."""
+"""Part → attack by the enclave with the widest permissions in a user's keystore."""
 
 
 def faulty_enclave_row(enclave: str, fault: str) -> Row:
-    """Return a row that shows whether an enclave with faulty files can join the others.
+    """Return a row that shows whether an enclave with faulty files can join the other enclaves.
 
     The talker's DDS announces endpoints only to participants that it has authenticated.
     """
@@ -638,7 +638,7 @@ def faulty_enclave_row(enclave: str, fault: str) -> Row:
 
 
 def revoked_enclave_row(enclave: str, has_list: bool) -> Row:
-    """Return a row that shows whether a revoked enclave can join the others.
+    """Return a row that shows whether a revoked enclave can join the other enclaves.
 
     ``has_list`` says whether the enclave itself has the revocation list with its certificate.
     """

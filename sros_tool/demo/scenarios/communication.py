@@ -41,7 +41,7 @@ TALKER_DENIED = Identity(OWN, "talker without permission")
 
 
 def _refused_process_row(name: str, mechanism: str, intruder: Party, rightful: Party) -> Row:
-    """Return a row with a process that is refused; in another enclave, its program runs."""
+    """Return a row in which a process is refused; the control is its program in another enclave."""
     return Row(
         name,
         RowStatus.REFUSED,
@@ -180,7 +180,7 @@ ISOLATION = Scenario(
 class _Interface(NamedTuple):
     """A service or action: its ROS name, and the roles and names of both sides.
 
-    ``asks`` and ``answers`` are the words of the policy language for the two rights.
+    ``asks`` and ``answers`` are the words of policies for the two rights, such as call and serve.
     """
 
     name: str

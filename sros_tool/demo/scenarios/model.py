@@ -43,7 +43,7 @@ class Role(StrEnum):
 
     @property
     def uses(self) -> str:
-        """Whether the role's name is that of a topic, a service or an action."""
+        """Whether the role's ``topic`` names a topic, a service or an action."""
         if self in (Role.SERVER, Role.CLIENT):
             return "service"
         return "action" if self in (Role.ACTION_SERVER, Role.ACTION_CLIENT) else "topic"
@@ -121,7 +121,7 @@ OUTCOMES: Mapping[Relation, tuple[RowStatus, RowStatus]] = {
     Relation.LOSES: (RowStatus.NOT_ERASED, RowStatus.ERASED),
     Relation.READABLE: (RowStatus.NOT_READABLE, RowStatus.READABLE),
 }
-"""The statuses of a relation that does not hold, and of one that holds."""
+"""Relation → status of a relation that does not hold, and status of a relation that holds."""
 
 SUCCESSES = frozenset(
     holding
@@ -159,7 +159,7 @@ A `Forge` changes a copy of the scenario's own keystore, `Undefended` changes a 
 
 @dataclass(frozen=True)
 class Identity:
-    """The keystore and the enclave that a process runs with; without a keystore it is unsecured.
+    """The keystore and the enclave of a process; without a keystore, the process is unsecured.
 
     ``enclave`` is a part of the scenario's cast ("talker") or the name of an enclave
     ("/arm/camera").  ``variables`` replace environment variables of a secured process.  On Zenoh, a
@@ -181,9 +181,9 @@ class Party:
 
     ``topic`` is the ROS name of its topic, service or action ("": the topic of the demo).
     ``other_topic`` puts a talker on a topic that nobody else uses.  If an ``intruder`` is refused,
-    the row goes on.  A party of a later ``turn`` starts when all of the earlier ones are ready.
-    ``announced`` is the enclave that it names to others ("": its own), as a part or a name; its
-    messages have ``size`` bytes or more.
+    the row goes on.  A party of a later ``turn`` starts when all parties of earlier turns are
+    ready. ``announced`` is the enclave that the party names to others ("": its own), as a part or a
+    name; messages of the party have ``size`` bytes or more.
     """
 
     name: str
@@ -199,7 +199,7 @@ class Party:
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim that ``relation`` holds between ``subject`` and ``talker``, or does not (``holds``).
+    """A claim on whether ``relation`` holds (``holds``) between ``subject`` and ``talker``.
 
     ``denied`` is the denial that must be the reason, a status in `DENIALS`; None: any reason.
     ``evidence`` is a text that a party of the row must have logged about a process that was refused
@@ -256,9 +256,9 @@ class Condition(StrEnum):
 class Variant:
     """The expected status of a row if all ``conditions`` are true.
 
-    ``open_because`` is the reason why an attack then succeeds ("": it fails), ``remedy`` what a
-    user can do.  ``instead`` is a row to run instead, for a vendor that implements the defense
-    differently.
+    ``open_because`` is the reason why an attack then succeeds ("": the attack fails), ``remedy``
+    what a user can do.  ``instead`` is a row to run instead, for a vendor that implements the
+    defense differently.
     """
 
     conditions: tuple[Condition, ...]
@@ -274,16 +274,17 @@ class Row:
     """One line of the demo's table: processes, claims about them, and controls.
 
     ``mechanism`` is the reason for the expected status, as a clause; ``wire`` requests a capture of
-    the packets; ``replay`` names the party whose packets are sent again after it has left,
+    the packets; ``replay`` names the party whose packets are sent again after its end,
     ``impersonate`` the party whose packets are sent again with changed text.  A ``brief`` row ends
     as soon as it is decided.  ``meanwhile`` changes the keystore of the first claim's subject when
     all processes run; with ``short_lived``, the talker of the first claim gets a certificate that
-    expires while the row runs.  Rows of the same ``world`` share their processes: a party of two
-    rows is the same process.  The first of ``variants`` whose conditions hold replaces the expected
+    expires while the row runs.  Rows of the same ``world`` share processes: a party of two such
+    rows is one process.  The first of ``variants`` whose conditions hold replaces the expected
     status.  ``attack`` names the attack to which the row belongs; with ``defence_removed``, the row
     shows that attack without the defense of that name.  ``open_because`` and ``remedy`` are as in
-    `Variant`.  ``accepted`` says that the user accepts that the attack succeeds, ``unaccepted``
-    that it succeeds because of the user's keystore, and the user did not accept that.
+    `Variant`.  ``accepted`` says that the user accepts the success of the attack. ``unaccepted``
+    says that the attack succeeds because of the user's keystore, and that the user did not accept
+    this.
     """
 
     name: str
@@ -353,7 +354,7 @@ class Row:
 
 
 def together(rows: Sequence[Row]) -> Row:
-    """Join rows that share processes to one row with all parties, claims and controls.
+    """Merge rows that share processes into one row with all parties, claims and controls.
 
     Raises:
         ValueError: two parties of one name differ.
@@ -377,9 +378,9 @@ class Scenario:
     """Rows that belong together, and the policy for their enclaves.
 
     ``cast`` has the enclave of each part.  ``policy`` returns the policy for the topic of the demo;
-    the enclaves ``unpermitted`` have no policy.  With a ``router``, the name of an enclave, its
-    keystores also have the files for Zenoh.  A scenario with ``any_keystore`` can also run in a
-    user's keystore.
+    the enclaves ``unpermitted`` have no policy.  With a ``router``, the name of an enclave,
+    keystores of the scenario also have the files for Zenoh.  A scenario with ``any_keystore`` can
+    also run in a user's keystore.
     """
 
     name: str
@@ -393,7 +394,7 @@ class Scenario:
 
 
 def joined(scenarios: Sequence[Scenario]) -> Scenario:
-    """Join scenarios with the same enclaves and policy to one scenario with all rows.
+    """Merge scenarios with the same enclaves and policy into one scenario with all rows.
 
     Raises:
         ValueError: their enclaves or policies differ.
@@ -410,12 +411,12 @@ def joined(scenarios: Sequence[Scenario]) -> Scenario:
 
 
 def hears(listener: str, talker: str, *, holds: bool = True) -> Claim:
-    """Return the claim that a listener hears a talker, or does not."""
+    """Return the claim that a listener hears a talker, or does not hear the talker."""
     return Claim(Relation.HEARS, listener, talker, holds=holds)
 
 
 def answered(client: str, server: str, *, holds: bool = True) -> Claim:
-    """Return the claim that a server answers a client, or does not."""
+    """Return the claim that a server answers a client, or does not answer the client."""
     return Claim(Relation.IS_ANSWERED, client, server, holds=holds)
 
 
@@ -471,7 +472,7 @@ def check_topic(topic: str) -> str:
     """Return the absolute form of a ROS topic name for the demo.
 
     Raises:
-        UsageError: the demo cannot use it.
+        UsageError: the demo cannot use this topic.
     """
     if len(topic) > _MAX_TOPIC_LENGTH or not _ROS_TOPIC.match(topic):
         raise UsageError(
@@ -501,7 +502,7 @@ def _shipped_policy(file: str) -> Policy:
 
 
 def talking_policy(topic: str) -> Policy:
-    """Return the shipped talker and listener on ``topic``, and one of each without that right."""
+    """Return the shipped policy of talker and listener on ``topic``, and both without access."""
     shipped = _shipped_policy(_POLICY_FILE)
     by_path = {enclave.path: enclave for enclave in shipped.enclaves}
     talker, listener = by_path[_TALKER], by_path[_LISTENER]
@@ -537,7 +538,7 @@ def zenoh_policy(topic: str, *, guest_talks: bool = False, silent: str = "") -> 
     """Return the policy of the demo on Zenoh: `attacked_policy` and an action.
 
     With ``guest_talks``, the guest may use the topic as talker and as listener; the enclave
-    ``silent`` may not use it.  The guest's node has a name of its own.
+    ``silent`` may not use the topic. The guest's node has another name than other nodes.
     """
     attacked = attacked_policy(topic)
     of = {enclave.path: enclave for enclave in attacked.enclaves}

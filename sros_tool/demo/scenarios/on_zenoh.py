@@ -1,8 +1,8 @@
 """The scenarios on Zenoh: nodes with the names, tokens and messages of rmw_zenoh.
 
-Every world has a router; several rows share a world.  An attacker's process does not enforce its
-own rules, so that only the rules of others stop it.  Each attack has a control, and is tried again
-without the defense that stops it.
+A world is a group of rows that share processes, among them a router. An attacker's process does not
+enforce its own rules, so that only the rules of other processes stop the attack. Each attack has a
+control, and is tried again without the defense that stops it.
 """
 
 from __future__ import annotations
@@ -596,7 +596,7 @@ def _through_the_router(party: Party, attack: str, denied: RowStatus, done: RowS
 
 
 def _trespass_rows() -> tuple[Row, ...]:
-    """Return the rows past the router, and through it, with and without the defense."""
+    """Return the trespass rows: with and without a router in between, and without the defense."""
     rows: list[Row] = []
     for way, rows_of in (
         ("past the router", _past_the_router),
@@ -635,7 +635,7 @@ def _rogue_router_row(
 ) -> Row:
     """Return a row in which a talker and a listener are connected to a router that attacks.
 
-    The attack succeeds without the defense, and for an attacker with the router's enclave.
+    The attack succeeds without the defense, or with the router's enclave.
     """
     rogue = Party("attacking router", Role.RELAY, Identity(keystore, part), intruder=True)
     succeeds = bool(defence_removed) or part == "router"
@@ -685,13 +685,13 @@ _ROUTER_ROWS = tuple(
 
 
 def _far_router(keystore: KeystoreChoice) -> tuple[Party, Party]:
-    """Return both routers; listener and admin connect to the far router, which starts first."""
+    """Return two routers; listener and admin connect to the far router, which starts first."""
     far = Identity(keystore, zenoh_forger.FAR_ROUTER)
     return Party("far router", Role.ROUTER, far), replace(_router(keystore), turn=1)
 
 
 def _far_pair(keystore: KeystoreChoice) -> tuple[Party, ...]:
-    """Return both routers, talker and listener."""
+    """Return two routers, a talker and a listener."""
     talker, listener = talker_and_listener(keystore)
     return (*_far_router(keystore), replace(talker, turn=2), replace(listener, turn=2))
 
@@ -822,7 +822,7 @@ _WILDCARD_ROWS = (
 
 
 class _FalseToken(NamedTuple):
-    """A graph token of the enclave of ``part`` that announces more than this enclave may.
+    """A graph token with which the enclave of ``part`` announces more than it may.
 
     ``announced`` is the enclave that the token names ("": the enclave itself); ``role`` says
     whether ``topic`` is a topic or a service.
@@ -896,7 +896,7 @@ def _false_token_row(
 
 
 def _false_token_rows(token: _FalseToken) -> tuple[Row, ...]:
-    """Return the rows of a token: past the router, through it, and without the defense."""
+    """Return the rows of a token: directly to sessions, through the router, without the defense."""
     forgery, wide = zenoh_forger.tokens_of_any_name, "names"
     if token.announced:
         forgery, wide = zenoh_forger.tokens_of_any_enclave, "enclaves"
@@ -1049,7 +1049,7 @@ _EARLIER_ROWS = (
 
 
 def _succeeding_attack(row: Row, because: str, remedy: str) -> Row:
-    """Return the only row of an attack that is known to succeed."""
+    """Return the single row of an attack that is known to succeed."""
     return known_open(replace(row, attack=row.name), because, remedy)
 
 

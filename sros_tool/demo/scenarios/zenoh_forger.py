@@ -93,7 +93,7 @@ def rules_at_the_router_only(copy: KeystoreCopy) -> None:
 
 
 def sessions_that_limit_themselves(copy: KeystoreCopy) -> None:
-    """Let every session enforce only its own rights, towards everybody, and the router nothing."""
+    """Let every session enforce only its own rights, towards every peer, and the router nothing."""
     through_the_router(copy)
     for name, path in _files(copy).items():
         _edit(
@@ -102,7 +102,7 @@ def sessions_that_limit_themselves(copy: KeystoreCopy) -> None:
 
 
 def _give_rights_to_everybody(router: str) -> _Change:
-    """Return a change that gives the router's rights in a file to everybody."""
+    """Return a change that gives the router's rights in a file to every enclave."""
 
     def change(document: _Document) -> None:
         control = document["access_control"]
@@ -211,7 +211,7 @@ def _allow_everything(document: _Document) -> None:
 
 
 def denial_in_a_wildcard(copy: KeystoreCopy) -> None:
-    """Allow everybody everything, but deny the guest the topic and the service by their names."""
+    """Allow every enclave everything, but deny the guest the topic and the service by name."""
     names = [f"{copy.domain}{name}/**" for name in (copy.topic, "/add_two_ints")]
     guest = copy.enclave("guest")
 
@@ -280,13 +280,13 @@ def _widen_tokens(copy: KeystoreCopy, wider: Callable[[str], str]) -> None:
 
 
 def earlier_session_file(copy: KeystoreCopy) -> None:
-    """Put back the guest's session file of an earlier policy, which gave it the topic."""
+    """Restore the guest's session file of an earlier policy, which gave the guest the topic."""
     path = copy.folder("guest") / SESSION_FILE
     path.write_bytes(_session_file_of_earlier_policy(copy))
 
 
 def earlier_session_file_of_one_that_limits_itself(copy: KeystoreCopy) -> None:
-    """Put back the guest's earlier file; each session enforces only its own rights."""
+    """Restore the guest's earlier file; each session enforces only its own rights."""
     earlier = json.loads(_session_file_of_earlier_policy(copy))
     sessions_that_limit_themselves(copy)
     _give_rights_to_everybody(copy.router)(earlier)
@@ -294,7 +294,10 @@ def earlier_session_file_of_one_that_limits_itself(copy: KeystoreCopy) -> None:
 
 
 def _session_file_of_earlier_policy(copy: KeystoreCopy) -> bytes:
-    """Give the guest the topic, take it away again, and return the session file from before."""
+    """Return the guest's session file of a policy that gives the guest the topic.
+
+    The keystore gets this policy, and then the earlier policy again.
+    """
     through_the_router(copy)
     _change_rights(copy, zenoh_policy(copy.topic, guest_talks=True))
     earlier = (copy.folder("guest") / SESSION_FILE).read_bytes()
@@ -399,7 +402,7 @@ def links_in_the_clear(copy: KeystoreCopy) -> None:
 
 
 def short_lived(_copy: KeystoreCopy) -> None:
-    """Leave the keystore as it is: the runner gives its talker a certificate that expires."""
+    """Leave the keystore unchanged: the runner gives the talker a certificate that expires."""
 
 
 def links_that_outlive_certificates(copy: KeystoreCopy) -> None:
@@ -412,7 +415,7 @@ def links_that_outlive_certificates(copy: KeystoreCopy) -> None:
 
 
 def room_for_few_handshakes(copy: KeystoreCopy) -> None:
-    """Let the router wait for few handshakes at a time, as Zenoh does by itself."""
+    """Set the router's limit of simultaneous handshakes to the low default of Zenoh."""
 
     def change(document: _Document) -> None:
         document["transport"].pop("unicast", None)
@@ -438,7 +441,7 @@ def revoked_talker(copy: KeystoreCopy) -> None:
 
 
 def revoked_talker_in_the_rules(copy: KeystoreCopy) -> None:
-    """Revoke the talker, but leave the files of all others as they were."""
+    """Revoke the talker, but leave the files of all other enclaves as they were."""
     before = {path: path.read_bytes() for path in _files(copy).values()}
     stolen = _revoke_talker(copy)
     for path, data in before.items():
@@ -448,7 +451,7 @@ def revoked_talker_in_the_rules(copy: KeystoreCopy) -> None:
 
 
 def revoked_name_in_use_again(copy: KeystoreCopy) -> None:
-    """Revoke the talker, and make it again under the same name."""
+    """Revoke the talker, and create a new enclave with the same name."""
     stolen = _revoke_talker(copy)
     talker, policy = copy.enclave("talker"), zenoh_policy(copy.topic)
     generate_artifacts(copy.root, enclaves=[talker], policies=[policy], now=copy.now)
@@ -461,18 +464,18 @@ def rights_taken_away(copy: KeystoreCopy) -> None:
 
 
 def rights_to_take_away(_copy: KeystoreCopy) -> None:
-    """Leave the keystore as it is: `rights_taken_away` changes it while the row runs."""
+    """Leave the keystore unchanged: `rights_taken_away` changes it while the row runs."""
 
 
 def _revoke_talker(copy: KeystoreCopy) -> dict[str, bytes]:
-    """Revoke the talker; return the files that its enclave had."""
+    """Revoke the talker; return the files of the talker before that."""
     stolen = {file.name: file.read_bytes() for file in copy.folder("talker").iterdir()}
     revoke(copy.root, [copy.enclave("talker")], now=copy.now, keyring=copy.keyring)
     return stolen
 
 
 def _keep_stolen(copy: KeystoreCopy, files: Mapping[str, bytes]) -> None:
-    """Put a copy of an enclave, which a thief made, under another name."""
+    """Put a copy of an enclave's files, which a thief made, under another name."""
     folder = enclave_path(copy.root, STOLEN)
     folder.mkdir(mode=0o700)
     for name, data in files.items():
