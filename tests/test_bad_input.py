@@ -217,7 +217,7 @@ POLICIES: dict[str, tuple[str | Callable[[], str], str]] = {
     "dot": (_topic("a.b"), "not allowed in ROS names"),
     "hyphen": (_topic("a-b"), "not allowed in ROS names"),
     "substitution": (_topic("$(node)/x"), "not allowed in ROS names"),
-    "placeholder": (_topic("{node}/x"), "there are {robot}, {namespace}"),
+    "placeholder": (_topic("{node}/x"), "write {robot}, {namespace}"),
     "home without a slash": (_topic("~x"), "'~'"),
     "home in the middle": (_topic("x/~"), "not allowed in ROS names"),
     "caret set": (_topic("[^a]x"), "vendors interpret"),

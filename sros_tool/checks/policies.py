@@ -1187,9 +1187,11 @@ IN_TWO_FILES = FindingKind(
     "policy.enclave-in-two-files",
     WARNING,
     "an enclave that two policies define",
-    "The policies count as those of one robot: verbs that take rights from both refuse them.",
+    "The two policies count as policies of one robot, and verbs that take rights from both refuse "
+    "them.",
     "sros.",
-    "Define the enclave in one of them; check the policies of each robot by themselves.",
+    "Define the enclave in one of the two policies. If they are for different robots, check the "
+    "policies of each robot with a separate command.",
 )
 NODE_IN_TWO_ENCLAVES = FindingKind(
     "policy.node-in-two-enclaves",

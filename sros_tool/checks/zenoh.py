@@ -76,8 +76,7 @@ DEFAULT_ALLOW = FindingKind(
     "zenoh.default-allow",
     ERROR,
     "access control that allows what no rule denies",
-    "A query or a put with a wildcard gets past a deny rule, and if a process matches two "
-    "subjects, "
+    "A query or a put with a wildcard bypasses a deny rule, and if a process matches two subjects, "
     "a name is denied only if both subjects deny it.",
     _TESTED,
     'Write "default_permission": "deny", and rules that allow.',
@@ -114,7 +113,7 @@ SELF_LIMITING = FindingKind(
 DENY_IN_WILDCARD = FindingKind(
     "zenoh.deny-in-wildcard",
     ERROR,
-    "a deny rule that a wildcard gets past",
+    "a deny rule that a wildcard bypasses",
     "A rule applies to a message only if it covers the whole key expression of the message. A "
     "put, a query or a subscription with a wildcard is wider than the deny rule, so it is allowed, "
     "and reaches the denied names.",

@@ -183,7 +183,7 @@ def print_closed(root: Path, changes: Sequence[Change], *, keystore: Path | None
     if closed:
         where = quote(str(keystore or root))
         echo(
-            "closed to other users, who could open them until now: "
+            "files closed to other users, who could open them until now: "
             f"{first_few(closed, _CLOSED_SHOWN)}. Run the nodes as the owner of the keystore, or "
             "give other users exports (`sros distribute_key`). Replace keys that somebody may "
             f"have copied: keys of enclaves with `sros renew {where} ENCLAVE --new-key "
@@ -235,7 +235,7 @@ def _print_restart(
     text = f"restart the processes of {number} for the change to take effect: "
     text += shown_names(names)
     if zenoh and zenoh.files and set(zenoh.restart) != set(names):
-        text += f"; of those on Zenoh: {shown_names(zenoh.restart) or 'none'}"
+        text += f"; on Zenoh: {shown_names(zenoh.restart) or 'none'}"
     if exported and (published := publish_command(root)):
         text += f"; robots that fetch: {published} first"
     text += "; if processes run from an export, export their enclaves again first" * exported

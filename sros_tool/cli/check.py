@@ -188,7 +188,7 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
 @all_distros_option("Report the findings for all supported ROS 2 distributions.")
 @distro_option(
     "Report only what changes with an update to this ROS 2 distribution. The distribution before "
-    "the update is that of --distro, else of the keystore's settings, else of $ROS_DISTRO.",
+    "the update: --distro, else the distribution in the keystore's settings, else $ROS_DISTRO.",
     "--upgrade-to",
 )
 @click.option(

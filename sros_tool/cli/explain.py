@@ -216,7 +216,8 @@ def _refuse_ignored(mode: str) -> None:
     "--reach",
     metavar="ENCLAVE",
     shell_complete=_complete_enclave,
-    help="Show which enclaves ENCLAVE can influence and learn from, directly or through others.",
+    help="Show which enclaves ENCLAVE can influence, and which enclaves can influence ENCLAVE, "
+    "directly or through others.",
 )
 @click.option(
     "--infrastructure",
@@ -421,7 +422,7 @@ def _notes_on_past(moment: datetime, keystore: OpenedKeystore | None) -> Iterato
     if keystore:
         with suppress(SrosError):
             changes = sum(entry.time > iso(moment) for entry in keystore.ledger.entries)
-    text = "the answer is by the current files, not by the files of that time"
+    text = "the answer uses the current files, not the files of that time"
     if changes:
         text += f"; {counted(changes, 'entry', 'entries')} of ledger.jsonl are from after that time"
     yield Note("explain.past", text)

@@ -211,7 +211,7 @@ class _SeveralEnclavesAndPolicies(SeveralValues):
     "The robots that the placeholders of the policies stand for: a TOML file, or an Ansible "
     "inventory."
 )
-@robot_option("Only the enclaves of this robot; those of other robots stay as they are.")
+@robot_option("Only the enclaves of this robot; the enclaves of other robots do not change.")
 @click.option(
     "--template",
     "template_name",

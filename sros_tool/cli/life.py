@@ -192,7 +192,7 @@ def _complete_reason(
     default="unspecified",
     shell_complete=_complete_reason,
     show_default=True,
-    help="Reason as in RFC 5280, such as key_compromise or cessation_of_operation; any but "
+    help="Reason as in RFC 5280, such as key_compromise or cessation_of_operation, but not "
     "superseded.",
 )
 @click.option(

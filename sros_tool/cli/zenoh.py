@@ -445,8 +445,8 @@ def _untranslatable_notes(subjects: Sequence[RightsOfSubject]) -> Iterator[Note]
         )
     yield Note(
         "zenoh.node-names",
-        "Zenoh rules name no nodes: in the policy, each node has the last part of its enclave's "
-        "name, and all names of topics and services are absolute. Write the real namespaces and "
-        "names of the nodes into it: on Zenoh, others do not see a node that the policy does not "
-        "name.",
+        "Zenoh rules name no nodes: in the policy, the name of each node is the last part of its "
+        "enclave's name, and all names of topics and services are absolute. Write the real "
+        "namespaces and names of the nodes into it: on Zenoh, others do not see a node that "
+        "the policy does not name.",
     )

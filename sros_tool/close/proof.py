@@ -367,8 +367,8 @@ def _remedy(robot: LocalRobot, difference: str) -> str:
         "denied": f"if a node needs this, add it to its profile in {policy}, and {restart}; if a "
         "name was changed in the policy alone, start the node with this name, too",
         "gone": f"if the node uses another name now, write that name into its profile in {policy} "
-        f"in place of this one, also into those of the nodes that it talks to, and {restart}; if "
-        f"not, start the node as before ({robot.commands_file})",
+        f"in place of this one, also into the profiles of the nodes that it talks to, and "
+        f"{restart}; if not, start the node as before ({robot.commands_file})",
         "left alone": f"give both sides one name, in {policy} and in their programs, and {restart}",
         "refused": f"ask `sros check {shlex.quote(str(robot.export))}`",
     }

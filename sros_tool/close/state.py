@@ -51,7 +51,7 @@ _LOOK_SECONDS = 0.2
 
 TALK = "everything that talked can still talk"
 SILENCE = "an open listener finds nothing"
-_ACCEPTS_REVOKED = f"something was revoked ({CRL_FILE}), and is still accepted by"
+_ACCEPTS_REVOKED = f"a certificate was revoked ({CRL_FILE}), and is still accepted by"
 
 
 class SecuredProcess(NamedTuple):
@@ -154,7 +154,7 @@ class RunningRobot:
     def _why_not_current(self, process: Process, enclave: ProcessEnclave) -> str:
         """Return why a process is not closed, as text before "the processes of X"; "" if it is."""
         if not self.may_use_files(process):
-            return f"others than the owner of the files ({user_text(process.user)}) run"
+            return f"users other than the owner of the files ({user_text(process.user)}) run"
         if process.environment.get(STRATEGY) != "Enforce":
             return f"no {STRATEGY}=Enforce in"
         if not enclave.is_there:

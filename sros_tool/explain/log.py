@@ -994,8 +994,8 @@ class _Examiner:
         if names:
             is_meant = f"{' and '.join(names)}: perhaps that is meant"
             return [f"the enclave may {question.word} {is_meant}"], (
-                f"If the node lacks a remapping{add} If the policy lacks one that the node has, "
-                f"write {name} in place of {meant}, or merge it with `--remap "
+                f"If the node lacks a remapping{add} If the policy lacks a remapping that the node "
+                f"has, write {name} in place of {meant}, or merge it with `--remap "
                 f"{quote(meant)}:={quote(name)}`. Otherwise, {remedy}"
             )
         if is_used is False and self._keystore:

@@ -363,7 +363,7 @@ def _short_lived_changes(old: Template, new: Template) -> Iterator[SettingChange
         first, second = (
             duration_text(lifetime) if lifetime else "as others" for lifetime in (before, after)
         )
-        meaning = f"what is issued for {name} expires {'later' if longer else 'earlier'}"
+        meaning = f"new files of {name} expire {'later' if longer else 'earlier'}"
         yield SettingChange(effect, f"enclaves {name}.validity", first, second, meaning)
 
 
@@ -380,7 +380,7 @@ def _zenoh_changes(old: ZenohNetwork | None, new: ZenohNetwork | None) -> Iterat
         ("endpoints", "sessions connect to these endpoints"),
         ("listen", "the router listens on these endpoints"),
         ("mode", "how sessions reach each other"),
-        ("domains", "ROS domains of the network, a part of the governance's"),
+        ("domains", "the domains of the governance in which the network is used"),
         ("routers", "further routers, to which the sessions of their enclaves connect"),
         ("crossing", "names that pass from one router to another"),
     ):

@@ -444,8 +444,8 @@ class ReceivedConfirmation:
         if alternated is None or self.time - alternated > timedelta(days=1):
             return ""
         return (
-            f"Its messages come in turn from two computers that have its keys, such as by a copied "
-            f"disk, last at {iso(alternated)}. The files of the other computer are not known."
+            f"Two computers that have its keys send messages in turn, perhaps because a disk was "
+            f"copied, last at {iso(alternated)}. The files of the other computer are not known."
         )
 
     def clock_note(self) -> str:

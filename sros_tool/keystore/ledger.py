@@ -458,7 +458,7 @@ class LedgerFile:
         """Yield a note if the clock is behind the ledger, so that expired files may seem valid."""
         with suppress(SrosError):  # `sros check` reports a ledger that cannot be read
             if behind := self.clock_behind(now):
-                text = f"{behind}: what has expired may count as valid. Set the clock."
+                text = f"{behind}: expired files may count as valid. Set the clock."
                 yield Note("keystore.clock", text)
 
     def last_time(self) -> datetime | None:

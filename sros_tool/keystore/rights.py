@@ -969,7 +969,7 @@ class RecordedRights:
                 f"The ledger has gaps ({'; '.join(recorded.gaps)}), so later permissions may be "
                 "missing."
             )
-            more = f" With --all in place of {name}, the command states those of all enclaves."
+            more = f" With --all in place of {name}, the command states the rights of all enclaves."
         elif recorded.unchained and name not in recorded.chained:
             why = (
                 f"Nothing shows whether one of the first {recorded.unchained} lines of the ledger "

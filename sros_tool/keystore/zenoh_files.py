@@ -675,7 +675,7 @@ def _domains(
             f"keystore '{root}' is for {len(chosen)} domains, but a Zenoh network can have at most "
             f"{_MOST_DOMAINS}",
             "Its rules state every right once for each domain.",
-            "Name those that run on Zenoh with `sros zenoh --domain`.",
+            "Name the domains that run on Zenoh with `sros zenoh --domain`.",
         )
     return chosen
 

@@ -55,8 +55,8 @@ def parts_of(text: str) -> Parts:
         kind = _KIND.fullmatch(brace[1])
         if not kind:
             raise ValueError(
-                f"{brace[0][:80]!r} is not a placeholder; there are {{robot}}, {{namespace}}, "
-                "{robots} and {namespaces}, and those of a group, such as {robot:carriers}."
+                f"{brace[0][:80]!r} is not a placeholder: write {{robot}}, {{namespace}}, "
+                "{robots} or {namespaces}, perhaps with a group, such as {robot:carriers}."
             )
         placeholder = Placeholder(kind[1], bool(kind[2]), kind[3] or "")
         if problem := _place_problem(placeholder, text[: brace.start()], text[brace.end() :]):

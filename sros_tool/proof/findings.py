@@ -462,7 +462,7 @@ def _other_violators(violation: Violation) -> str:
     for steps in differing:
         text += f"; {steps[0].use.enclave} may {' and '.join(step.action_text() for step in steps)}"
     more = len(violation.witness.others) - len(similar) - len(differing)
-    return text + (f"; {more} more break it in their own ways" if more else "")
+    return text + (f"; {more} more break it in other ways" if more else "")
 
 
 def _listed_names(names: Sequence[str]) -> str:

@@ -145,7 +145,7 @@ _SETTINGS = re.compile(
 _LARGEST_SETTINGS = 1024 * 1024
 _PRIVATE_KEY_FOUND = (
     "has a private key, which everybody who can read the repository has now: replace it, because "
-    "its history keeps it"
+    "the history of the repository keeps it"
 )
 _OK, _FOUND, _UNDECIDED = 0, 1, 2
 

@@ -365,8 +365,8 @@ def _keystore_system(keystore: OpenedKeystore, at: Circumstances) -> System:
         if note.id == FOREIGN_GRANT:
             raise KeystoreError(
                 f"the rights in keystore '{root}' are not known: {note.text.rstrip('.')}",
-                "Permissions are not secret: whoever has the key of an enclave can use all of them "
-                "that have a grant for it.",
+                "Permissions are not secret: whoever has the key of an enclave can use all "
+                "permissions that have a grant for this enclave.",
                 "Sign permissions with one grant for each enclave, with create_permission or "
                 "generate_artifacts.",
             )

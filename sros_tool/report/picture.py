@@ -550,9 +550,9 @@ class Picture:
         yield (
             f"{counted(number, self.unread[0].what)} with {counted(enclaves, 'enclave')} "
             f"({first_few(members, _SAID)}) were only compared: their permissions have the same "
-            f"text as those of {likes}, except for names. Their signatures, certificates, expiry "
-            "and findings, and rights of others to their names, are not in this picture: --robot "
-            "NAME reads one, `sros check` checks all"
+            f"text as the permissions of {likes}, except for names. Their signatures, "
+            "certificates, expiry and findings, and rights of others to their names, are not in "
+            "this picture: --robot NAME reads one, `sros check` checks all"
         )
 
 

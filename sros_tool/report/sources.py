@@ -152,7 +152,9 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
     picture = _compared_picture(read, hosts, use=bool(drawing.observed))
     governed = [source.governance for source in read if source.governance]
     if len(governed) == 2 and governed[0] != governed[1]:
-        text = "the sources differ in governance, and the one of the second source is drawn: "
+        text = (
+            "the sources differ in governance, and the governance of the second source is drawn: "
+        )
         text += "`sros inspect` shows each governance."
         finding = PicturedFinding("view.governance-differs", "warning", text)
         picture = replace(picture, findings=(*picture.findings, finding))

@@ -632,9 +632,9 @@ _CONSEQUENCE_TEXTS = (
     ),
     _log_text(
         "endpoint", _CYCLONE, r"failed to create (?:writer|reader)\b",
-        "the permissions deny a publisher, subscription, client or server, but name its topic for "
-        "the opposite: for a client in place of a server, say; this message does not name the "
-        "topic",
+        "the permissions deny a publisher, subscription, client or server, but allow its topic in "
+        "the other direction, for example to a client in place of a server; this message does not "
+        "name the topic",
         f"Start the node with `CYCLONEDDS_URI='{_CYCLONE_TRACE}'` to see the topic, and explain "
         "the new log.",
         vagueness=3,
@@ -792,7 +792,7 @@ RUNS_OPEN = _log_text(
 RAN_OPEN = _log_text(
     "ran-open", _ROS, _AFTER_START,
     "the enclave lacks a file, yet this log shows no refusal that sros knows: on DDS the node RAN "
-    "UNSECURED (ROS_SECURITY_STRATEGY is not exactly Enforce), unless the file went missing since",
+    "UNSECURED (ROS_SECURITY_STRATEGY is not exactly Enforce), unless the file went missing later",
     "Start the node with `sros run KEYSTORE ENCLAVE -- COMMAND`, which runs a node secured or "
     "not at all.",
     (*BEFORE_DDS, Fault.KEY_ON_TOKEN), vagueness=4,

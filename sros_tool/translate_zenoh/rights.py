@@ -342,7 +342,7 @@ def _untranslatable_denial_error(
     allows = f"line {allowing.line} of '{allowing.file}' allows" if allowing.line else "they allow"
     return PolicyError(
         f"{denying}: DENY {right} {denied} cannot be expressed in Zenoh, because {allows} {wide}",
-        "In Zenoh, a query or a put with a wildcard gets past a DENY inside a wildcard. So sros "
+        "In Zenoh, a query or a put with a wildcard bypasses a DENY inside a wildcard. So sros "
         f"lists the names that remain allowed, and {why}.",
         f"List the names to {right} in place of {wide}.",
     )

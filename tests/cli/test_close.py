@@ -764,7 +764,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     lax = {**talker.environment, "ROS_SECURITY_STRATEGY": "Permissive"}
     for changed, why in (
         (replace(talker, environment=lax), "no ROS_SECURITY_STRATEGY=Enforce in"),
-        (replace(talker, user=12345), "others than the owner of the files (user 12345) run"),
+        (replace(talker, user=12345), "users other than the owner of the files (user 12345) run"),
     ):
         robot.more = (changed,)
         named = f"{why} the processes of /talker (process {PID['/talker']}); restart them\n"

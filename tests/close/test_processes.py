@@ -217,10 +217,10 @@ def test_an_enclave_is_closed_only_if_all_its_processes_are(tmp_path: Path) -> N
         ((fresh, replace(old, user=4321)), None),
         ((fresh, old), "cert.pem changed, or got another mode, after the start of"),
         ((old, fresh), "cert.pem changed, or got another mode, after the start of"),
-        ((replace(fresh, user=4321),), "others than the owner of the files (user 4321) run"),
+        ((replace(fresh, user=4321),), "users other than the owner of the files (user 4321) run"),
         (
             (replace(fresh, user=SEVERAL_USERS),),
-            "others than the owner of the files (several users at once) run",
+            "users other than the owner of the files (several users at once) run",
         ),
         (
             (replace(fresh, configuration=unread),),

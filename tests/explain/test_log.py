@@ -1172,7 +1172,9 @@ def test_a_forgotten_remapping_is_shown(keystore: Path, tmp_path: Path) -> None:
         found = sros("explain", keystore, ENCLAVE, "--log", log).out
         assert (f"the enclave may publish /chatter{why}\n" in found) is bool(why)
         assert (f"`--ros-args -r /{topic}:=/chatter`" in found) is bool(why)
-        assert (f"the policy lacks one that the node has, write /{topic}" in found) is bool(why)
+        assert (f"the policy lacks a remapping that the node has, write /{topic}" in found) is bool(
+            why
+        )
         assert (f"`--remap /chatter:=/{topic}`" in found) is bool(why)
         assert f"`sros explain {keystore} {ENCLAVE} publish /{topic}`" in found
 

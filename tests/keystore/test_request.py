@@ -569,7 +569,7 @@ def test_an_answer_with_another_list_of_the_same_number_needs_force(
     refresh_crl(backup, now=LATER)
     later = sign(backup, robot, LATER, renew=True).archive
     (note,) = import_answer(robot, later, now=LATER).notes
-    assert (note.id, "revokes 1 certificate that the new one lacks" in note.text) == (
+    assert (note.id, "revokes 1 certificate that the new list lacks" in note.text) == (
         "import.list-lacks",
         True,
     )

@@ -192,7 +192,7 @@ def test_of_each_enclave_the_finding_says_what_it_may() -> None:
     ]
     many = {f"/e{number}": may("publish", f"/topic{number}") for number in range(8)}
     (text,) = texts(many, required)
-    assert "; /e5 may publish /topic5; 2 more break it in their own ways, but /* may" in text
+    assert "; /e5 may publish /topic5; 2 more break it in other ways, but /* may" in text
     both = {f"/e{number}": may("publish", f"/x{number}", "/y") for number in range(2)}
     required = '[[not_both]]\nfirst.publish = ["/x*"]\nsecond.publish = ["/y"]'
     assert texts(both, required) == [

@@ -133,7 +133,8 @@ def test_the_verb_says_what_was_only_compared(large: Path) -> None:
     assert "a1 … a6: 5 equal namespaces are drawn as one\n" in ended.err
     said = (
         "12 namespaces with 15 enclaves (a3, a4, a5, b2, b4 and 7 more) were only compared: "
-        "their permissions have the same text as those of a1, b1 and 3 more, except for names."
+        "their permissions have the same text as the permissions of a1, b1 and 3 more, except for "
+        "names."
     )
     assert said in ended.err
     assert "were only compared" in ended.out

@@ -330,7 +330,7 @@ CLOCK_BEHIND = FindingKind(
     "If the clock of this machine is behind, expired files count as valid.",
     "sros: ledger.jsonl has the time of each change.",
     "Set the clock. If the clock is right now but was ahead at the last change, run `sros crl "
-    "KEYSTORE --refresh`, so that the last entry of the ledger is of today.",
+    "KEYSTORE --refresh`, so that the last entry of the ledger has today's date.",
 )
 CRL_EXPIRES_SOON = FindingKind(
     "keystore.revocation-list-ends",

@@ -48,8 +48,8 @@ SEVERAL_GRANTS = FindingKind(
     "several grants in one document",
     "Fast DDS uses the subject's first grant that is valid now. Cyclone DDS uses the subject's "
     "first grant, valid or not, and also accepts a grant whose subject only contains the subject "
-    "of the certificate. Permissions are not secret: an enclave can use the grants for it in the "
-    "permissions of others.",
+    "of the certificate. Permissions are not secret: an enclave can also use a grant for its "
+    "subject in the permissions of another enclave.",
     "Fast DDS 2.6 to 3.6 (Permissions.cpp), Cyclone DDS 0.10 and 11.0; tested.",
     "Write one document with one grant for each enclave.",
 )

@@ -63,8 +63,8 @@ PEERS_ACCEPT = FindingKind(
     "keystore.peers-accept-revoked",
     WARNING,
     "a revocation list that lacks certificates on the list of another keystore or export",
-    "A node with this list communicates with everybody whom only the other list revokes, such as "
-    "the thief of a key.",
+    "A node with this list still communicates with enclaves that only the other list revokes, for "
+    "example with the thief of a key.",
     "RFC 5280, 5.2.3; rmw_dds_common (crl.pem).",
     "Export the enclaves with this list again from their keystore, with `sros distribute_key "
     "KEYSTORE ENCLAVE TARGET --force`, bring the files to the robot, and restart the processes.",

@@ -326,7 +326,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
                 "packets of a secured talker sent again",
                 Relation.HEARS_AGAIN,
                 RowStatus.NOT_HEARD_AGAIN,
-                "every two participants agree on new keys, so that old packets are rejected",
+                "each pair of participants agrees on new keys, so that old packets are rejected",
                 OWN,
             ),
             variants=(

@@ -814,9 +814,10 @@ class _Publication:
         return Note(
             "fleet.revocations-not-shown",
             f"nothing in '{self._folder}' shows what was revoked after {since}: a robot that was "
-            f"stolen since gets releases, and is trusted. Unless you have done so, run `sros fleet "
-            f"collect {where} INBOX`, which revokes again what messages of robots show, revoke "
-            f"again what else was stolen (`sros revoke {where} --robot NAME`), and publish again.",
+            f"stolen after that gets releases, and is trusted. Unless you have done so, run `sros "
+            f"fleet collect {where} INBOX`, which revokes again what messages of robots show, "
+            f"revoke again what else was stolen (`sros revoke {where} --robot NAME`), and publish "
+            "again.",
         )
 
     def _not_restored_error(self) -> KeystoreError:

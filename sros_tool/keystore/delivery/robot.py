@@ -619,11 +619,12 @@ def _lost_revocation_notes(place: Path, answer: RequestAnswer) -> Iterator[Note]
     """
     if lost := lost_serials(*_lists_here_and_sent(place, answer)):
         text = (
-            f"the revocation list until now revokes {counted(len(lost), 'certificate')} that the "
-            f"new one lacks, such as {min(lost):x}. This is right if they have expired, which "
-            "`sros inspect KEYSTORE --history` shows. If one has not, or is not there, the "
-            "keystore comes from a backup: then take the list over from another robot, with "
-            "`sros crl KEYSTORE --refresh --crl FILE`, and have the request signed again."
+            f"the earlier revocation list revokes {counted(len(lost), 'certificate')} that the new "
+            f"list lacks, such as {min(lost):x}. This is right if these certificates have expired: "
+            "`sros inspect KEYSTORE --history` shows it. If a certificate has not expired, or is "
+            "not shown, the keystore comes from a backup: then take the list over from another "
+            "robot, with `sros crl KEYSTORE --refresh --crl FILE`, and have the request signed "
+            "again."
         )
         yield Note("import.list-lacks", text)
 

@@ -302,7 +302,8 @@ def _lost_revocations(
                     shown = (
                         f"revokes {counted(len(lacking), 'certificate')} that the keystore's "
                         "revocation list lacks",
-                        f"One has the serial number {min(lacking):x}, and may not have expired",
+                        f"One of them, with the serial number {min(lacking):x}, may not have "
+                        "expired",
                     )
                 else:
                     continue

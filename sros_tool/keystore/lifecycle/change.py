@@ -493,7 +493,9 @@ class KeystoreChange:
             signer = self.permissions if self.identity.service else self.identity
             self._check_served()
         if behind := self.keystore.ledger_file.clock_behind(self.now):
-            text = f"{behind}: what is made now is valid for too short a time. Set the clock."
+            text = (
+                f"{behind}: files that are made now are valid for too short a time. Set the clock."
+            )
             self.notes.append(Note("keystore.clock", text))
         self.entries = _take_over_records(self.transaction, self.keystore, self.now, self.entries)
         append(

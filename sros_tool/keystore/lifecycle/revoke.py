@@ -143,10 +143,10 @@ def _later_keys_notes(
         would = "would be" if change.dry_run else "are"
         yield Note(
             "revoke.later-keys",
-            f"the keystore was restored from a backup, and knows later keys of "
-            f"{first_few(sorted(names), _SHOWN)} only since, such as those of new hardware. They "
-            f"{would} revoked, too, and are not certified again: create new keys on the robot. "
-            "docs/howto/keystore_is_lost.md says how to revoke only the earlier keys.",
+            f"the keystore was restored from a backup, and learned later keys of "
+            f"{first_few(sorted(names), _SHOWN)} only after that, such as keys of new hardware. "
+            f"They {would} revoked, too, and are not certified again: create new keys on the "
+            "robot. docs/howto/keystore_is_lost.md says how to revoke only the earlier keys.",
         )
 
 

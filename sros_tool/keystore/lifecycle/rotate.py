@@ -840,8 +840,8 @@ def _issuance(
         key: PublicKey = kept.public_key()  # type: ignore[assignment]
         where = f"{quote(str(root))} {name}"
         remedy = (
-            f"Revoke the enclave again, with `sros revoke {where}` (or, with --robot, all of its "
-            f"robot); to keep it, renew it with `sros renew {where} --new-key --revoke-old`."
+            f"Revoke the enclave again, with `sros revoke {where}` (with --robot: all enclaves "
+            f"of its robot); to keep it, renew it with `sros renew {where} --new-key --revoke-old`."
         )
         change.known.refuse_revoked(key, f"enclave {name}", remedy, kept, publish_first=False)
         certificate = NewIdentity(kept.subject, key)
