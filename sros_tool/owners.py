@@ -36,6 +36,11 @@ def other_writers(state: os.stat_result, trusted_users: frozenset[int]) -> str:
     return ""
 
 
+def is_for_root_alone(mode: int) -> bool:
+    """Return whether this process, as root, can read a file that its owner cannot read."""
+    return os.geteuid() == 0 and not mode & stat.S_IRUSR
+
+
 def replaceable_on_the_way(path: Path, trusted_users: frozenset[int]) -> Iterator[tuple[Path, str]]:
     """Yield the folders and links above ``path`` through which others can replace it, and why.
 

@@ -300,7 +300,7 @@ def create_request(
       $ sros create_request /arm/camera robot
       made the key of enclave /arm/camera, which stays in 'robot'
         its SHA-256 is 6f5bbd292e91c5d0fbf579aa0d036ac044cdd9788c6efdbc730a...
-        have 'robot/enclaves/arm/camera/request.pem' signed: sros sign_request
+        bring 'robot/enclaves/arm/camera/request.pem' to the keystore: ...
       $ ssh robot cat robot/enclaves/arm/camera/request.pem |   # or in one step
             sros sign_request keystore - | ssh robot sros import - robot
     """
@@ -324,7 +324,7 @@ def create_request(
     else:
         echo(f"made the key of enclave {name}, which stays in '{folder}'")
     echo(f"  its SHA-256 is {request.key}")
-    echo(f"  have '{request.file}' signed: sros sign_request")
+    echo(f"  bring '{request.file}' to the keystore: sros sign_request KEYSTORE request.pem")
     print_notes(request.notes)
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import stat
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import datetime
 from enum import Enum, auto
 from fnmatch import fnmatchcase
+from shlex import quote
 from typing import NamedTuple
 
 from sros_tool.dds.decision.access import AccessVerb, Outcome, OutcomeWord, ReasonWord
@@ -37,6 +39,7 @@ from sros_tool.explain.asking import (
 from sros_tool.explain.explanation import explain, likely_names, remapping_clause
 from sros_tool.faults import REFUSE_STRANGERS
 from sros_tool.keystore.layout import (
+    KEY_FILE,
     SETTINGS,
     ZENOH_SIGNED,
     has_zenoh_files,
@@ -52,6 +55,7 @@ from sros_tool.keystore.participant import (
 )
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.names import is_expression
+from sros_tool.owners import is_for_root_alone
 from sros_tool.policy.model import OFFERING_RIGHT, PEER_RIGHT, Policy
 from sros_tool.policy.rights import Right, is_of_every_node, policy_rights
 from sros_tool.values import shows
@@ -213,6 +217,7 @@ def explain_on_dds(
         *_other_name_notes(answer, asked_enclave),
         *_note_on_fitting_permissions(evaluator, answer),
         *(note_on_lacking_keys(copied) if copied else ()),
+        *_note_on_key_mode(enclave),
         *_earlier_permissions_notes(answer, context.at),
         *_note_on_anybody([_opened_parts(evaluator, question)], refuse),
     )
@@ -354,6 +359,17 @@ def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[N
         text = f"no enclave that was read may {needed} {question.name} by its name: perhaps nobody "
         text += f"{does} it, and the node lacks a remapping, or a wildcard allows it."
         yield Note(f"explain.{kind}", text)
+
+
+def _note_on_key_mode(enclave: LoadedEnclave) -> Iterator[Note]:
+    """Yield a note if root alone can read the enclave's key."""
+    key = enclave.folder / KEY_FILE if enclave.folder else None
+    if key and key.is_file() and is_for_root_alone(mode := key.stat().st_mode):
+        text = (
+            f"the mode of '{key}' is {stat.S_IMODE(mode):04o}, so only root can read it: a process "
+            f"of another user does not start in the enclave. Run `chmod 600 {quote(str(key))}`."
+        )
+        yield Note("explain.key-mode", text)
 
 
 def _note_on_fitting_permissions(evaluator: Evaluator, answer: Answer) -> Iterator[Note]:

@@ -388,8 +388,8 @@ class _Review:
     """The fleet of the policy or keystore that a step examines, by subject of the step."""
     is_relative: bool = False
     """Whether a requirement has a name that moves with the namespace."""
-    is_compared_elsewhere: bool = True
-    """Whether the review decided which requirements the change breaks in another namespace."""
+    compared_elsewhere: str = "other namespaces"
+    """The namespaces in which the review decided which requirements the change breaks."""
 
     def _allows(self, kind: str) -> bool:
         """Return whether findings of a kind of step are allowed, by the request or always."""
@@ -855,10 +855,9 @@ class _Review:
             yield "no policy is named"
         if not asked.requirements:
             yield "no requirements are named"
-        others = (
-            ", and in other namespaces only whether the change breaks them"
-            * self.is_compared_elsewhere
-        )
+        others = ""
+        if self.compared_elsewhere:
+            others = f", and in {self.compared_elsewhere} only whether the change breaks them"
         if self.is_relative and not asked.namespaces:
             yield (
                 "requirements with names without '/' at the beginning were decided only in the "
@@ -1085,12 +1084,13 @@ class _Review:
         if not any(requirement.is_relative for requirement in requirements):
             return
         if asked.namespaces or asked.fleet or not sources:
-            self.is_compared_elsewhere = False
+            self.compared_elsewhere = ""
             return
         base, head = sources()
         namespaces = _namespaces_to_try(base, head)
-        if len(namespaces) > _MOST_NAMESPACES:
-            self.is_compared_elsewhere = False
+        if len(namespaces) > _MOST_NAMESPACES and self.compared_elsewhere:
+            of_all = f"{_MOST_NAMESPACES} of {len(namespaces)}"
+            self.compared_elsewhere = f"{of_all} other namespaces (those of changed names first)"
         left = {
             at
             for at, here in enumerate(requirements)

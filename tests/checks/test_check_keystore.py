@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -98,6 +99,13 @@ def test_weaknesses_of_single_files(tmp_path: Path) -> None:
     assert ids(root) == []
     (root / "enclaves/a/key.pem").chmod(0o644)
     assert ids(root) == ["keystore.key-readable"]
+    (root / "enclaves/a/key.pem").chmod(0)
+    unread = "enclave.file-unreadable" if os.geteuid() else "keystore.file-unreadable"
+    assert ids(root) == [unread]
+    if not os.geteuid():  # root reads it, and the owner does not
+        said = sros("explain", root, "/a", "publish", "/x").err
+        assert "key.pem' is 0000, so only root can read it" in said
+    (root / "enclaves/a/key.pem").chmod(0o644)
     (root / "enclaves/b/cert.pem").unlink()
     assert ids(root) == ["keystore.key-readable", "enclave.file-missing"]
     words = ("check", root, "--json", "--include", "enclave.not-loadable")

@@ -1267,7 +1267,9 @@ def test_objects_are_what_their_hashes_say(
     assert named.review("--policy", "robot.xml").status == status
 
 
-def test_requirements_of_a_package_are_decided_in_a_namespace(change: Change) -> None:
+def test_requirements_of_a_package_are_decided_in_a_namespace(
+    change: Change, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """In the namespace / they hold, because nobody there has their names."""
     only = '[[only]]\npublish = ["x"]\nenclaves = ["/a"]\n'
     robot = policy_text({"/a": publish("/x"), "/b": publish("/l/x")})
@@ -1276,6 +1278,10 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(change: Change) ->
     asked = ("--policy", "robot.xml", "--requirements", "robot.toml")
     ended = change.review(*asked).ok()
     assert "were decided only in the namespace /, and in other namespaces only whether" in ended.out
+    with monkeypatch.context() as patched:
+        patched.setattr(review, "_MOST_NAMESPACES", 1)
+        some = "and in 1 of 2 other namespaces (those of changed names first) only whether the ch"
+        assert some in change.review(*asked).ok().out
     assert (
         "in the namespace / (--namespace)"
         in sros("review", "--base", "none", *asked, cwd=change.folder).out

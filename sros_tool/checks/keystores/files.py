@@ -38,7 +38,7 @@ from sros_tool.keystore.layout import (
     hidden_enclaves,
     is_layout_path,
 )
-from sros_tool.owners import other_writers, replaceable_on_the_way, user_name
+from sros_tool.owners import is_for_root_alone, other_writers, replaceable_on_the_way, user_name
 from sros_tool.pki.keys import holds_private_key
 
 KEY_READABLE = FindingKind(
@@ -407,10 +407,12 @@ def _write_access_findings(
 
 
 def key_mode_findings(path: str, mode: int) -> Iterator[Finding]:
-    """Yield a finding if others can read a private key."""
+    """Yield a finding if others can read a private key, or only root can."""
+    text, remedy = f"its mode is {stat.S_IMODE(mode):04o}", f"Run `chmod 600 {quote(path)}`."
     if mode & 0o077:
-        text = f"its mode is {stat.S_IMODE(mode):04o}"
-        yield KEY_READABLE.found(path, text, path, remedy=f"Run `chmod 600 {quote(path)}`.")
+        yield KEY_READABLE.found(path, text, path, remedy=remedy)
+    elif is_for_root_alone(mode):
+        yield UNREADABLE.found(path, f"{text}: only root can read it", path, remedy=remedy)
 
 
 class _Links:

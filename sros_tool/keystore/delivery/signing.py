@@ -378,8 +378,9 @@ class _Signer:
                 change.notes.append(
                     Note(
                         "fleet.unrecorded-enclaves",
-                        f"The keystore does not record which robot enclave {name} belongs to: "
-                        f"{lacks}. `--robot` can choose and revoke the enclave only after `sros "
+                        f"enclave {name} belongs to a robot, but the keystore does not know which: "
+                        f"{lacks}. So `--robot`, as in `sros renew KEYSTORE --robot ROBOT`, does "
+                        "not choose this enclave: name the enclave itself, or first run `sros "
                         f"generate_artifacts -k {quote(str(root))} -p POLICY_FILE --fleet "
                         "FLEET_FILE`.",
                     )
