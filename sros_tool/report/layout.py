@@ -524,12 +524,14 @@ def _common_namespace(names: Sequence[str]) -> str:
 
 
 def _wrapped_name(text: str, letters: int) -> tuple[str, ...]:
-    """Split ``text`` at slashes or underscores into lines of at most ``letters`` characters."""
+    """Split ``text`` into lines of at most ``letters`` characters, at slashes or underscores.
+
+    A word is split only if it is longer than a line.
+    """
     lines = []
     while len(text) > letters:
-        cut = max(
-            text.rfind("/", letters // 2, letters), text.rfind("_", letters // 2, letters - 1)
-        )
+        second = len(text) - len(text.lstrip()) + 1
+        cut = max(text.rfind("/", second, letters), text.rfind("_", second, letters - 1))
         cut = cut if cut > 0 else letters - 1
         if text[cut] == "_":
             cut += 1

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import product
+from itertools import pairwise, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -569,6 +569,11 @@ def test_what_all_names_have_in_common_is_said_once(
         assert ", all encrypted; left out: " in summary
         assert summary.endswith("; A: also subscribed by /mobile_robot/recorder")
         assert page.locator("#map .lock").count() == 0
+        # A line of a card ends within a word only if the word is longer than the line.
+        drawn = page.locator("#map .card tspan, #map .card text").all_text_contents()
+        for line, rest in pairwise(drawn):
+            if rest.startswith("  ") and not (line.strip()[-1] == "_" or rest.strip()[0] == "/"):
+                assert not set("/_").intersection(line.strip()[1:]), (line, rest)
         # Names that an enclave receives stand below those that it sends: each column has its head.
         page.click("#map .card.enclave:has-text('velocity_mux')")
         left_edges = "cards => new Set(cards.map(card => card.getBoundingClientRect().left)).size"

@@ -13,13 +13,14 @@ export const MOST_BUNDLES = 160;
 const MOST_NAMES = 8;
 const SHOWN_NAMES = 4;
 
-// Cuts names as the drawing on paper does: before a slash or after an underscore, where one is near.
+// Cuts names as the drawing on paper does: before a slash or after an underscore; within a word only
+// if the word has more letters than the line.
 function wrapped(text, letters) {
   const lines = [];
   while (text.length > letters) {
     const head = text.slice(0, letters);
     let cut = Math.max(head.lastIndexOf("/"), head.lastIndexOf("_"));
-    if (cut < letters / 3) cut = letters - 1;
+    if (cut <= head.search(/[^ ]/)) cut = letters - 1;
     else if (text[cut] === "_") cut += 1;
     lines.push(text.slice(0, cut));
     text = `  ${text.slice(cut)}`;
