@@ -39,11 +39,11 @@ def distributions_page() -> str:
         MADE,
         shipped,
         "The column rmw_zenoh has the first version of the distribution, and the first version "
-        "that reads the files of sros. Versions between the versions of two distributions are "
-        "from Rolling, and count for the later distribution: Lyrical has 0.10, and 0.7 to 0.9 came "
-        "before it. The versions of DDS are the latest as of November 2026; sros assumes that all "
-        "patch versions of a release decide alike. For a release that is *not tested*, sros uses "
-        "the rules of another release, and does not see how the two releases differ.",
+        "that reads the files of sros. Versions of Rolling count for the distribution that "
+        "followed: Lyrical has 0.10, so 0.7 to 0.9 count for Lyrical. The versions of DDS are the "
+        "latest as of November 2026; sros assumes that all patch versions of a release decide "
+        "alike. For a release that is *not tested*, sros uses the rules of another release, and "
+        "does not see how the two releases differ.",
         "Rules that are not the same in all tested releases:",
         table_text("rule", "where it holds", rows=_rules()),
         "What an update changes is reported as:",

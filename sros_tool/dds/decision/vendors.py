@@ -34,7 +34,10 @@ class Subjects(Enum):
     SUBSET = auto()
     """Each part of the certificate's subject, split at ``, / |``, is in the grant's subject."""
     TRIMMED_SUBSET = auto()
-    """As SUBSET, but spaces around parts are ignored (Cyclone DDS 11)."""
+    """Each part of the certificate's subject, without spaces around it, is in the grant's subject.
+
+    Parts are as in `SUBSET` (Cyclone DDS 11).
+    """
 
 
 class DateRule(Enum):
@@ -75,9 +78,9 @@ class DenyPartitions(Enum):
     ANY_OR_ALL = auto()
     """One of the endpoint's partitions; a rule without partitions applies to all endpoints."""
     ANY_OR_DEFAULT = auto()
-    """As ANY_OR_ALL, but without partitions, a rule applies to the default one (Cyclone DDS)."""
+    """One of the endpoint's partitions; without partitions, a rule applies to the default one."""
     IGNORED = auto()
-    """None: a deny rule applies in all partitions, whichever it names (Fast DDS)."""
+    """None: a deny rule applies in all partitions, whatever partitions it names (Fast DDS)."""
 
 
 class Signers(Enum):
@@ -143,9 +146,9 @@ class VendorTraits:
     escapes_subjects: bool = False
     r"""Characters of a subject beyond ASCII are compared as escapes (``\C3\B6``)."""
     longest_subject: int | None = None
-    """Number of bytes of a certificate's subject that are compared; None means all."""
+    """Bytes of a certificate's subject that are compared, from its beginning; None: all."""
     drops_expired: bool = False
-    """Running participants lose each other when the certificate of one expires.
+    """Running participants lose each other when the certificate of one of them expires.
 
     Since Fast DDS 2.6.12 and 3.2.5 (CVE-2025-67108); with 2.14.6 and 3.6.2, they stay connected
     (all tested).
@@ -182,14 +185,14 @@ class VendorTraits:
     longest_topic_name: int | None = None
     """Longest topic name that rules match, in bytes; longer topics can still be created."""
     creates_topics: bool = False
-    """A topic is created before its endpoint, which takes a right in either direction.
+    """A topic is created before its endpoint, and this needs a right in either direction.
 
     The first rule that names the topic decides, for publishing or for subscribing.
     """
     asks_both_directions: bool = False
-    """Creating a topic takes a right to publish or subscribe; for each, its first rule decides."""
+    """Creating a topic needs a right to publish or subscribe; for each, its first rule decides."""
     always_needs_allow_rule: bool = False
-    """A participant without allow rules never starts, even without join control."""
+    """A participant without allow rules never starts, even if joining is not controlled."""
     needs_domain_rule: bool = True
     """A participant does not start in a domain that the governance does not list."""
     shares_open_topics: bool = False
