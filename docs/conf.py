@@ -45,6 +45,7 @@ html_title = f"sros {release}"
 html_copy_source = False
 html_show_copyright = False
 html_static_path = ["_static"]
+html_search_scorer = str(Path(__file__).with_name("scorer.js"))
 html_css_files = ["site.css"]
 html_extra_path = ["_root"]
 html_theme_options = {"navigation_with_keys": True}

@@ -48,6 +48,8 @@ def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_
     assert '<span class="line" style="--rest: 4ch">  ' in page  # long lines are indented further
     assert '<td data-label="what to do">' in page  # a phone has no columns
     assert (tmp_path / "site" / "index.html").exists()
+    data = (tmp_path / "site/_static/language_data.js").read_text("utf-8")
+    assert (PROJECT / "docs/scorer.js").read_text("utf-8") in data  # recipes before references
     loaded = subprocess.run(
         ["grep", "-rlE", r"(src|href)=\"https?://[^\"]+\.(js|css|woff2?)", tmp_path / "site"],
         capture_output=True,

@@ -12,6 +12,7 @@ import click
 import pytest
 
 import sros_tool
+from sros_tool.checks.keystores.issued import STALE
 from sros_tool.cli.common import KEYSTORE_VARIABLE
 from sros_tool.cli.program import program
 from sros_tool.explain.log import explain_log
@@ -136,6 +137,7 @@ def test_a_remedy_in_a_folder_of_close_names_close(tmp_path: Path) -> None:
     for file in ("processes.json", "policy.xml", "keystore/private/key"):
         (tmp_path / file).touch()
     close = f"run `sros close {tmp_path}`"
+    sign = STALE.remedy
     in_export = Fault.FILE_MISSING.remedy_in_export("permissions.p7s")
     renew = remedy_in_original_keystore("Renew it: `sros renew KEYSTORE ENCLAVE`.")
     for remedy, said in (
@@ -144,9 +146,12 @@ def test_a_remedy_in_a_folder_of_close_names_close(tmp_path: Path) -> None:
         ("export them again (`sros distribute_key K E TARGET --force`), or", f"{close}, or"),
         ("Run `sros zenoh KEYSTORE`, export again, and", f"zenoh {keystore}`, {close}, and"),
         ("from an export, export their enclaves again first", f"an export, {close} first"),
+        (sign, f"Run `sros close {tmp_path}`; `sros diff_policy` shows all differences."),
+        (remedy_in_original_keystore(sign), f"Run `sros close {tmp_path}`; `sros diff_policy` sh"),
     ):
         for root in (export, keystore):
-            assert said in remedy_in_closed_robot(root, remedy)
+            mended = remedy_in_closed_robot(root, remedy)
+            assert said in mended and mended.count("sros close") == 1
         assert remedy_in_closed_robot(tmp_path, remedy) == remedy
     (keystore / "private/key").unlink()
     assert remedy_in_closed_robot(export, renew) == renew

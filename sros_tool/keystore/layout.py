@@ -262,10 +262,12 @@ _EXPORT_AGAIN = re.compile(
     rf"(?:(?: from the {ORIGINAL_KEYSTORE}:)? \(?`sros distribute_key [^`]+`\)?)?"
 )
 """What remedies say of bringing changed files to an export."""
+_SIGN_POLICY = re.compile(r"un `sros generate_artifacts -k [^`]+ -p POLICY_FILE`")
+"""What remedies say of signing a whole policy."""
 
 
 def remedy_in_closed_robot(root: Path, remedy: str) -> str:
-    """Return a remedy for ``root``, with the verb that exports again in a folder of `sros close`.
+    """Return a remedy for ``root``, with the verb that signs and exports in a closed robot's folder.
 
     Only if the CA keys are still in that folder; otherwise the remedy is returned as it is.
     """
@@ -274,6 +276,8 @@ def remedy_in_closed_robot(root: Path, remedy: str) -> str:
         return remedy
     close, keystore = f"un `sros close {quote(str(robot))}`", quote(str(robot / CLOSED_KEYSTORE))
     remedy = _EXPORT_AGAIN.sub(lambda found: ("R" if found[1] == "E" else "r") + close, remedy)
+    if _SIGN_POLICY.search(remedy):
+        remedy = _SIGN_POLICY.sub(lambda _: close, remedy).replace(f" Then r{close}.", "")
     for where in (f"In the {ORIGINAL_KEYSTORE}: ", f" KEYSTORE is the {ORIGINAL_KEYSTORE}."):
         remedy = remedy.replace(where, "")
     return re.sub(r"\bKEYSTORE\b", lambda _: keystore, remedy)
