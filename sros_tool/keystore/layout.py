@@ -267,7 +267,7 @@ _SIGN_POLICY = re.compile(r"un `sros generate_artifacts -k [^`]+ -p POLICY_FILE`
 
 
 def remedy_in_closed_robot(root: Path, remedy: str) -> str:
-    """Return a remedy for ``root``, with the verb that signs and exports in a closed robot's folder.
+    """Return a remedy for ``root``; in a closed robot's folder, `sros close` signs and exports.
 
     Only if the CA keys are still in that folder; otherwise the remedy is returned as it is.
     """
